@@ -1,0 +1,373 @@
+// Fused L1 + SSIM loss and its gradient, one pass over tiles that stay in the second-level cache.
+//
+// With x the rendered and y the target picture, G the 11-tap Gaussian blur with zero padding, d = x - y and s = x + y:
+//   P = (G(d)^2 + G(s)^2) / 2 + C1                      = mean_x^2 + mean_y^2 + C1
+//   V_d = G(d^2) - G(d)^2,  V_s = G(s^2) - G(s)^2
+//   Q = (V_d + V_s) / 2 + C2                            = var_x + var_y + C2
+//   P - G(d)^2 = 2 mean_x mean_y + C1,  Q - V_d = 2 cov_xy + C2
+//   SSIM = (1 - G(d)^2 / P) * (1 - V_d / Q)
+// which is the usual formula, but needs four blurs instead of five and has no cancellation where x is close to y:
+// equal pictures give exactly 0 loss.
+//
+// Gradient. Write SSIM = l * c with e = G(d)^2 / P = 1 - l and f = V_d / Q = 1 - c. The partial derivatives by the four
+// blurred maps are, per pixel,
+//   A_dd = dSSIM/dG(d^2) = l * (f / 2 - 1) / Q          A_ss = dSSIM/dG(s^2) = l * (f / 2) / Q
+//   A_d  = dSSIM/dG(d)   = c * (e - 2) / P * G(d) - 2 * G(d) * A_dd
+//   A_s  = dSSIM/dG(s)   = c * e / P * G(s)       - 2 * G(s) * A_ss
+// As dd/dx = ds/dx = 1 and G is its own adjoint (symmetric kernel, zero padding),
+//   dSSIM/dx = G(A_d + A_s) + 2 d G(A_dd) + 2 s G(A_ss).
+//
+// Channels are interleaved: a row is 3 * width floats, and the horizontal taps lie 3 floats apart.
+#include "cpu/loss.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <memory>
+
+namespace dyngs {
+namespace {
+
+constexpr int kChannels = 3;
+constexpr int kRadius = 5;
+constexpr int kTaps = 2 * kRadius + 1;
+constexpr float kC1 = 0.01f * 0.01f;
+constexpr float kC2 = 0.03f * 0.03f;
+
+constexpr int kBatch = 4;                        // rows filtered together: each row read serves up to four sums
+constexpr int kWindow = kBatch + 2 * kRadius;    // rows that a batch reads
+constexpr int kRing = 16;                        // rows kept of each map; a power of two, at least kWindow
+constexpr int kHalo = 2 * kRadius;               // a gradient depends on pixels this far away
+constexpr int kTileRows = 96;
+constexpr int kTilePixels = 256;
+
+#if defined(__AVX512F__)
+constexpr int kFloatLanes = 16;
+#elif defined(__AVX__)
+constexpr int kFloatLanes = 8;
+#else
+constexpr int kFloatLanes = 4;
+#endif
+typedef float Lanes __attribute__((vector_size(kFloatLanes * sizeof(float))));
+
+inline Lanes load(const float* from) {
+  Lanes x;
+  std::memcpy(&x, from, sizeof x);
+  return x;
+}
+inline void store(float* to, Lanes x) { std::memcpy(to, &x, sizeof x); }
+
+struct Kernel {
+  float tap[kTaps];
+};
+
+Kernel gaussian_kernel() {
+  double value[kTaps], sum = 0;
+  for (int i = 0; i < kTaps; ++i) sum += value[i] = std::exp(-(i - kRadius) * (i - kRadius) / (2 * 1.5 * 1.5));
+  Kernel kernel;
+  for (int i = 0; i < kTaps; ++i) kernel.tap[i] = static_cast<float>(value[i] / sum);
+  return kernel;
+}
+
+// Pixels [row_begin, row_end) x [col_begin, col_end). Tiles depend on the picture only, never on the thread count.
+struct Tile {
+  int64_t row_begin, row_end, col_begin, col_end;
+};
+
+// Maps kept for the last kRing rows.
+enum RingMap { kDifference, kSum, kWeight, kGradMean, kGradDifferenceSquare, kGradSumSquare, kRingMaps };
+// Vertically blurred maps of the current batch; the adjoint pass reuses the first three.
+enum ScratchMap { kMeanD, kMeanS, kSquareD, kSquareS, kScratchMaps };
+
+// Row buffers of one thread. Float i of a row is float i of the picture's row minus 3 * (tile.col_begin - kHalo), so
+// that the tile itself starts at float kTileStart; everything outside the picture holds zeros.
+constexpr int kTileStart = kChannels * kHalo;
+
+class Workspace {
+ public:
+  explicit Workspace(int64_t max_tile_pixels)
+      : stride_((kChannels * (max_tile_pixels + 2 * kHalo) + kFloatLanes - 1) / kFloatLanes * kFloatLanes + kFloatLanes),
+        floats_(new float[stride_ * kRows]()) {}
+
+  int64_t stride() const { return stride_; }
+  float* ring(int map, int64_t row) { return floats_.get() + (map * kRing + (row & (kRing - 1))) * stride_; }
+  float* scratch(int map, int index) { return floats_.get() + (kRingRows + map * kBatch + index) * stride_; }
+  float* line() { return floats_.get() + (kRows - 1) * stride_; }
+
+ private:
+  static constexpr int64_t kRingRows = kRingMaps * kRing;
+  static constexpr int64_t kRows = kRingRows + kScratchMaps * kBatch + 1;
+  int64_t stride_;
+  std::unique_ptr<float[]> floats_;
+};
+
+// Everything that the steps below share for one tile.
+struct Context {
+  const LossInput& input;
+  const Kernel& kernel;
+  Tile tile;
+  float scale;      // 1 / (channels * sum of the mask)
+  float* gradient;  // nullptr: value only
+  Workspace& rows;
+
+  int64_t tile_floats() const { return kChannels * (tile.col_end - tile.col_begin); }
+  int64_t row_floats() const { return tile_floats() + 2 * kTileStart; }
+};
+
+struct Sums {
+  double l1 = 0;
+  double dissimilarity = 0;
+};
+
+// Sixteen independent sums, so that the compiler may vectorise without reordering a float sum.
+template <class Function>
+double sum_of(int64_t count, Function value) {
+  float lane[16] = {};
+  int64_t i = 0;
+  for (; i + 16 <= count; i += 16)
+    for (int k = 0; k < 16; ++k) lane[k] += value(i + k);
+  for (; i < count; ++i) lane[i % 16] += value(i);
+  double sum = 0;
+  for (int k = 0; k < 16; ++k) sum += lane[k];
+  return sum;
+}
+
+void load_row(Context& c, int64_t row) {
+  float* difference = c.rows.ring(kDifference, row);
+  float* sum = c.rows.ring(kSum, row);
+  float* weight = c.rows.ring(kWeight, row);
+  const size_t bytes = c.rows.stride() * sizeof(float);
+  std::memset(difference, 0, bytes);
+  std::memset(sum, 0, bytes);
+  std::memset(weight, 0, bytes);
+  if (row < 0 || row >= c.input.height) return;
+
+  const int64_t first = std::max<int64_t>(c.tile.col_begin - kHalo, 0);
+  const int64_t pixels = std::min(c.tile.col_end + kHalo, c.input.width) - first;
+  const int64_t skip = kChannels * (first - (c.tile.col_begin - kHalo));
+  const int64_t offset = row * c.input.width + first;
+  difference += skip, sum += skip, weight += skip;
+  if (c.input.mask) {
+    const float* mask = c.input.mask + offset;
+    for (int64_t p = 0; p < pixels; ++p)
+      for (int k = 0; k < kChannels; ++k) weight[kChannels * p + k] = mask[p];
+  } else {
+    std::fill(weight, weight + kChannels * pixels, 1.0f);
+  }
+  const float* x = c.input.rendered + kChannels * offset;
+  const float* y = c.input.target + kChannels * offset;
+  for (int64_t i = 0; i < kChannels * pixels; ++i) {
+    difference[i] = weight[i] * (x[i] - y[i]);
+    sum[i] = weight[i] * (x[i] + y[i]);
+  }
+}
+
+// Blurs the ring map around rows row .. row + kBatch - 1 down the columns, and its square too if asked for.
+template <bool with_square>
+void blur_columns(Context& c, int ring_map, int64_t row, int to, int square_to = 0) {
+  const float* from[kWindow];
+  for (int r = 0; r < kWindow; ++r) from[r] = c.rows.ring(ring_map, row - kRadius + r);
+  for (int64_t i = 0; i < c.row_floats(); i += kFloatLanes) {
+    Lanes sum[kBatch] = {}, square_sum[kBatch] = {};
+#pragma GCC unroll 16
+    for (int r = 0; r < kWindow; ++r) {
+      const Lanes x = load(from[r] + i), square = x * x;
+#pragma GCC unroll 4
+      for (int b = 0; b < kBatch; ++b) {
+        if (r < b || r - b >= kTaps) continue;
+        sum[b] += x * c.kernel.tap[r - b];
+        if (with_square) square_sum[b] += square * c.kernel.tap[r - b];
+      }
+    }
+    for (int b = 0; b < kBatch; ++b) {
+      store(c.rows.scratch(to, b) + i, sum[b]);
+      if (with_square) store(c.rows.scratch(square_to, b) + i, square_sum[b]);
+    }
+  }
+}
+
+inline Lanes blur_along(const float* centre, const Kernel& kernel) {
+  Lanes sum = load(centre) * kernel.tap[kRadius];
+#pragma GCC unroll 8
+  for (int k = 1; k <= kRadius; ++k)
+    sum += (load(centre - kChannels * k) + load(centre + kChannels * k)) * kernel.tap[kRadius + k];
+  return sum;
+}
+
+// A variance below zero is rounding; NaN stays NaN.
+inline Lanes at_least_zero(Lanes x) { return x < 0.0f ? Lanes{} : x; }
+
+struct SsimTerms {
+  Lanes dissimilarity;                              // 1 - SSIM
+  Lanes grad_mean, grad_diff_square, grad_sum_square;  // A_d + A_s, A_dd, A_ss
+};
+
+inline SsimTerms ssim_terms(Lanes mean_d, Lanes mean_s, Lanes square_d, Lanes square_s) {
+  const Lanes mean_d2 = mean_d * mean_d, mean_s2 = mean_s * mean_s;
+  const Lanes var_d = at_least_zero(square_d - mean_d2), var_s = at_least_zero(square_s - mean_s2);
+  const Lanes inv_p = 1.0f / ((mean_d2 + mean_s2) * 0.5f + kC1);
+  const Lanes inv_q = 1.0f / ((var_d + var_s) * 0.5f + kC2);
+  const Lanes e = mean_d2 * inv_p, f = var_d * inv_q;
+  const Lanes l_over_q = (1.0f - e) * inv_q, c_over_p = (1.0f - f) * inv_p;
+  SsimTerms t;
+  t.dissimilarity = e + f - e * f;
+  t.grad_sum_square = l_over_q * (f * 0.5f);
+  t.grad_diff_square = t.grad_sum_square - l_over_q;
+  t.grad_mean = mean_d * (c_over_p * (e - 2.0f) - t.grad_diff_square * 2.0f) +
+                mean_s * (c_over_p * e - t.grad_sum_square * 2.0f);
+  return t;
+}
+
+// Finishes the blur of one row along the row, and turns the four means into SSIM and its partial derivatives.
+double ssim_row(Context& c, int64_t row, int b) {
+  const float* mean_d = c.rows.scratch(kMeanD, b);
+  const float* mean_s = c.rows.scratch(kMeanS, b);
+  const float* square_d = c.rows.scratch(kSquareD, b);
+  const float* square_s = c.rows.scratch(kSquareS, b);
+  const float* weight = c.rows.ring(kWeight, row);
+  float* dissimilarity = c.rows.line();
+  for (int64_t i = kChannels * kRadius; i < c.row_floats() - kChannels * kRadius; i += kFloatLanes) {
+    const SsimTerms t = ssim_terms(blur_along(mean_d + i, c.kernel), blur_along(mean_s + i, c.kernel),
+                                   blur_along(square_d + i, c.kernel), blur_along(square_s + i, c.kernel));
+    const Lanes w = load(weight + i);
+    store(dissimilarity + i, w * t.dissimilarity);
+    store(c.rows.ring(kGradMean, row) + i, w * t.grad_mean);
+    store(c.rows.ring(kGradDifferenceSquare, row) + i, w * t.grad_diff_square);
+    store(c.rows.ring(kGradSumSquare, row) + i, w * t.grad_sum_square);
+  }
+  if (row < c.tile.row_begin || row >= c.tile.row_end) return 0;
+  return sum_of(c.tile_floats(), [=](int64_t i) { return dissimilarity[kTileStart + i]; });
+}
+
+// SSIM and its partial derivatives on rows row .. row + kBatch - 1; needs the rows kRadius around them.
+double ssim_batch(Context& c, int64_t row) {
+  blur_columns<true>(c, kDifference, row, kMeanD, kSquareD);
+  blur_columns<true>(c, kSum, row, kMeanS, kSquareS);
+  double dissimilarity = 0;
+  for (int b = 0; b < kBatch; ++b) {
+    if (row + b >= 0 && row + b < c.input.height) {
+      dissimilarity += ssim_row(c, row + b, b);
+    } else {
+      for (int map : {kGradMean, kGradDifferenceSquare, kGradSumSquare})
+        std::memset(c.rows.ring(map, row + b), 0, c.rows.stride() * sizeof(float));
+    }
+  }
+  return dissimilarity;
+}
+
+// NaN passes through, as 0 does.
+inline Lanes sign(Lanes x) {
+  const Lanes one = Lanes{} + 1.0f;
+  return x > 0.0f ? one : (x < 0.0f ? -one : x);
+}
+
+void write_gradient_row(Context& c, int64_t row, const float* line) {
+  float* to = c.gradient + kChannels * (row * c.input.width + c.tile.col_begin);
+  std::memcpy(to, line + kTileStart, c.tile_floats() * sizeof(float));
+}
+
+void gradient_batch(Context& c, int64_t row) {
+  constexpr int kFromMean = 0, kFromDifference = 1, kFromSum = 2;
+  blur_columns<false>(c, kGradMean, row, kFromMean);
+  blur_columns<false>(c, kGradDifferenceSquare, row, kFromDifference);
+  blur_columns<false>(c, kGradSumSquare, row, kFromSum);
+  const float l1_scale = c.scale * (1 - c.input.ssim_weight), ssim_scale = c.scale * c.input.ssim_weight;
+  for (int b = 0; b < kBatch && row + b < c.tile.row_end; ++b) {
+    const float* difference = c.rows.ring(kDifference, row + b);
+    const float* sum = c.rows.ring(kSum, row + b);
+    const float* weight = c.rows.ring(kWeight, row + b);
+    float* line = c.rows.line();
+    for (int64_t i = kTileStart; i < c.row_floats() - kTileStart; i += kFloatLanes) {
+      const Lanes d = load(difference + i), s = load(sum + i);
+      const Lanes ssim = blur_along(c.rows.scratch(kFromMean, b) + i, c.kernel) +
+                         d * 2.0f * blur_along(c.rows.scratch(kFromDifference, b) + i, c.kernel) +
+                         s * 2.0f * blur_along(c.rows.scratch(kFromSum, b) + i, c.kernel);
+      store(line + i, load(weight + i) * (l1_scale * sign(d) - ssim_scale * ssim));
+    }
+    write_gradient_row(c, row + b, line);
+  }
+}
+
+double l1_row(Context& c, int64_t row) {
+  const float* difference = c.rows.ring(kDifference, row) + kTileStart;
+  return sum_of(c.tile_floats(), [=](int64_t i) { return std::fabs(difference[i]); });
+}
+
+Sums ssim_tile(Context& c) {
+  Sums sums;
+  int64_t loaded = c.tile.row_begin - kHalo;       // rows before this one are in the ring
+  int64_t ssim_done = c.tile.row_begin - kRadius;  // rows before this one have their partial derivatives in the ring
+  for (int64_t row = c.tile.row_begin; row < c.tile.row_end; row += kBatch) {
+    for (; ssim_done < row + kBatch + kRadius; ssim_done += kBatch) {
+      for (; loaded < ssim_done + kBatch + kRadius; ++loaded) load_row(c, loaded);
+      sums.dissimilarity += ssim_batch(c, ssim_done);
+    }
+    for (int b = 0; b < kBatch && row + b < c.tile.row_end; ++b) sums.l1 += l1_row(c, row + b);
+    if (c.gradient) gradient_batch(c, row);
+  }
+  return sums;
+}
+
+// Without SSIM no neighbours are needed.
+Sums l1_tile(Context& c) {
+  Sums sums;
+  for (int64_t row = c.tile.row_begin; row < c.tile.row_end; ++row) {
+    load_row(c, row);
+    sums.l1 += l1_row(c, row);
+    if (!c.gradient) continue;
+    float* line = c.rows.line();
+    for (int64_t i = kTileStart; i < c.row_floats() - kTileStart; i += kFloatLanes)
+      store(line + i, c.scale * load(c.rows.ring(kWeight, row) + i) * sign(load(c.rows.ring(kDifference, row) + i)));
+    write_gradient_row(c, row, line);
+  }
+  return sums;
+}
+
+// Cuts `length` into equal pieces of at most `most`.
+struct Pieces {
+  int64_t length, count;
+  Pieces(int64_t length_, int64_t most) : length(length_), count((length_ + most - 1) / most) {}
+  int64_t begin(int64_t i) const { return length * i / count; }
+  int64_t longest() const { return (length + count - 1) / count; }
+};
+
+double sum_of_mask(const LossInput& input) {
+  if (!input.mask) return static_cast<double>(input.height) * static_cast<double>(input.width);
+  double sum = 0;
+  for (int64_t row = 0; row < input.height; ++row) {
+    const float* mask = input.mask + row * input.width;
+    sum += sum_of(input.width, [=](int64_t i) { return mask[i]; });
+  }
+  return sum;
+}
+
+}  // namespace
+
+double l1_ssim_loss(const LossInput& input, float* gradient, int num_threads) {
+  const Kernel kernel = gaussian_kernel();
+  const Pieces strips(input.height, kTileRows), columns(input.width, kTilePixels);
+  const double mask_sum = sum_of_mask(input);
+  const double scale = mask_sum == 0 ? 0 : 1 / (kChannels * mask_sum);
+  const int64_t num_tiles = strips.count * columns.count;
+  const std::unique_ptr<Sums[]> sums(new Sums[num_tiles]);
+#pragma omp parallel num_threads(num_threads)
+  {
+    Workspace rows(columns.longest());
+#pragma omp for schedule(dynamic)
+    for (int64_t t = 0; t < num_tiles; ++t) {
+      const int64_t strip = t / columns.count, column = t % columns.count;
+      const Tile tile{strips.begin(strip), strips.begin(strip + 1), columns.begin(column), columns.begin(column + 1)};
+      Context context{input, kernel, tile, static_cast<float>(scale), gradient, rows};
+      sums[t] = input.ssim_weight == 0 ? l1_tile(context) : ssim_tile(context);
+    }
+  }
+  Sums total;
+  for (int64_t t = 0; t < num_tiles; ++t) {
+    total.l1 += sums[t].l1;
+    total.dissimilarity += sums[t].dissimilarity;
+  }
+  const double ssim_weight = input.ssim_weight;
+  return scale * ((1 - ssim_weight) * total.l1 + (ssim_weight == 0 ? 0 : ssim_weight * total.dissimilarity));
+}
+
+}  // namespace dyngs

@@ -1,0 +1,225 @@
+// Projection of N Gaussians into V views, 16 Gaussians at a time, and its backward pass.
+#include <cmath>
+
+#include "cpu/kernels.hpp"
+#include "cpu/parallel.hpp"
+#include "math/projection.hpp"
+
+namespace dyngs {
+namespace {
+
+constexpr int64_t kBlock = 64 * kLanes;  // Gaussians per work item
+
+template <class S>
+Pinhole<S> load_pinhole(const GaussianViews<S>& in, const ProjectOptions<S>& options, int64_t view) {
+  const S* m = in.viewmats + view * 16;
+  const S* k = in.intrinsics + view * 9;
+  Pinhole<S> cam;
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) cam.rotation[i][j] = m[4 * i + j];
+    cam.translation[i] = m[4 * i + 3];
+  }
+  cam.fx = k[0], cam.fy = k[4], cam.cx = k[2], cam.cy = k[5];
+  cam.width = static_cast<S>(options.width), cam.height = static_cast<S>(options.height);
+  return cam;
+}
+
+// Column `c` of rows first..first+15 of an (N, stride) array; lanes past `count` repeat the last row.
+template <class S>
+Packet<S> load_column(const S* rows, int64_t first, int count, int stride, int c) {
+  Packet<S> r;
+  for (int i = 0; i < kLanes; ++i) r[i] = rows[(first + std::min(i, count - 1)) * stride + c];
+  return r;
+}
+
+template <class S>
+void store_column(Packet<S> x, S* rows, int64_t first, int count, int stride, int c) {
+  for (int i = 0; i < count; ++i) rows[(first + i) * stride + c] = x[i];
+}
+
+template <class S>
+struct Loaded {
+  Vec3<Packet<S>> mean, scale;
+  Quat<Packet<S>> unit;
+  Packet<S> inv_norm, opacity;
+};
+
+template <class S>
+Loaded<S> load_gaussians(const GaussianViews<S>& in, int64_t first, int count) {
+  const auto column = [&](const S* rows, int stride, int c) { return load_column(rows, first, count, stride, c); };
+  Loaded<S> g;
+  g.mean = {column(in.means, 3, 0), column(in.means, 3, 1), column(in.means, 3, 2)};
+  g.scale = {column(in.scales, 3, 0), column(in.scales, 3, 1), column(in.scales, 3, 2)};
+  g.unit = normalize(Quat<Packet<S>>{column(in.quats, 4, 0), column(in.quats, 4, 1), column(in.quats, 4, 2),
+                                     column(in.quats, 4, 3)},
+                     g.inv_norm);
+  g.opacity = column(in.opacities, 1, 0);
+  return g;
+}
+
+template <class S>
+Packet<S> ceil_lanes(Packet<S> x) {
+  Packet<S> r;
+  for (int i = 0; i < kLanes; ++i) r[i] = std::ceil(x[i]);
+  return r;
+}
+
+// Half extents in px where alpha can reach alpha_min: Mahalanobis^2 <= t = 2 ln(o / alpha_min) (methods: SnugBox).
+template <class S>
+struct Extent {
+  Packet<S> x, y;
+  Mask<S> visible;
+};
+
+template <class S>
+Extent<S> visible_extent(const Splat<Packet<S>>& splat, Packet<S> opacity, Mask<S> in_range,
+                         const ProjectOptions<S>& options) {
+  using P = Packet<S>;
+  const P limit(S(1e9));  // keeps the int32 radii defined
+  const P t = P(S(2)) * log_of(opacity / P(options.alpha_min));
+  Extent<S> e;
+  e.x = min_of(ceil_lanes(sqrt_of(t * splat.var_x)), limit);
+  e.y = min_of(ceil_lanes(sqrt_of(t * splat.var_y)), limit);
+  const P width(static_cast<S>(options.width)), height(static_cast<S>(options.height)), clip(options.radius_clip);
+  const P finite_limit(std::numeric_limits<S>::max());
+  // every comparison is false for NaN
+  e.visible = in_range & (t > P(S(0))) & ((e.x > clip) | (e.y > clip)) & (e.x > P(S(0))) & (e.y > P(S(0))) &
+              (splat.x + e.x > P(S(0))) & (splat.x - e.x < width) & (splat.y + e.y > P(S(0))) &
+              (splat.y - e.y < height) & (splat.u > P(S(0))) & (splat.u <= finite_limit) & (splat.v > P(S(0))) &
+              (splat.v <= finite_limit) & (abs_of(splat.w) <= finite_limit) &
+              (splat.compensation <= finite_limit);
+  return e;
+}
+
+template <class S>
+void project_block(const GaussianViews<S>& in, const ProjectOptions<S>& options, const Pinhole<S>& cam, int64_t view,
+                   int64_t first, int count, const Projected<S>& out) {
+  using P = Packet<S>;
+  const Loaded<S> g = load_gaussians(in, first, count);
+  Vec3<P> p = to_camera(cam, g.mean);
+  const Mask<S> in_range = (p.z > P(options.near)) & (p.z < P(options.far));
+  p.z = select(in_range, p.z, P(S(1)));
+  ProjectionState<P> state;
+  const Splat<P> splat = project(cam, p, g.unit, g.scale, options.eps2d, state);
+  const P opacity = options.antialiased ? g.opacity * splat.compensation : g.opacity;
+  const Extent<S> e = visible_extent(splat, opacity, in_range, options);
+  const auto shown = [&](P x) { return select(e.visible, x, P(S(0))); };
+  const int64_t row = view * in.num_gaussians + first;
+  store_column(shown(splat.x), out.means2d, row, count, 2, 0);
+  store_column(shown(splat.y), out.means2d, row, count, 2, 1);
+  store_column(shown(splat.depth), out.depths, row, count, 1, 0);
+  store_column(shown(splat.u), out.factors, row, count, 3, 0);
+  store_column(shown(splat.w), out.factors, row, count, 3, 1);
+  store_column(shown(splat.v), out.factors, row, count, 3, 2);
+  store_column(shown(splat.compensation), out.compensations, row, count, 1, 0);
+  const P rx = shown(e.x), ry = shown(e.y);
+  for (int i = 0; i < count; ++i) {
+    out.radii[2 * (row + i)] = static_cast<int32_t>(rx[i]);
+    out.radii[2 * (row + i) + 1] = static_cast<int32_t>(ry[i]);
+  }
+}
+
+template <class S>
+struct BlockGrads {
+  Vec3<Packet<S>> mean, scale;
+  Quat<Packet<S>> unit;
+};
+
+// Adds what one view says about 16 Gaussians; `camera` (12 numbers) collects the gradient of [rotation | translation].
+template <class S>
+void backward_view(const Pinhole<S>& cam, const Loaded<S>& g, const ProjectOptions<S>& options, const int32_t* radii,
+                   const ProjectedGrads<S>& grads, int64_t row, int count, BlockGrads<S>& sum, double* camera) {
+  using P = Packet<S>;
+  P drawn(S(0));
+  bool any_drawn = false;
+  for (int i = 0; i < count; ++i)
+    if (radii[2 * (row + i)] > 0) drawn[i] = S(1), any_drawn = true;
+  if (!any_drawn) return;
+  const Mask<S> visible = drawn > P(S(0));
+  const auto load = [&](const S* rows, int stride, int c) {
+    return select(visible, load_column(rows, row, count, stride, c), P(S(0)));
+  };
+  const Vec3<P> world = g.mean;
+  Vec3<P> p = to_camera(cam, world);
+  p.z = select(visible, p.z, P(S(1)));
+  ProjectionState<P> state;
+  const Splat<P> splat = project(cam, p, g.unit, g.scale, options.eps2d, state);
+  const SplatGrad<P> gs{load(grads.means2d, 2, 0), load(grads.means2d, 2, 1), load(grads.depths, 1, 0),
+                        load(grads.factors, 3, 0), load(grads.factors, 3, 1), load(grads.factors, 3, 2),
+                        load(grads.compensations, 1, 0)};
+  ProjectionGrad<P> d = project_vjp(cam, g.unit, g.scale, options.eps2d, state, splat, gs);
+  const auto kept = [&](P x) { return select(visible, x, P(S(0))); };  // culled lanes may hold NaN
+  d.cam = {kept(d.cam.x), kept(d.cam.y), kept(d.cam.z)};
+  const auto& r = cam.rotation;
+  sum.mean.x += P(r[0][0]) * d.cam.x + P(r[1][0]) * d.cam.y + P(r[2][0]) * d.cam.z;
+  sum.mean.y += P(r[0][1]) * d.cam.x + P(r[1][1]) * d.cam.y + P(r[2][1]) * d.cam.z;
+  sum.mean.z += P(r[0][2]) * d.cam.x + P(r[1][2]) * d.cam.y + P(r[2][2]) * d.cam.z;
+  sum.scale.x += kept(d.scale.x), sum.scale.y += kept(d.scale.y), sum.scale.z += kept(d.scale.z);
+  sum.unit.w += kept(d.unit.w), sum.unit.x += kept(d.unit.x);
+  sum.unit.y += kept(d.unit.y), sum.unit.z += kept(d.unit.z);
+  if (camera == nullptr) return;
+  const P gc[3] = {d.cam.x, d.cam.y, d.cam.z};
+  const P w[3] = {world.x, world.y, world.z};
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) camera[4 * i + j] += horizontal_sum(kept(gc[i] * w[j] + d.view[i][j]));
+    camera[4 * i + 3] += horizontal_sum(gc[i]);
+  }
+}
+
+}  // namespace
+
+template <class S>
+void project_forward(const GaussianViews<S>& in, const ProjectOptions<S>& options, const Projected<S>& out) {
+  for (int64_t view = 0; view < in.num_views; ++view) {
+    const Pinhole<S> cam = load_pinhole(in, options, view);
+    parallel_for(in.num_gaussians, kBlock, options.threads, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; i += kLanes)
+        project_block(in, options, cam, view, i, static_cast<int>(std::min<int64_t>(kLanes, end - i)), out);
+    });
+  }
+}
+
+template <class S>
+void project_backward(const GaussianViews<S>& in, const ProjectOptions<S>& options, const int32_t* radii,
+                      const ProjectedGrads<S>& grads, const GaussianGrads<S>& out) {
+  using P = Packet<S>;
+  const int64_t blocks = (in.num_gaussians + kBlock - 1) / kBlock;
+  std::vector<Pinhole<S>> cams;
+  for (int64_t v = 0; v < in.num_views; ++v) cams.push_back(load_pinhole(in, options, v));
+  std::vector<double> camera(out.viewmats ? blocks * in.num_views * 12 : 0);  // per block: summed in fixed order below
+  parallel_for(in.num_gaussians, kBlock, options.threads, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; i += kLanes) {
+      const int count = static_cast<int>(std::min<int64_t>(kLanes, end - i));
+      const Loaded<S> g = load_gaussians(in, i, count);
+      const P zero(S(0));
+      BlockGrads<S> sum{{zero, zero, zero}, {zero, zero, zero}, {zero, zero, zero, zero}};
+      for (int64_t v = 0; v < in.num_views; ++v) {
+        double* cam_sum = out.viewmats ? camera.data() + ((begin / kBlock) * in.num_views + v) * 12 : nullptr;
+        backward_view(cams[v], g, options, radii, grads, v * in.num_gaussians + i, count, sum, cam_sum);
+      }
+      const Quat<P> q = normalize_vjp(g.unit, g.inv_norm, sum.unit);
+      const auto store = [&](P x, S* rows, int stride, int c) { store_column(x, rows, i, count, stride, c); };
+      store(sum.mean.x, out.means, 3, 0), store(sum.mean.y, out.means, 3, 1), store(sum.mean.z, out.means, 3, 2);
+      store(sum.scale.x, out.scales, 3, 0), store(sum.scale.y, out.scales, 3, 1), store(sum.scale.z, out.scales, 3, 2);
+      store(q.w, out.quats, 4, 0), store(q.x, out.quats, 4, 1);
+      store(q.y, out.quats, 4, 2), store(q.z, out.quats, 4, 3);
+    }
+  });
+  if (out.viewmats == nullptr) return;
+  for (int64_t v = 0; v < in.num_views; ++v) {
+    double total[16] = {};
+    for (int64_t b = 0; b < blocks; ++b)
+      for (int k = 0; k < 12; ++k) total[k] += camera[(b * in.num_views + v) * 12 + k];
+    for (int k = 0; k < 16; ++k) out.viewmats[v * 16 + k] = static_cast<S>(total[k]);
+  }
+}
+
+#define DYNGS_INSTANTIATE(S)                                                                                        \
+  template void project_forward<S>(const GaussianViews<S>&, const ProjectOptions<S>&, const Projected<S>&);         \
+  template void project_backward<S>(const GaussianViews<S>&, const ProjectOptions<S>&, const int32_t*,              \
+                                    const ProjectedGrads<S>&, const GaussianGrads<S>&);
+DYNGS_INSTANTIATE(float)
+DYNGS_INSTANTIATE(double)
+#undef DYNGS_INSTANTIATE
+
+}  // namespace dyngs

@@ -1,0 +1,294 @@
+// Backward pass of the blending, back to front (Kerbl et al. 2023). With the background as a last, opaque layer and
+// s_i = <colour_i, dL/dC>, B = what lies behind i (as the same scalar), T_i the transmittance before i:
+//   dL/dalpha_i = T_i (s_i - B),   B <- B + alpha_i (s_i - B).
+// For each Gaussian only sums over pixels are needed: of p = alpha dL/dalpha times 1, dx, dy, dx^2, dx dy, dy^2, and of
+// alpha T times dL/dC. They are taken 16 Gaussians at a time after a transpose, added up per tile entry, written to the
+// entry's own slot, and finally summed per Gaussian in slot order: no atomics, the same bytes for any thread count.
+#include <array>
+#include <memory>
+
+#include "cpu/parallel.hpp"
+#include "cpu/tile.hpp"
+#include "cpu/transpose.hpp"
+
+namespace dyngs {
+namespace {
+
+enum Moment { kOne, kDx, kDy, kDxDx, kDxDy, kDyDy, kMoments };
+constexpr int kMaxFields = 48;  // moments, channels, two absolute gradients; padded to whole packets
+static_assert(kMoments + kMaxChannels + 2 <= kMaxFields);
+
+// Fields of one entry's gradient record: moments, D colours, then |d mean x|, |d mean y| if asked for.
+struct Layout {
+  int channels;
+  bool absolute;
+  int fields() const { return kMoments + channels + (absolute ? 2 : 0); }
+  int packets() const { return (fields() + kLanes - 1) / kLanes; }
+};
+
+// Up to 16 Gaussians of one block, waiting for the transpose.
+template <class S>
+struct Batch {
+  Packet<S> p[kLanes], weight[kLanes];  // row: Gaussian, lane: pixel
+  Packet<S> dx, dy;                     // lane: Gaussian; centre minus the block's first pixel centre
+  int index[kLanes];
+  int count = 0;
+};
+
+template <class S>
+struct Scratch {
+  Chunk<S> chunk;
+  uint16_t list[kChunk + 16];
+  Batch<S> batch;
+  Packet<S> sums[kChunk * kMaxFields / kLanes];  // gradient records of the chunk, padded to whole packets
+};
+
+// A block's pixels: loss gradients and the running state of the backward recursion.
+template <class S>
+struct BlockPixels {
+  Packet<S> transmittance, behind, threshold;
+  Packet<S> grad[kMaxChannels];               // dL/dC per channel, lane: pixel
+  S grad_rows[kMaxChannels][kLanes];          // the same, to broadcast one pixel
+  int32_t stop[kLanes];
+  int32_t last = 0;                           // largest stop
+};
+
+template <class S>
+BlockPixels<S> load_pixels(const Splats<S>& s, const TileFrame<S>& frame, int block, const ImageGrads<S>& image) {
+  BlockPixels<S> b;
+  const int channels = s.channels;
+  b.transmittance = Packet<S>(S(1)), b.behind = Packet<S>(S(0));
+  b.threshold = pixel_threshold(s, frame, block);
+  std::fill(b.stop, b.stop + kLanes, 0);
+  for (int c = 0; c < channels; ++c) b.grad[c] = Packet<S>(S(0));
+  const S* background = image.background ? image.background + frame.view * channels : nullptr;
+  for_each_pixel(s, frame, block, [&](int i, int64_t pixel) {
+    b.transmittance[i] = image.final_transmittance[pixel];
+    b.stop[i] = image.stop[pixel];
+    b.last = std::max(b.last, b.stop[i]);
+    S behind = image.transmittance[pixel];
+    for (int c = 0; c < channels; ++c) {
+      b.grad[c][i] = image.color[pixel * channels + c];
+      if (background) behind += background[c] * b.grad[c][i];
+    }
+    b.behind[i] = behind;
+  });
+  for (int c = 0; c < channels; ++c) b.grad[c].store(b.grad_rows[c]);
+  return b;
+}
+
+// Sums over the block's pixels of p times the powers of the lane offsets, for 16 Gaussians (rows already transposed),
+// turned into moments about each Gaussian's centre: dx = batch.dx - lane.x.
+template <class S>
+void add_moments(const Packet<S> (&p)[kLanes], const Batch<S>& batch, Packet<S>* out) {
+  using P = Packet<S>;
+  P one(S(0)), x(S(0)), y(S(0)), xx(S(0)), xy(S(0)), yy(S(0));
+  for (int r = 0; r < kBlockSide; ++r) {
+    const P &a = p[4 * r], &b = p[4 * r + 1], &c = p[4 * r + 2], &d = p[4 * r + 3];
+    const P row = (a + b) + (c + d), row_x = b + P(S(2)) * c + P(S(3)) * d;
+    const P fy(static_cast<S>(r)), fyy(static_cast<S>(r * r));
+    one += row, x += row_x, xx += b + P(S(4)) * c + P(S(9)) * d;
+    y += fy * row, xy += fy * row_x, yy += fyy * row;
+  }
+  const P &dx = batch.dx, &dy = batch.dy;
+  const P sum_dx = dx * one - x, sum_dy = dy * one - y;
+  out[kOne] = one;
+  out[kDx] = sum_dx;
+  out[kDy] = sum_dy;
+  out[kDxDx] = dx * (sum_dx - x) + xx;
+  out[kDxDy] = dx * sum_dy - dy * x + xy;
+  out[kDyDy] = dy * (sum_dy - y) + yy;
+}
+
+// Sums over the block's pixels of |p d(log alpha)/d(mean)|: absolute values do not factor into moments.
+template <class S>
+void add_absolute(const Packet<S> (&p)[kLanes], const Batch<S>& batch, const Chunk<S>& chunk, Packet<S>* out) {
+  using P = Packet<S>;
+  P u, w, v;
+  for (int i = 0; i < kLanes; ++i) {
+    const Record<S>& g = chunk.records[batch.index[i]];
+    u[i] = g.u, w[i] = g.w, v[i] = g.v;
+  }
+  P sum_x(S(0)), sum_y(S(0));
+  for (int i = 0; i < kLanes; ++i) {
+    const P dx = batch.dx - P(static_cast<S>(i % kBlockSide)), dy = batch.dy - P(static_cast<S>(i / kBlockSide));
+    const P a = u * dx + w * dy;
+    sum_x += abs_of(p[i] * u * a);
+    sum_y += abs_of(p[i] * (w * a + v * (v * dy)));
+  }
+  const P unscale(S(2) / S(1.4426950408889634));  // the records hold u, w, v times sqrt(log2(e) / 2)
+  out[0] = sum_x * unscale;
+  out[1] = sum_y * unscale;
+}
+
+template <class S>
+void flush(const Layout& layout, const BlockPixels<S>& pixels, Scratch<S>& scratch) {
+  Batch<S>& batch = scratch.batch;
+  if (batch.count == 0) return;
+  for (int i = batch.count; i < kLanes; ++i) {
+    batch.p[i] = batch.weight[i] = Packet<S>(S(0));
+    batch.dx[i] = batch.dy[i] = S(0);
+    batch.index[i] = batch.index[0];
+  }
+  transpose16(batch.p);
+  transpose16(batch.weight);
+  Packet<S> fields[kMaxFields];
+  add_moments(batch.p, batch, fields);
+  for (int c = 0; c < layout.channels; ++c) {
+    Packet<S> even(S(0)), odd(S(0));
+    for (int i = 0; i < kLanes; i += 2) {
+      even += batch.weight[i] * Packet<S>(pixels.grad_rows[c][i]);
+      odd += batch.weight[i + 1] * Packet<S>(pixels.grad_rows[c][i + 1]);
+    }
+    fields[kMoments + c] = even + odd;
+  }
+  if (layout.absolute) add_absolute(batch.p, batch, scratch.chunk, fields + kMoments + layout.channels);
+  const int packets = layout.packets();
+  for (int i = layout.fields(); i < packets * kLanes; ++i) fields[i] = Packet<S>(S(0));
+  for (int k = 0; k < packets; ++k) {
+    Packet<S>(&group)[kLanes] = *reinterpret_cast<Packet<S>(*)[kLanes]>(fields + k * kLanes);
+    transpose16(group);
+    for (int i = 0; i < batch.count; ++i) scratch.sums[batch.index[i] * packets + k] += group[i];
+  }
+  batch.count = 0;
+}
+
+// Lanes whose pixel was not yet full at `position`.
+template <class S>
+Packet<S> relative_stop(const BlockPixels<S>& pixels, int32_t chunk_begin) {
+  Packet<S> r;
+  for (int i = 0; i < kLanes; ++i)
+    r[i] = static_cast<S>(std::clamp<int64_t>(int64_t{pixels.stop[i]} - chunk_begin, 0, kChunk));
+  return r;
+}
+
+template <class S, int D>
+void block_backward(const Splats<S>& s, const Layout& layout, S px, S py, int32_t chunk_begin, int listed,
+                    BlockPixels<S>& pixels, Scratch<S>& scratch) {
+  using P = Packet<S>;
+  const int channels = D == 0 ? layout.channels : D;
+  const LaneOffsets<S> lane;
+  const P alpha_max(s.alpha_max), one(S(1)), zero(S(0));
+  const P stop = relative_stop(pixels, chunk_begin);
+  Batch<S>& batch = scratch.batch;
+  P transmittance = pixels.transmittance, behind = pixels.behind;
+  for (int k = listed - 1; k >= 0; --k) {
+    const int i = scratch.list[k];
+    const Record<S>& g = scratch.chunk.records[i];
+    const S dx = g.x - px, dy = g.y - py;
+    const P x = log2_alpha(g, dx, dy, lane);
+    const Mask<S> drawn = (x >= pixels.threshold) & (P(static_cast<S>(i)) < stop);
+    const P raw = exp2_of(x);
+    const P alpha = select(drawn, min_of(raw, alpha_max), zero);
+    transmittance = transmittance / (one - alpha);  // alpha <= alpha_max < 1
+    const S* color = scratch.chunk.colors[i];
+    P shade(S(0));
+    for (int c = 0; c < channels; ++c) shade += P(color[c]) * pixels.grad[c];
+    const P gap = shade - behind;
+    const P weight = alpha * transmittance;
+    behind += alpha * gap;
+    batch.p[batch.count] = select(raw < alpha_max, weight * gap, zero);  // the clamp stops the gradient
+    batch.weight[batch.count] = weight;
+    batch.dx[batch.count] = dx, batch.dy[batch.count] = dy;
+    batch.index[batch.count] = i;
+    if (++batch.count == kLanes) flush(layout, pixels, scratch);
+  }
+  flush(layout, pixels, scratch);
+  pixels.transmittance = transmittance;
+  pixels.behind = behind;
+}
+
+template <class S>
+void store_chunk(const Layout& layout, const Entries& entries, int64_t begin, const Scratch<S>& scratch, S* slots) {
+  const int fields = layout.fields(), packets = layout.packets();
+  for (int i = 0; i < scratch.chunk.count; ++i)
+    std::memcpy(slots + int64_t{entries.slots[begin + i]} * fields, scratch.sums + i * packets, fields * sizeof(S));
+}
+
+template <class S, int D>
+void tile_backward(const Splats<S>& s, const Layout& layout, const Entries& entries, const ImageGrads<S>& image,
+                   int64_t tile, S* slots) {
+  const TileFrame<S> frame = tile_frame(s, tile);
+  const int64_t begin = entries.tile_offsets[tile], end = entries.tile_offsets[tile + 1];
+  if (begin == end) return;
+  std::array<BlockPixels<S>, kBlocks> pixels;
+  for (int b = 0; b < kBlocks; ++b)
+    if (frame.inside >> b & 1) pixels[b] = load_pixels(s, frame, b, image);
+  Scratch<S> scratch;
+  for (int64_t at = begin + (end - begin - 1) / kChunk * kChunk; at >= begin; at -= kChunk) {
+    const int count = static_cast<int>(std::min<int64_t>(kChunk, end - at));
+    const int32_t chunk_begin = static_cast<int32_t>(at - begin);
+    load_chunk(s, entries, frame, at, count, scratch.chunk);
+    std::fill(scratch.sums, scratch.sums + count * layout.packets(), Packet<S>(S(0)));
+    for (int b = 0; b < kBlocks; ++b) {
+      if (!(frame.inside >> b & 1) || pixels[b].last <= chunk_begin) continue;
+      const int listed = scratch.chunk.list_block(b, scratch.list);
+      block_backward<S, D>(s, layout, frame.block_x[b], frame.block_y[b], chunk_begin, listed, pixels[b], scratch);
+    }
+    store_chunk(layout, entries, at, scratch, slots);
+  }
+}
+
+template <class S, int D>
+void all_tiles_backward(const Splats<S>& s, const Layout& layout, const Entries& entries, const ImageGrads<S>& image,
+                        S* slots) {
+  const int64_t tiles = s.num_views * ((s.width + kTile - 1) / kTile) * int64_t{(s.height + kTile - 1) / kTile};
+  parallel_for(tiles, 1, s.threads, [&](int64_t begin, int64_t end) {
+    for (int64_t t = begin; t < end; ++t) tile_backward<S, D>(s, layout, entries, image, t, slots);
+  });
+}
+
+// d(-(u^2 + v^2) / 2) with u = U dx + W dy, v = V dy, dx = mean - pixel, summed over pixels with weights p.
+template <class S>
+void write_gaussian(const Splats<S>& s, int64_t row, const S* sum, const Layout& layout, const SplatGrads<S>& out) {
+  const S u = s.factors[3 * row], w = s.factors[3 * row + 1], v = s.factors[3 * row + 2];
+  const S sum_u = u * sum[kDx] + w * sum[kDy];
+  const S grad_x = -u * sum_u, grad_y = -(w * sum_u + v * v * sum[kDy]);
+  out.means2d[2 * row] = grad_x, out.means2d[2 * row + 1] = grad_y;
+  out.factors[3 * row] = -(u * sum[kDxDx] + w * sum[kDxDy]);
+  out.factors[3 * row + 1] = -(u * sum[kDxDy] + w * sum[kDyDy]);
+  out.factors[3 * row + 2] = -v * sum[kDyDy];
+  const S opacity = s.opacities[row];
+  out.opacities[row] = opacity > S(0) ? sum[kOne] / opacity : S(0);
+  for (int c = 0; c < layout.channels; ++c) out.colors[row * layout.channels + c] = sum[kMoments + c];
+  if (out.probe == nullptr) return;
+  out.probe[4 * row] = grad_x, out.probe[4 * row + 1] = grad_y;
+  for (int k = 0; k < 2; ++k) out.probe[4 * row + 2 + k] = layout.absolute ? sum[kMoments + layout.channels + k] : S(0);
+}
+
+template <class S>
+void sum_slots(const Splats<S>& s, const Layout& layout, const Entries& entries, const S* slots,
+               const SplatGrads<S>& out) {
+  const int fields = layout.fields();
+  parallel_for(s.num_views * s.num_gaussians, 1024, s.threads, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      S sum[kMaxFields] = {};
+      for (int64_t k = entries.slot_offsets[i]; k < entries.slot_offsets[i + 1]; ++k)
+        for (int f = 0; f < fields; ++f) sum[f] += slots[k * fields + f];
+      write_gaussian(s, i, sum, layout, out);
+    }
+  });
+}
+
+}  // namespace
+
+template <class S>
+void rasterize_backward(const Splats<S>& s, const Entries& entries, const ImageGrads<S>& image,
+                        const SplatGrads<S>& out) {
+  const Layout layout{s.channels, out.absolute};
+  const auto slots = std::make_unique_for_overwrite<S[]>(static_cast<size_t>(entries.count) * layout.fields());
+  switch (s.channels) {
+    case 1: all_tiles_backward<S, 1>(s, layout, entries, image, slots.get()); break;
+    case 3: all_tiles_backward<S, 3>(s, layout, entries, image, slots.get()); break;
+    case 4: all_tiles_backward<S, 4>(s, layout, entries, image, slots.get()); break;
+    default: all_tiles_backward<S, 0>(s, layout, entries, image, slots.get());
+  }
+  sum_slots(s, layout, entries, slots.get(), out);
+}
+
+template void rasterize_backward<float>(const Splats<float>&, const Entries&, const ImageGrads<float>&,
+                                        const SplatGrads<float>&);
+template void rasterize_backward<double>(const Splats<double>&, const Entries&, const ImageGrads<double>&,
+                                         const SplatGrads<double>&);
+
+}  // namespace dyngs

@@ -1,0 +1,147 @@
+// Front-to-back blending of each tile's Gaussians. Pixel state (transmittance, colour) of one 4x4 block stays in
+// registers while the block's own list is walked.
+#include "cpu/parallel.hpp"
+#include "cpu/tile.hpp"
+
+namespace dyngs {
+namespace {
+
+constexpr int kDynamic = 0;  // number of channels known only at run time
+
+template <class S, int D>
+struct BlockState {
+  Packet<S> transmittance, threshold;
+  Packet<S> color[D == kDynamic ? kMaxChannels : D];
+  int32_t stop[kLanes];
+};
+
+template <class S>
+struct Scratch {
+  Chunk<S> chunk;
+  uint16_t list[kChunk + 16];
+  S sums[kChunk];  // contributions of the chunk's Gaussians
+};
+
+// Pixels that the Gaussian would take below transmittance_min are full: it is not added and they take no more.
+template <class S, int D>
+void mark_full(Mask<S> full, int32_t position, BlockState<S, D>& state) {
+  uint32_t bits = to_bits(full);
+  state.threshold = select(full, Packet<S>(std::numeric_limits<S>::infinity()), state.threshold);
+  for (; bits != 0; bits &= bits - 1) state.stop[__builtin_ctz(bits)] = position;
+}
+
+template <class S, int D, bool kContributions>
+void blend_block(const Splats<S>& s, const TileFrame<S>& frame, int block, int32_t chunk_begin, int listed,
+                 Scratch<S>& scratch, BlockState<S, D>& block_state) {
+  using P = Packet<S>;
+  const int channels = D == kDynamic ? s.channels : D;
+  const LaneOffsets<S> lane;
+  const S px = frame.block_x[block], py = frame.block_y[block];
+  const P alpha_max(s.alpha_max), transmittance_min(s.transmittance_min), zero(S(0));
+  BlockState<S, D> state = block_state;
+  for (int k = 0; k < listed; ++k) {
+    const int i = scratch.list[k];
+    const Record<S>& g = scratch.chunk.records[i];
+    const P x = log2_alpha(g, g.x - px, g.y - py, lane);
+    const P alpha = select(x >= state.threshold, min_of(exp2_of(x), alpha_max), zero);
+    P weight = alpha * state.transmittance;
+    P next = state.transmittance - weight;
+    const Mask<S> full = (next < transmittance_min) & (alpha > zero);
+    if (any(full)) [[unlikely]] {
+      mark_full(full, chunk_begin + i, state);
+      weight = select(full, zero, weight);
+      next = select(full, state.transmittance, next);
+    }
+    state.transmittance = next;
+    const S* color = scratch.chunk.colors[i];
+    for (int c = 0; c < channels; ++c) state.color[c] += weight * P(color[c]);
+    if constexpr (kContributions) scratch.sums[i] += horizontal_sum(weight);
+  }
+  block_state = state;
+}
+
+template <class S, int D>
+void write_block(const Splats<S>& s, const TileFrame<S>& frame, int block, const Image<S>& image,
+                 const BlockState<S, D>& state) {
+  const int channels = D == kDynamic ? s.channels : D;
+  const S* background = image.background ? image.background + frame.view * channels : nullptr;
+  for_each_pixel(s, frame, block, [&](int i, int64_t pixel) {
+    const S t = state.transmittance[i];
+    image.transmittance[pixel] = t;
+    image.stop[pixel] = state.stop[i];
+    for (int c = 0; c < channels; ++c)
+      image.color[pixel * channels + c] = state.color[c][i] + (background ? t * background[c] : S(0));
+  });
+}
+
+template <class S, int D>
+bool any_open(const BlockState<S, D>& state) {
+  return any(state.threshold < Packet<S>(std::numeric_limits<S>::infinity()));
+}
+
+template <class S, int D, bool kContributions>
+void blend_tile(const Splats<S>& s, const Entries& entries, const Image<S>& image, int64_t tile, S* slot_sums) {
+  const TileFrame<S> frame = tile_frame(s, tile);
+  const int64_t begin = entries.tile_offsets[tile], end = entries.tile_offsets[tile + 1];
+  BlockState<S, D> state[kBlocks];
+  for (int b = 0; b < kBlocks; ++b) {
+    state[b] = {};
+    state[b].transmittance = Packet<S>(S(1));
+    state[b].threshold = pixel_threshold(s, frame, b);
+    std::fill(state[b].stop, state[b].stop + kLanes, std::numeric_limits<int32_t>::max());
+  }
+  Scratch<S> scratch;
+  uint32_t open = frame.inside;
+  for (int64_t at = begin; at < end && open != 0; at += kChunk) {
+    load_chunk(s, entries, frame, at, static_cast<int>(std::min<int64_t>(kChunk, end - at)), scratch.chunk);
+    if constexpr (kContributions) std::fill(scratch.sums, scratch.sums + kChunk, S(0));
+    for (int b = 0; b < kBlocks; ++b) {
+      if (!(open >> b & 1)) continue;
+      const int listed = scratch.chunk.list_block(b, scratch.list);
+      blend_block<S, D, kContributions>(s, frame, b, static_cast<int32_t>(at - begin), listed, scratch, state[b]);
+      if (!any_open(state[b])) open &= ~(1u << b);
+    }
+    if constexpr (kContributions)
+      for (int i = 0; i < scratch.chunk.count; ++i) slot_sums[entries.slots[at + i]] = scratch.sums[i];
+  }
+  for (int b = 0; b < kBlocks; ++b)
+    if (frame.inside >> b & 1) write_block(s, frame, b, image, state[b]);
+}
+
+template <class S, int D, bool kContributions>
+void blend_all(const Splats<S>& s, const Entries& entries, const Image<S>& image, S* slot_sums) {
+  const int64_t tiles = s.num_views * ((s.width + kTile - 1) / kTile) * int64_t{(s.height + kTile - 1) / kTile};
+  parallel_for(tiles, 1, s.threads, [&](int64_t begin, int64_t end) {
+    for (int64_t t = begin; t < end; ++t) blend_tile<S, D, kContributions>(s, entries, image, t, slot_sums);
+  });
+}
+
+// Contributions per (Gaussian, tile) entry, then summed per Gaussian in slot order: the same for any thread count.
+template <class S>
+void blend_with_contributions(const Splats<S>& s, const Entries& entries, const Image<S>& image) {
+  std::vector<S> slot_sums(entries.count, S(0));
+  blend_all<S, kDynamic, true>(s, entries, image, slot_sums.data());
+  for (int64_t i = 0; i < s.num_views * s.num_gaussians; ++i) {
+    S sum = 0;
+    for (int64_t k = entries.slot_offsets[i]; k < entries.slot_offsets[i + 1]; ++k) sum += slot_sums[k];
+    image.contributions[i] = sum;
+  }
+}
+
+}  // namespace
+
+template <class S>
+void rasterize_forward(const Splats<S>& s, const Entries& entries, const Image<S>& image) {
+  if (image.contributions != nullptr) return blend_with_contributions(s, entries, image);
+  switch (s.channels) {
+    case 1: return blend_all<S, 1, false>(s, entries, image, nullptr);
+    case 3: return blend_all<S, 3, false>(s, entries, image, nullptr);
+    case 4: return blend_all<S, 4, false>(s, entries, image, nullptr);
+    default: return blend_all<S, kDynamic, false>(s, entries, image, nullptr);
+  }
+}
+
+template void rasterize_forward<float>(const Splats<float>&, const Entries&, const Image<float>&);
+template void rasterize_forward<double>(const Splats<double>&, const Entries&, const Image<double>&);
+
+}  // namespace dyngs

@@ -1,0 +1,160 @@
+// What the forward and the backward rasterizer share: the Gaussians of one tile, copied into a compact form, and the
+// test of which of the tile's sixteen 4x4 blocks each of them can touch. One packet holds one block's 16 pixels.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "cpu/kernels.hpp"
+#include "math/packet.hpp"
+
+namespace dyngs {
+
+inline constexpr int kBlockSide = 4, kBlocks = 16;
+inline constexpr int kChunk = 256;  // Gaussians copied at a time: their records stay in the L1 cache
+
+// One Gaussian as the pixel loop reads it. u, w, v are scaled by sqrt(log2(e) / 2), so that
+// alpha = 2^(log2_opacity - u'^2 - v'^2).
+template <class S>
+struct Record {
+  S x, y, u, w, v, log2_opacity;
+};
+
+template <class S>
+struct Chunk {
+  int count;
+  Record<S> records[kChunk];
+  const S* colors[kChunk];
+  uint16_t masks[kChunk];  // bit b: block b may be touched
+
+  // Positions within the chunk of the Gaussians that touch block `b`, in order. Branch free.
+  int list_block(int b, uint16_t* list) const {
+    int n = 0;
+#if defined(__AVX512F__) && defined(__AVX512BW__) && defined(__AVX512VL__)
+    const __m256i bit = _mm256_set1_epi16(static_cast<int16_t>(1u << b));
+    __m512i index = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    for (int i = 0; i < count; i += 16) {
+      const __m256i masks16 = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(masks + i));
+      const __mmask16 hit = _mm256_test_epi16_mask(masks16, bit);
+      const __m512i packed = _mm512_maskz_compress_epi32(hit, index);
+      _mm256_storeu_si256(reinterpret_cast<__m256i*>(list + n), _mm512_cvtepi32_epi16(packed));
+      n += __builtin_popcount(hit);
+      index = _mm512_add_epi32(index, _mm512_set1_epi32(16));
+    }
+#else
+    for (int i = 0; i < count; ++i) {
+      list[n] = static_cast<uint16_t>(i);
+      n += (masks[i] >> b) & 1;
+    }
+#endif
+    return n;
+  }
+};
+
+template <class S>
+struct TileFrame {
+  int x0, y0;                     // top left pixel
+  int view;
+  Packet<S> block_x, block_y;     // first pixel centre of each block
+  uint16_t inside;                // blocks that hold at least one pixel of the image
+  S log2_alpha_min;
+};
+
+template <class S>
+TileFrame<S> tile_frame(const Splats<S>& s, int64_t tile) {
+  const int columns = (s.width + kTile - 1) / kTile, rows = (s.height + kTile - 1) / kTile;
+  TileFrame<S> f;
+  f.view = static_cast<int>(tile / (int64_t{columns} * rows));
+  const int in_view = static_cast<int>(tile % (int64_t{columns} * rows));
+  f.x0 = (in_view % columns) * kTile, f.y0 = (in_view / columns) * kTile;
+  f.inside = 0;
+  for (int b = 0; b < kBlocks; ++b) {
+    const int x = f.x0 + kBlockSide * (b % 4), y = f.y0 + kBlockSide * (b / 4);
+    f.block_x[b] = static_cast<S>(x) + S(0.5), f.block_y[b] = static_cast<S>(y) + S(0.5);
+    if (x < s.width && y < s.height) f.inside |= static_cast<uint16_t>(1u << b);
+  }
+  f.log2_alpha_min = std::log2(s.alpha_min);
+  return f;
+}
+
+template <class P>
+P clamp(P x, P lo, P hi) {
+  return min_of(max_of(x, lo), hi);
+}
+
+// Blocks (lanes) where u^2 + v^2 <= limit somewhere. The quadratic form is convex: its minimum over a box lies at the
+// centre if that is inside, else on the facing vertical or horizontal edge; both are minimised in closed form.
+template <class S>
+uint16_t touched_blocks(const TileFrame<S>& f, const Record<S>& g) {
+  using P = Packet<S>;
+  const P side(S(kBlockSide - 1)), gx(g.x), gy(g.y), u(g.u), w(g.w), v(g.v);
+  const P x0 = f.block_x - gx, y0 = f.block_y - gy, x1 = x0 + side, y1 = y0 + side;
+  const P zero(S(0));
+  const P edge_x = clamp(zero, x0, x1), edge_y = clamp(zero, y0, y1);
+  const P y_on_edge = clamp(P(-g.u * g.w / (g.w * g.w + g.v * g.v)) * edge_x, y0, y1);
+  const P x_on_edge = clamp(P(-g.w / g.u) * edge_y, x0, x1);
+  const P u1 = u * edge_x + w * y_on_edge, v1 = v * y_on_edge;
+  const P u2 = u * x_on_edge + w * edge_y, v2 = v * edge_y;
+  const P least = min_of(u1 * u1 + v1 * v1, u2 * u2 + v2 * v2);
+  const S slack = S(1e-3);  // the pixel test decides; this one may only err on the generous side
+  return static_cast<uint16_t>(to_bits(least <= P(g.log2_opacity - f.log2_alpha_min + slack)) & f.inside);
+}
+
+// Copies entries [begin, begin + count) of a tile.
+template <class S>
+void load_chunk(const Splats<S>& s, const Entries& entries, const TileFrame<S>& frame, int64_t begin, int count,
+                Chunk<S>& chunk) {
+  const S scale = std::sqrt(S(0.5) * S(1.4426950408889634));
+  chunk.count = count;
+  for (int i = 0; i < count; ++i) {
+    const int64_t row = entries.gaussians[begin + i];
+    Record<S>& r = chunk.records[i];
+    r.x = s.means2d[2 * row], r.y = s.means2d[2 * row + 1];
+    r.u = s.factors[3 * row] * scale, r.w = s.factors[3 * row + 1] * scale, r.v = s.factors[3 * row + 2] * scale;
+    r.log2_opacity = std::log2(s.opacities[row]);
+    chunk.colors[i] = s.colors + row * s.channels;
+    chunk.masks[i] = touched_blocks(frame, r);
+  }
+  for (int i = count; i < std::min(kChunk, count + 16); ++i) chunk.masks[i] = 0;
+}
+
+// Offsets of a block's 16 pixels from its first one.
+template <class S>
+struct LaneOffsets {
+  Packet<S> x, y;
+  LaneOffsets() {
+    for (int i = 0; i < kLanes; ++i) x[i] = static_cast<S>(i % kBlockSide), y[i] = static_cast<S>(i / kBlockSide);
+  }
+};
+
+// log2 of alpha before clamping, at a block's pixels; `dx`, `dy`: Gaussian centre minus the block's first pixel centre.
+template <class S>
+Packet<S> log2_alpha(const Record<S>& g, S dx, S dy, const LaneOffsets<S>& lane) {
+  using P = Packet<S>;
+  const P u = P(g.u * dx + g.w * dy) - P(g.u) * lane.x - P(g.w) * lane.y;
+  const P v = P(g.v * dy) - P(g.v) * lane.y;
+  return P(g.log2_opacity) - u * u - v * v;
+}
+
+// Infinite in lanes outside the image: no log2 alpha passes it.
+template <class S>
+Packet<S> pixel_threshold(const Splats<S>& s, const TileFrame<S>& f, int block) {
+  Packet<S> t;
+  for (int i = 0; i < kLanes; ++i) {
+    const int x = f.x0 + kBlockSide * (block % 4) + i % 4, y = f.y0 + kBlockSide * (block / 4) + i / 4;
+    t[i] = x < s.width && y < s.height ? f.log2_alpha_min : std::numeric_limits<S>::infinity();
+  }
+  return t;
+}
+
+// Calls f(lane, pixel index within all views) for the block's pixels inside the image.
+template <class S, class F>
+void for_each_pixel(const Splats<S>& s, const TileFrame<S>& frame, int block, F&& f) {
+  for (int i = 0; i < kLanes; ++i) {
+    const int x = frame.x0 + kBlockSide * (block % 4) + i % 4, y = frame.y0 + kBlockSide * (block / 4) + i / 4;
+    if (x < s.width && y < s.height) f(i, (int64_t{frame.view} * s.height + y) * s.width + x);
+  }
+}
+
+}  // namespace dyngs

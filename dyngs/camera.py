@@ -1,0 +1,50 @@
+"""Pinhole cameras, one or many, as tensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """V pinhole cameras of one image size.
+
+    Attributes:
+        cam_from_world: (V, 4, 4) rigid transforms, world to camera, OpenCV axes.
+        intrinsics: (V, 3, 3) matrices in pixels; the first pixel's centre is (0.5, 0.5).
+        width, height: image size in pixels.
+    """
+
+    cam_from_world: Tensor
+    intrinsics: Tensor
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if self.cam_from_world.ndim != 3 or self.cam_from_world.shape[1:] != (4, 4):
+            raise ValueError(f"cam_from_world must be (V, 4, 4), got {tuple(self.cam_from_world.shape)}")
+        if self.intrinsics.shape != (len(self.cam_from_world), 3, 3):
+            raise ValueError(f"intrinsics must be (V, 3, 3), got {tuple(self.intrinsics.shape)}")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"image size must be positive, got {self.width}x{self.height}")
+
+    def __len__(self) -> int:
+        return len(self.cam_from_world)
+
+    @property
+    def centers(self) -> Tensor:
+        """(V, 3) camera centres in the world."""
+        rotation, translation = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
+        return -(rotation.transpose(1, 2) @ translation[..., None])[..., 0]
+
+    def select(self, index: int) -> Cameras:
+        """The camera at ``index`` as a batch of one."""
+        return Cameras(self.cam_from_world[index][None], self.intrinsics[index][None], self.width, self.height)
+
+    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
+        """The same cameras on another device or in another precision."""
+        moved = (x.to(device=device, dtype=dtype) for x in (self.cam_from_world, self.intrinsics))
+        return Cameras(*moved, self.width, self.height)

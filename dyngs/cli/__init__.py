@@ -1,0 +1,107 @@
+"""The ``dyngs`` command: one verb per module of this package.
+
+Every module offers ``add_parser(commands)`` and a ``run(arguments) -> int``. What is heavy (torch, the native core,
+readers) is imported inside ``run``, so that ``dyngs --help`` is instant.
+
+Exit codes: 0 done; 2 bad input or usage, after one line on stderr; 130 interrupted. Anything unexpected keeps its
+traceback, because it is a bug.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import os
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from dyngs import __version__
+from dyngs.cli import data, demo, doctor, evaluate, export, render, train
+from dyngs.errors import DyngsError
+
+EXIT_ERROR = 2
+EXIT_INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The exit code of the command line ``argv`` (default: the process's own arguments)."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        code = _dispatch(arguments)
+        sys.stdout.flush()
+        return code
+    except DyngsError as error:
+        return _fail(str(error))
+    except KeyboardInterrupt as interrupt:
+        print(f"\ndyngs: interrupted{_after_colon(interrupt)}", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except OSError as error:
+        _abandon_broken_stdout()
+        return _fail(_describe_os_error(error))
+    except MemoryError:
+        return _fail("out of memory; use smaller pictures (data.longest_side) or a smaller cache (data.cache_mb)")
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if arguments[:1] == ["bench"]:  # has a parser of its own
+        from dyngs.bench import run_bench
+
+        return run_bench(arguments[1:])
+    parser = make_parser()
+    try:
+        parsed = parser.parse_args(arguments)
+    except SystemExit as stop:  # after --help or --version
+        return int(stop.code or 0)
+    if "run" not in parsed:
+        parser.print_help()
+        return 0
+    return parsed.run(parsed)
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose complaints are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise DyngsError(f"{message} (see `{self.prog} --help`)")
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
+    parser = _Parser(prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU.")
+    parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    for module in (demo, train, evaluate, render, export, data):
+        module.add_parser(commands)
+    commands.add_parser("bench", help="measure the speed of the rasterizer (dyngs bench rasterize)", add_help=False)
+    doctor.add_parser(commands)
+    return parser
+
+
+def _fail(message: str) -> int:
+    print(f"dyngs: error: {' '.join(message.split())}", file=sys.stderr)
+    return EXIT_ERROR
+
+
+def _abandon_broken_stdout() -> None:
+    """Point stdout to nowhere if it takes no more, because the interpreter would complain about that at its end."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _after_colon(error: BaseException) -> str:
+    return f": {error}" if str(error) else ""
+
+
+def _describe_os_error(error: OSError) -> str:
+    where = f"{error.filename}: " if error.filename is not None else ""
+    advice = {
+        errno.ENOSPC: "; free some space and run the command again, earlier results are untouched",
+        errno.EDQUOT: "; your quota is used up, free some space and run the command again",
+        errno.EPIPE: "; the program that read our output has gone",
+        errno.EACCES: "; choose another folder or change its permissions",
+        errno.EROFS: "; choose a folder that can be written",
+    }
+    return f"{where}{error.strerror or error}{advice.get(error.errno or 0, '')}"

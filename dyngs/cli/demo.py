@@ -1,0 +1,39 @@
+"""``dyngs demo``: everything at once, on a scene that comes with dyngs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from dyngs.errors import DyngsError
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``demo`` to the commands."""
+    parser = commands.add_parser(
+        "demo",
+        help="train, measure and render an embedded scene",
+        description="Ray trace an embedded scene, train on it, measure, render pictures and a video, write a .ply.",
+    )
+    parser.add_argument("--out", type=Path, default=Path("dyngs-demo"), metavar="DIR", help="default dyngs-demo")
+    parser.add_argument("--steps", type=int, default=2000, metavar="N", help="of training (default 2000)")
+    parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the demo, print the table and where the files are."""
+    if arguments.steps < 1 or arguments.threads < 0:
+        raise DyngsError("--steps must be at least 1, --threads at least 0")
+    from rich.console import Console
+
+    from dyngs.demo import DemoOptions, result_table, run_demo
+
+    result = run_demo(arguments.out, DemoOptions(steps=arguments.steps, threads=arguments.threads))
+    Console().print(result_table(result))
+    print(f"truth, render, error  {result.sheet}")
+    print(f"test views            {result.pictures}")
+    print(f"flight around it      {result.video}")
+    print(f"for other viewers     {result.ply}")
+    print(f"run folder            {result.run_dir}  (more pictures: dyngs render {result.run_dir} --out DIR)")
+    return 0

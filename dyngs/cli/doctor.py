@@ -1,0 +1,114 @@
+"""``dyngs doctor``: what this installation is made of, and whether it can work."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import metadata, util
+from pathlib import Path
+from typing import Literal
+
+from dyngs.errors import DyngsError
+
+_REQUIRED = {
+    "torch": "torch",
+    "numpy": "numpy",
+    "pydantic": "pydantic",
+    "pyyaml": "yaml",
+    "safetensors": "safetensors",
+    "rich": "rich",
+    "pycolmap": "pycolmap",
+    "trimesh": "trimesh",
+    "kornia": "kornia",
+    "OpenImageIO": "OpenImageIO",
+    "scikit-image": "skimage",
+    "scipy": "scipy",
+    "av": "av",
+}
+_OPTIONAL = {
+    "flip-evaluator": ("flip_evaluator", "the FLIP metric: pip install flip-evaluator"),
+    "lpips": ("lpips", "the LPIPS metric: pip install lpips"),
+    "tensorboard": ("tensorboard", "train.tensorboard=true: pip install tensorboard"),
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One row of the report; ``verdict`` is "ok", "absent" (optional and missing) or "broken"."""
+
+    name: str
+    value: str
+    verdict: Literal["ok", "absent", "broken"] = "ok"
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``doctor`` to the commands."""
+    parser = commands.add_parser("doctor", help="report versions, cores, instruction set and optional packages")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the report."""
+    from rich.console import Console
+    from rich.table import Table
+
+    findings = list(examine())
+    table = Table(show_header=False, box=None, pad_edge=False)
+    colours = {"ok": "green", "absent": "yellow", "broken": "red"}
+    for finding in findings:
+        table.add_row(finding.name, f"[{colours[finding.verdict]}]{finding.verdict}", finding.value)
+    Console().print(table)
+    broken = [finding.name for finding in findings if finding.verdict == "broken"]
+    if broken:
+        raise DyngsError(f"this installation cannot work: {', '.join(broken)} (see the rows marked broken)")
+    return 0
+
+
+def examine() -> Iterator[Finding]:
+    """What is installed, row by row."""
+    yield Finding("dyngs", _version("dyngs") or "not installed (run from a source folder)")
+    yield Finding("python", f"{platform.python_version()} on {platform.platform()}")
+    yield Finding("cores", f"{_usable_cores()} usable of {os.cpu_count()}")
+    for name, module in _REQUIRED.items():
+        yield Finding(name, _version(name) or "") if util.find_spec(module) else Finding(name, "missing", "broken")
+    yield from _examine_core()
+    for name, (module, purpose) in _OPTIONAL.items():
+        found = util.find_spec(module) is not None
+        yield Finding(name, _version(name) or "") if found else Finding(name, f"needed for {purpose}", "absent")
+
+
+def _examine_core() -> Iterator[Finding]:
+    try:
+        from dyngs.ops.native import active_isa
+
+        yield Finding("native core", f"instruction set {active_isa()}")
+    except ImportError as error:
+        yield Finding("native core", f"{error}; reinstall with `pip install --force-reinstall dyngs`", "broken")
+        return
+    runtimes = openmp_runtimes()
+    if runtimes is not None:
+        names = ", ".join(path.name for path in runtimes)
+        yield Finding("OpenMP runtimes", f"{len(runtimes)}: {names}" if runtimes else "0")
+
+
+def openmp_runtimes() -> list[Path] | None:
+    """The OpenMP runtimes loaded in this process (more than one fight over the cores); None where that is unknown."""
+    maps = Path("/proc/self/maps")
+    if not maps.is_file():
+        return None
+    paths = {Path(line.split(maxsplit=5)[5]) for line in maps.read_text().splitlines() if line.count("/")}
+    return sorted(path for path in paths if path.name.startswith(("libgomp", "libiomp", "libomp")))
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _usable_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

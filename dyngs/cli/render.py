@@ -1,0 +1,120 @@
+"""``dyngs render``: pictures and videos of a run, or of any 3DGS .ply."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dyngs.errors import DyngsError
+
+if TYPE_CHECKING:
+    from dyngs.view.shots import Shot
+
+_EPILOG = """\
+examples:
+  dyngs render runs/bench --out pictures                          the test views and a contact sheet
+  dyngs render runs/bench --out frames --path orbit --video orbit.mp4
+  dyngs render splats.ply --path spiral --video spiral.mp4 --up -y --size 1280x720
+"""
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``render`` to the commands."""
+    parser = commands.add_parser(
+        "render",
+        help="pictures and videos of a run or a .ply",
+        description="Render the views of a split beside their truth, or the frames of a camera path.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("source", type=Path, metavar="RUN_OR_PLY", help="a run folder, or a 3DGS .ply of any program")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the pictures")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--split", choices=("test", "val", "train"), help="render these views (default for a run: test)")
+    what.add_argument("--path", metavar="PATH", help="orbit (default for a .ply), spiral, or a .json file of cameras")
+    parser.add_argument("--video", type=Path, metavar="FILE.mp4", help="write a video too")
+    parser.add_argument("--frames", type=_count, default=120, metavar="N", help="of orbit and spiral (default 120)")
+    parser.add_argument("--fps", type=float, metavar="F", help="of the video (default 30, or what the .json says)")
+    parser.add_argument("--depth", action="store_true", help="write depth too: colours (.png) and world units (.exr)")
+    parser.add_argument("--alpha", action="store_true", help="write opacity too")
+    parser.add_argument("--size", type=_size, metavar="WxH", help="of the frames of a path, in pixels")
+    parser.add_argument("--background", choices=("white", "black"), help="of a path (default: that of training)")
+    parser.add_argument("--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="z", help="of a .ply (default z)")
+    parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Render and say what was written."""
+    written = _render(_checked(arguments))
+    folders = sorted({str(path.parent) for path in written})
+    print(f"written: {len(written)} files in {', '.join(folders)}")
+    for path in written:
+        if path.suffix == ".mp4" or path.name == "sheet.png":
+            print(f"         {path}")
+    return 0
+
+
+def _checked(arguments: argparse.Namespace) -> argparse.Namespace:
+    """The arguments, if they go together.
+
+    Raises:
+        DyngsError: nothing to render, nowhere to write, or options that mean nothing here.
+    """
+    is_file = arguments.source.is_file()
+    if is_file and arguments.split:
+        raise DyngsError(f"{arguments.source}: a file has no splits; use --path orbit, spiral or FILE.json")
+    if arguments.out is None and (arguments.video is None or not (is_file or arguments.path)):
+        raise DyngsError("say where to write: --out DIR (or --video FILE.mp4 with --path)")
+    if not arguments.source.exists():
+        raise DyngsError(f"{arguments.source}: no such run or file; give a folder that `dyngs train` wrote, or a .ply")
+    unfit = [f"--{name}" for name in ("size", "background") if getattr(arguments, name)]
+    if unfit and not (is_file or arguments.path):
+        raise DyngsError(f"{unfit[0]} goes with --path; the views of a split keep their size and background")
+    return arguments
+
+
+def _render(arguments: argparse.Namespace) -> list[Path]:
+    """The files written."""
+    import torch
+
+    if arguments.threads > 0:
+        torch.set_num_threads(arguments.threads)
+    if arguments.source.is_file() or arguments.path:
+        return _render_path(arguments)
+    return _render_split(arguments)
+
+
+def _render_split(arguments: argparse.Namespace) -> list[Path]:
+    from dyngs.view.frames import OutputOptions, write_split
+
+    output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or 30.0)
+    return write_split(arguments.source, arguments.split or "test", arguments.out, output)
+
+
+def _render_path(arguments: argparse.Namespace) -> list[Path]:
+    from dyngs.view.frames import OutputOptions, write_path_frames
+    from dyngs.view.shots import ShotOptions, shot_of_ply, shot_of_run
+
+    options = ShotOptions(
+        arguments.path or "orbit", arguments.frames, arguments.size, arguments.background, arguments.up
+    )
+    source: Path = arguments.source
+    shot: Shot = shot_of_ply(source, options) if source.is_file() else shot_of_run(source, options)
+    output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or shot.fps)
+    return write_path_frames(shot.gaussians, shot.cameras, arguments.out, shot.options, shot.background, output)
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.lower())
+    if not match or "0" in match.groups():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size; write WIDTHxHEIGHT, for instance 1280x720")
+    return int(match[1]), int(match[2])
+
+
+def _count(text: str) -> int:
+    if not text.isdigit() or not int(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of frames; write a whole number above 0")
+    return int(text)

@@ -1,0 +1,68 @@
+"""``dyngs train``: from a capture to a run folder."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dyngs.errors import DyngsError
+
+if TYPE_CHECKING:
+    from dyngs.config import Config
+
+_EPILOG = """\
+examples:
+  dyngs train configs/static.yaml data.root=scans/bench
+  dyngs train configs/static.yaml data.root=scans/bench train.steps=30000 run.dir=runs/bench run.threads=8
+  dyngs train --resume runs/bench
+
+CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip.
+All keys are listed in docs/cli.md; a wrong one is answered with what is allowed.
+"""
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``train`` to the commands."""
+    parser = commands.add_parser(
+        "train",
+        help="train a model from a capture",
+        description="Train a model from a capture; writes a run folder (default runs/NAME).",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("config", nargs="*", metavar="CONFIG key=value", help="preset and overrides")
+    parser.add_argument("--resume", type=Path, metavar="RUN", help="go on with an interrupted run")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train, and say what to do next."""
+    config = parse_config(arguments.config, arguments.resume)
+    from dyngs.train.trainer import train
+
+    folder = train(config, resume_from=arguments.resume)
+    print(f"trained: {folder}\nnext:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/pictures")
+    return 0
+
+
+def parse_config(words: Sequence[str], resume: Path | None) -> Config:
+    """The configuration that the words after ``dyngs train`` ask for.
+
+    Raises:
+        DyngsError: nothing to train, an override of a resumed run other than ``run.threads``, or a wrong key or value.
+    """
+    from dyngs.config_io import load_config, load_resolved
+
+    has_preset = bool(words) and "=" not in words[0]
+    preset, overrides = (Path(words[0]), words[1:]) if has_preset else (None, words)
+    if resume is None:
+        if not words:
+            raise DyngsError("give a config, for instance `dyngs train configs/static.yaml data.root=FOLDER`")
+        return load_config(preset, overrides)
+    other = [word for word in words if word.partition("=")[0].strip() != "run.threads"]
+    if other:
+        raise DyngsError(f"{other[0]!r}: a resumed run keeps its own config; only run.threads=N may be given")
+    config = load_resolved(resume, overrides)
+    return config.model_copy(update={"run": config.run.model_copy(update={"dir": resume})})

@@ -1,0 +1,146 @@
+"""The typed configuration of a run: frozen pydantic models, composed into ``Config``.
+
+Loading (YAML preset + ``a.b=c`` overrides + "did you mean") lives in ``dyngs.config_io``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from dyngs.conventions import RasterizeMode
+
+Positive = Annotated[float, Field(gt=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class Section(BaseModel):
+    """Base of every section: immutable, unknown keys are errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class DataConfig(Section):
+    """Where the pictures are and how they are read."""
+
+    root: Path = Field(description="capture folder")
+    format: Literal["auto", "blender", "nerfstudio", "colmap"] = "auto"
+    downscale: float = Field(1.0, ge=1.0, description="divide width and height by this")
+    longest_side: int | None = Field(None, ge=1, description="shrink so that the longer side has at most this many px")
+    test_every: int = Field(8, ge=0, description="every n-th picture by name is held out; 0 = none")
+    background: Literal["auto", "white", "black", "random"] = Field(
+        "auto", description="auto: white where the pictures have alpha, black otherwise"
+    )
+    cache_mb: float = Field(4096, ge=0, description="memory for decoded pictures")
+
+
+class PointsInit(Section):
+    """Start from the capture's sparse points (random ones where it has none)."""
+
+    kind: Literal["auto", "points"] = "auto"
+    num_random: int = Field(100_000, ge=1, description="used where the capture has no points")
+    half_extent: Positive = 1.3
+
+
+class RandomInit(Section):
+    """Start from uniformly random points in a cube around the origin (Blender scenes of 3DGS)."""
+
+    kind: Literal["random"] = "random"
+    num_random: int = Field(100_000, ge=1)
+    half_extent: Positive = Field(1.3, description="half the cube's side, world units")
+
+
+class StaticModel(Section):
+    """3D Gaussian splatting, Mip-Splatting's filters as options."""
+
+    kind: Literal["static"] = "static"
+    sh_degree: int = Field(3, ge=0, le=4)
+    rasterize_mode: RasterizeMode = RasterizeMode.CLASSIC
+    eps2d: float = Field(0.3, ge=0, description="2D low-pass variance, px^2 (Mip-Splatting: 0.1 with antialiased)")
+    filter_3d: bool = Field(False, description="Mip-Splatting's 3D smoothing filter")
+    near: Positive = Field(0.2, description="near plane, world units")
+
+
+class DefaultStrategy(Section):
+    """Clone, split and prune by the gradient of the 2D means (3DGS, AbsGS as an option).
+
+    Step numbers are those of a 30,000-step run and are scaled with ``train.steps``.
+    """
+
+    kind: Literal["default"] = "default"
+    absgrad: bool = False
+    grad_threshold: Positive = Field(2e-4, description="mean over visible views, NDC units (8e-4 suits absgrad)")
+    dense_fraction: Positive = Field(0.01, description="of the extent: smaller ones are cloned, larger ones split")
+    start: int = 500
+    stop: int = 15_000
+    every: int = Field(100, ge=1, description="not scaled")
+    prune_opacity: Fraction = 0.005
+    prune_scale: Positive = Field(0.1, description="of the extent, after the first opacity reset")
+    reset_every: int = Field(3000, ge=1)
+    max_gaussians: int = Field(3_000_000, ge=1)
+
+
+class McmcStrategy(Section):
+    """3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024): a cap, relocation, noise."""
+
+    kind: Literal["mcmc"] = "mcmc"
+    max_gaussians: int = Field(300_000, ge=1)
+    start: int = 500
+    stop: int = 25_000
+    every: int = Field(100, ge=1)
+    growth: Positive = 0.05
+    min_opacity: Fraction = 0.005
+    noise: float = Field(5e5, ge=0)
+    opacity_reg: float = Field(0.01, ge=0)
+    scale_reg: float = Field(0.01, ge=0)
+    init_opacity: Fraction = 0.5
+    init_scale: Positive = 0.1
+
+
+class OptimConfig(Section):
+    """Adam and its learning rates (methods: 3DGS)."""
+
+    lr_means: Positive = Field(1.6e-4, description="times the scene extent")
+    lr_means_final: Positive = 1.6e-6
+    lr_sh_dc: Positive = 2.5e-3
+    lr_sh_rest: Positive = 1.25e-4
+    lr_opacities: Positive = 0.05
+    lr_scales: Positive = 5e-3
+    lr_quats: Positive = 1e-3
+    eps: Positive = 1e-15
+    sparse: bool = Field(True, description="skip Gaussians that received no gradient in the step")
+
+
+class TrainConfig(Section):
+    """Length, loss and logging of a run."""
+
+    steps: int = Field(7000, ge=1)
+    ssim_weight: Fraction = 0.2
+    sh_every: int = Field(1000, ge=1, description="steps (of 30,000) between SH degree increments")
+    log_every: int = Field(10, ge=1)
+    save_every: int = Field(0, ge=0, description="steps between checkpoints; 0 = only the last")
+    eval_every: int = Field(0, ge=0, description="steps between evaluations; 0 = only when `dyngs eval` is called")
+    tensorboard: bool = False
+
+
+class RunConfig(Section):
+    """Where the run goes and how it is executed."""
+
+    name: str = "static"
+    dir: Path | None = Field(None, description="run folder; default runs/NAME")
+    seed: int = Field(42, ge=0)
+    threads: int = Field(0, ge=0, description="0 = all cores")
+
+
+class Config(Section):
+    """Everything that decides a run."""
+
+    data: DataConfig
+    model: StaticModel = StaticModel()
+    init: Annotated[PointsInit | RandomInit, Field(discriminator="kind")] = PointsInit()
+    strategy: Annotated[DefaultStrategy | McmcStrategy, Field(discriminator="kind")] = DefaultStrategy()
+    optim: OptimConfig = OptimConfig()
+    train: TrainConfig = TrainConfig()
+    run: RunConfig = RunConfig()

@@ -1,0 +1,388 @@
+"""Configurations from and to YAML: presets, ``a.b=c`` overrides, and errors that say what is allowed.
+
+A preset is a short YAML file; overrides are laid over it; ``dyngs.config.Config`` checks the result and fills in the
+rest. What was resolved is saved with every run and is all that later commands read.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+from yaml.composer import ComposerError
+
+from dyngs.config import Config
+from dyngs.config_schema import allowed_values, choices_of, config_keys, keys_of_section, section_class
+from dyngs.data.write import write_text
+from dyngs.errors import DyngsError
+
+RESOLVED_NAME = "config.yaml"
+"""Name of the resolved configuration inside a run folder."""
+
+_EXACT_FLOAT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
+
+
+# ---------------------------------------------------------------------------------------------------- loading
+
+
+def load_config(preset: Path | None, overrides: Iterable[str] = ()) -> Config:
+    """The configuration of a preset with overrides laid over it.
+
+    Args:
+        preset: a YAML file, or the name of a packaged preset (``static``, ``configs/static.yaml``) where no such file
+            exists; None starts from the defaults.
+        overrides: ``section.key=value`` with the value in YAML. A changed ``kind`` replaces its whole section, whatever
+            the order of the overrides.
+
+    Returns:
+        the checked configuration; ``data.root`` is made absolute, so that later commands work from any folder.
+
+    Raises:
+        DyngsError: naming the file and line or the override, the key, and what is allowed.
+    """
+    layers = _Layers()
+    if preset is not None:
+        layers.add_file(find_preset(preset))
+    parsed = [_parse_override(text) for text in overrides]
+    for override in sorted(parsed, key=lambda o: o.keys[-1] != "kind"):  # stable: kinds first
+        layers.add_override(override)
+    config = _validate(layers)
+    data = config.data.model_copy(update={"root": config.data.root.absolute()})
+    return config.model_copy(update={"data": data})
+
+
+def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
+    """The configuration of a finished or interrupted run.
+
+    Args:
+        path: a run folder, or the YAML file in it.
+        overrides: as in ``load_config``.
+
+    Raises:
+        DyngsError: if there is none, or it is broken.
+    """
+    file = path / RESOLVED_NAME if path.is_dir() else path
+    if not file.is_file():
+        raise DyngsError(
+            f"{path}: not a run folder (no {RESOLVED_NAME} there); give the folder that `dyngs train` wrote"
+        )
+    layers = _Layers()
+    layers.add_file(file)
+    for text in overrides:
+        layers.add_override(_parse_override(text))
+    return _validate(layers)
+
+
+def save_config(config: Config, path: Path) -> None:
+    """Write every value of ``config`` as YAML, atomically: ``path`` is either the old file or the new one."""
+    text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    write_text(path, text)
+
+
+def find_preset(path: Path) -> Path:
+    """The preset file meant by ``path``: itself if it exists, else the packaged preset of that name.
+
+    Only a bare name or one below ``configs/`` is looked for in the package, so that a mistyped path of the user's own
+    is an error. In a source checkout the package's presets are those in the repository's ``configs``.
+    """
+    if path.is_file():
+        return path
+    packaged = _packaged_presets()
+    if path.parent.name in ("", "configs") and path.suffix in ("", ".yaml", ".yml") and path.stem in packaged:
+        return packaged[path.stem]
+    if path.exists() and not path.is_dir():
+        raise DyngsError(f"{path}: not a regular file; give a YAML preset")
+    close = get_close_matches(path.stem, packaged, n=1)
+    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    raise DyngsError(f"{path}: no such preset{hint}; the packaged ones are {', '.join(sorted(packaged))}")
+
+
+def packaged_preset(name: str) -> Path:
+    """The file of the preset ``name`` that comes with dyngs, for instance ``static``.
+
+    Raises:
+        DyngsError: there is none of that name.
+    """
+    packaged = _packaged_presets()
+    if name not in packaged:
+        raise DyngsError(f"no packaged preset {name!r}; there are {', '.join(sorted(packaged))}")
+    return packaged[name]
+
+
+def _packaged_presets() -> dict[str, Path]:
+    here = Path(__file__).resolve().parent
+    folder = next((f for f in (here / "configs", here.parent / "configs") if f.is_dir()), None)
+    return {f.stem: f for f in sorted(folder.glob("*.yaml"))} if folder else {}
+
+
+# ---------------------------------------------------------------------------------------------------- YAML text
+
+
+class _PresetLoader(yaml.SafeLoader):
+    """Safe YAML without aliases, and with ``1e-4`` read as the number that it is."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+            raise ComposerError(None, None, "aliases (*name) are not allowed here", mark)
+        return super().compose_node(parent, index)
+
+
+_PresetLoader.add_implicit_resolver("tag:yaml.org,2002:float", _EXACT_FLOAT, list("-+.0123456789"))
+
+
+@dataclass(frozen=True)
+class _Leaf:
+    """One value of a YAML text: where it lies, what it is, and how it was written."""
+
+    keys: tuple[str, ...]
+    value: Any
+    text: str
+    line: int
+
+
+def _read_leaves(text: str, origin: str) -> list[_Leaf]:
+    """The values of a YAML mapping in file order; an empty section is a leaf of value None."""
+    loader = _PresetLoader(text)
+    try:
+        root = loader.get_single_node()
+        if root is None:
+            return []
+        if not isinstance(root, yaml.MappingNode):
+            raise DyngsError(f"{origin}: must be a mapping of sections (data:, train:, ...)")
+        return list(_walk(loader, root, (), origin))
+    except yaml.YAMLError as error:
+        raise DyngsError(_describe_yaml_error(error, origin)) from None
+    except RecursionError:
+        raise DyngsError(f"{origin}: nested too deeply for a configuration") from None
+    finally:
+        loader.dispose()
+
+
+def _walk(loader: yaml.SafeLoader, node: yaml.MappingNode, above: tuple[str, ...], origin: str) -> Iterator[_Leaf]:
+    seen: set[str] = set()
+    for key_node, value_node in node.value:
+        line = key_node.start_mark.line + 1
+        if not isinstance(key_node, yaml.ScalarNode):
+            raise DyngsError(f"{origin}:{line}: keys must be plain words")
+        key = key_node.value
+        if "." in key:
+            raise DyngsError(f"{origin}:{line}: {key!r} must be nested in YAML: {key.replace('.', ': {', 1)}: ...}}")
+        if key in seen:
+            raise DyngsError(f"{origin}:{line}: duplicate key {'.'.join((*above, key))}; keep one of the two")
+        seen.add(key)
+        if isinstance(value_node, yaml.MappingNode) and value_node.value:
+            yield from _walk(loader, value_node, (*above, key), origin)
+        else:
+            text = value_node.value if isinstance(value_node, yaml.ScalarNode) else ""
+            yield _Leaf((*above, key), loader.construct_object(value_node, deep=True), text, line)
+
+
+def _describe_yaml_error(error: yaml.YAMLError, origin: str) -> str:
+    if isinstance(error, yaml.MarkedYAMLError):
+        mark = error.problem_mark or error.context_mark
+        problem = error.problem or error.context or "not valid YAML"
+        if "'\\t'" in problem:
+            problem = "a tab where YAML wants spaces; indent with spaces"
+        where = f":{mark.line + 1}" if mark is not None else ""
+        return f"{origin}{where}: not valid YAML: {problem}"
+    return f"{origin}: not valid YAML: {' '.join(str(error).split())}"
+
+
+# ---------------------------------------------------------------------------------------------------- layers
+
+
+@dataclass(frozen=True)
+class _Override:
+    keys: tuple[str, ...]
+    text: str
+    origin: str
+
+
+def _parse_override(text: str) -> _Override:
+    key, equals, value = text.partition("=")
+    keys = tuple(key.strip().split("."))
+    if not equals or not all(re.fullmatch(r"\w+", k) for k in keys):
+        raise DyngsError(f"{text!r} is not an override; write section.key=value, for instance train.steps=2000")
+    return _Override(keys, value.strip(), text)
+
+
+@dataclass
+class _Layers:
+    """The tree that is being put together, and for every value where it came from."""
+
+    tree: dict[str, Any] = field(default_factory=dict)
+    origins: dict[tuple[str, ...], str] = field(default_factory=dict)
+    written: dict[tuple[str, ...], str] = field(default_factory=dict)
+
+    def add_file(self, path: Path) -> None:
+        try:
+            text = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError:
+            raise DyngsError(f"{path}: not a text file in UTF-8; give a YAML preset") from None
+        except OSError as error:
+            raise DyngsError(f"{path}: cannot be read ({error.strerror})") from None
+        for leaf in _read_leaves(text, str(path)):
+            self._set(leaf.keys, leaf.value, leaf.text, f"{path}:{leaf.line}")
+
+    def add_override(self, override: _Override) -> None:
+        loader = _PresetLoader(override.text)
+        try:
+            node = loader.get_single_node()
+            if isinstance(node, yaml.MappingNode) and node.value:
+                leaves = list(_walk(loader, node, override.keys, override.origin))
+                for leaf in sorted(leaves, key=lambda o: o.keys[-1] != "kind"):
+                    if leaf.keys[-1] == "kind":
+                        self._drop_other_kind(leaf.keys[0], leaf.value)
+                    self._set(leaf.keys, leaf.value, leaf.text, override.origin)
+                return
+            value = None if node is None else loader.construct_object(node, deep=True)
+        except (yaml.YAMLError, RecursionError):
+            value = override.text  # a path or a name that happens not to be YAML
+        finally:
+            loader.dispose()
+        if override.keys[-1] == "kind":
+            self._drop_other_kind(override.keys[0], value)
+        self._set(override.keys, value, override.text, override.origin)
+
+    def _drop_other_kind(self, name: str, kind: Any) -> None:
+        """Empty section ``name`` if it is of another kind than ``kind``."""
+        section = self.tree.get(name)
+        if isinstance(section, dict) and name in Config.model_fields:
+            present = section.get("kind", section_class(name).model_fields["kind"].default)
+            if present != kind:
+                section.clear()
+
+    def _set(self, keys: tuple[str, ...], value: Any, text: str, origin: str) -> None:
+        section = self.tree
+        for depth, key in enumerate(keys[:-1], start=1):
+            inner = section.setdefault(key, {})
+            if inner is None:
+                inner = section[key] = {}
+            if not isinstance(inner, dict):
+                raise DyngsError(f"{origin}: {'.'.join(keys[:depth])} is a value, it has no key {keys[depth]!r}")
+            section = inner
+        if isinstance(value, str) and value.startswith("~/"):
+            value = os.path.expanduser(value)
+        section[keys[-1]] = value
+        self.origins[keys], self.written[keys] = origin, text
+
+    def origin_of(self, keys: tuple[str, ...]) -> str:
+        """Where the value at ``keys``, or else the first one below it, was written; "" if nowhere."""
+        below = (origin for k, origin in self.origins.items() if k[: len(keys)] == keys)
+        return self.origins.get(keys) or next(below, "")
+
+
+# ---------------------------------------------------------------------------------------------------- checking
+
+
+def _validate(layers: _Layers) -> Config:
+    for name, info in Config.model_fields.items():
+        if layers.tree.get(name) is None:
+            layers.tree[name] = {}
+        section = layers.tree[name]
+        if info.discriminator and isinstance(section, dict):
+            section.setdefault("kind", info.get_default().kind)
+    try:
+        return Config.model_validate(layers.tree)
+    except ValidationError as error:
+        problems = sorted(error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden")
+    if _take_as_text(layers, problems):
+        return _validate(layers)
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    raise DyngsError(_explain(layers, problems[0]) + more)
+
+
+def _take_as_text(layers: _Layers, problems: list[ErrorDetails]) -> bool:
+    """Replace numbers, dates and such by what was written where the schema wants text; True if anything changed."""
+    changed = False
+    for problem in problems:
+        keys = _keys_of(layers.tree, problem["loc"])
+        if problem["type"] in ("string_type", "path_type") and layers.written.get(keys):
+            section = layers.tree
+            for key in keys[:-1]:
+                section = section[key]
+            changed = changed or section[keys[-1]] != layers.written[keys]
+            section[keys[-1]] = layers.written[keys]
+    return changed
+
+
+def _keys_of(tree: dict[str, Any], loc: tuple[int | str, ...]) -> tuple[str, ...]:
+    """The keys of a pydantic location, without the ``kind`` tags that pydantic puts between them."""
+    keys: list[str] = []
+    section: Any = tree
+    for i, part in enumerate(loc):
+        is_tag = isinstance(section, dict) and section.get("kind") == part and 0 < i < len(loc) - 1
+        if is_tag and part not in section:
+            continue
+        keys.append(str(part))
+        section = section.get(part) if isinstance(section, dict) else None
+    return tuple(keys)
+
+
+def _explain(layers: _Layers, problem: ErrorDetails) -> str:
+    keys = _keys_of(layers.tree, problem["loc"])
+    kind = problem["type"]
+    if kind == "union_tag_invalid":
+        keys = (*keys, "kind")
+    origin = layers.origin_of(keys)
+    prefix = f"{origin}: " if origin else ""
+    dotted = ".".join(keys)
+    section = _section_at(layers.tree, keys)
+    if kind == "extra_forbidden":
+        full = next((k for k in layers.origins if k[: len(keys)] == keys), keys)
+        owners = [k.kind for k in config_keys() if k.name == dotted]
+        if owners:
+            return f"{prefix}{dotted} belongs to {keys[0]}.kind={owners[0]}, not to {layers.tree[keys[0]].get('kind')}"
+        return f"{prefix}unknown key {dotted!r}{_did_you_mean_key(full, section)}"
+    if kind == "missing":
+        example = "data.root=FOLDER" if dotted == "data.root" else f"{dotted}=..."
+        return f"{prefix}{dotted} is missing ({section.model_fields[keys[-1]].description}); give {example}"
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        return f"{prefix}{dotted} is a section, not a value; its keys: {', '.join(keys_of_section(dotted))}"
+    value = problem["input"].get("kind") if kind == "union_tag_invalid" else problem["input"]
+    if kind == "union_tag_invalid":
+        choices = [c.strip().strip("'") for c in problem.get("ctx", {})["expected_tags"].split(",")]
+        allowed = f"one of {', '.join(choices)}"
+    else:
+        info = section.model_fields[keys[-1]]
+        choices, allowed = choices_of(info.annotation), allowed_values(info)
+    close = get_close_matches(str(value), choices, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return f"{prefix}{dotted} must be {allowed}, not {_shorten(value)}{hint}"
+
+
+def _section_at(tree: dict[str, Any], keys: tuple[str, ...]) -> type[BaseModel]:
+    """The section class that holds the last of ``keys`` (``Config`` itself for a section)."""
+    if len(keys) < 2 or keys[0] not in Config.model_fields:
+        return Config
+    return section_class(keys[0], tree[keys[0]].get("kind"))
+
+
+def _shorten(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _did_you_mean_key(keys: tuple[str, ...], section: type[BaseModel]) -> str:
+    """``; did you mean ...?`` with the nearest key, preferring the same section, then the same last word elsewhere."""
+    everything = [key.name for key in config_keys()]
+    above = keys[:-1]
+    siblings = get_close_matches(keys[-1], list(section.model_fields), n=1)
+    elsewhere = [name for name in everything if name.split(".")[-1] == keys[-1]]
+    if siblings and len(above) == 1 and above[0] in Config.model_fields:
+        return f"; did you mean {'.'.join((*above, siblings[0]))!r}?"
+    if elsewhere:
+        return f"; did you mean {' or '.join(repr(name) for name in dict.fromkeys(elsewhere))}?"
+    close = get_close_matches(".".join(keys), everything, n=1)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; known here: {', '.join(section.model_fields)}"

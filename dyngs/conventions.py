@@ -1,0 +1,41 @@
+"""Conventions shared by every module: shape letters, frames, units, enums.
+
+Shape letters used in all docstrings:
+
+====== ==========================================================
+N      Gaussians
+V      views (cameras)
+H, W   image height and width in pixels
+K      spherical-harmonics terms, ``(degree + 1) ** 2``
+D      colour or feature channels
+J, M   joints, mesh vertices
+F      frames of a sequence
+====== ==========================================================
+
+Frames: cameras are OpenCV (x right, y down, z forward); ``cam_from_world`` maps world points to camera points.
+Quaternions are wxyz. The centre of the first pixel is (0.5, 0.5). Time lies in [0, 1] over the capture.
+Colours are display-referred sRGB in [0, 1].
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic: ``rgb = SH_C0 * f_dc + 0.5``."""
+
+MAX_SH_DEGREE = 4
+
+
+class RasterizeMode(str, Enum):
+    """How the 2D low-pass filter is applied."""
+
+    CLASSIC = "classic"
+    """Add ``eps2d`` to the diagonal of the 2D covariance, opacity unchanged (3DGS)."""
+    ANTIALIASED = "antialiased"
+    """Also scale the opacity by sqrt(det / det_filtered) (Mip-Splatting 2D filter)."""
+
+
+def num_sh_terms(degree: int) -> int:
+    """Number of SH terms K for ``degree``."""
+    return (degree + 1) ** 2

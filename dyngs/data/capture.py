@@ -1,0 +1,90 @@
+"""What a reader returns: an immutable description of a captured scene, images not yet decoded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+Split = Literal["train", "val", "test"]
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Lens distortion of one view; images are undistorted to a pinhole on load.
+
+    Attributes:
+        model: "none", "opencv" (k1 k2 p1 p2 [k3 k4 k5 k6]) or "fisheye" (OpenCV equidistant k1..k4).
+        params: the coefficients, in OpenCV's order.
+    """
+
+    model: Literal["none", "opencv", "fisheye"] = "none"
+    params: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class View:
+    """One picture and its camera.
+
+    Attributes:
+        name: unique within the capture (usually the path below the root, without extension).
+        image_path: picture file.
+        cam_from_world: (4, 4) float64, OpenCV axes, in the capture's rebased world (see ``Capture.world_offset``).
+        intrinsics: (3, 3) float64 in pixels of the *stored* picture size.
+        width, height: stored picture size in pixels.
+        camera_id: which physical camera took it.
+        mask_path: white = keep, black = ignore; None without a mask.
+        time: in [0, 1], or None for a still scene.
+        frame: frame number of a sequence, or None.
+    """
+
+    name: str
+    image_path: Path
+    cam_from_world: np.ndarray
+    intrinsics: np.ndarray
+    width: int
+    height: int
+    lens: Lens = field(default_factory=Lens)
+    camera_id: int = 0
+    mask_path: Path | None = None
+    time: float | None = None
+    frame: int | None = None
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Sparse points: ``xyz`` (P, 3) float64 in the rebased world, ``rgb`` (P, 3) uint8."""
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A scene on disk.
+
+    Attributes:
+        root: the folder.
+        format: "blender", "nerfstudio" or "colmap".
+        splits: split name to views, each tuple sorted by name; train is never empty.
+        points: sparse points or None.
+        world_offset: (3,) float64 added to rebased coordinates to get the file's coordinates (zero unless the scene
+            lies far from its origin).
+        has_alpha: pictures carry straight alpha that means "transparent here".
+        body: per-frame body parameters (arrays with F rows) for human captures, else None.
+        warnings: suspicious things met while reading, one line each.
+    """
+
+    root: Path
+    format: str
+    splits: dict[Split, tuple[View, ...]]
+    points: PointCloud | None = None
+    world_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    has_alpha: bool = False
+    body: dict[str, np.ndarray] | None = None
+    warnings: tuple[str, ...] = ()
+
+    def replace(self, **changes: object) -> Capture:
+        return replace(self, **changes)  # type: ignore[arg-type]

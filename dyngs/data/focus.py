@@ -1,0 +1,29 @@
+"""What a set of cameras looks at."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def focus_point(world_from_cam: np.ndarray) -> np.ndarray | None:
+    """(3,) point nearest to all optical axes in the least-squares sense, or None where they are all but parallel.
+
+    It may lie behind the cameras; see ``share_in_front``.
+
+    Args:
+        world_from_cam: (V, 4, 4) rigid OpenCV poses.
+    """
+    centers, axes = world_from_cam[:, :3, 3], world_from_cam[:, :3, 2]
+    middle = centers.mean(axis=0)
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal_matrix = projectors.mean(axis=0)
+    if np.linalg.eigvalsh(normal_matrix)[0] <= 1e-4:
+        return None
+    right_side = np.einsum("vij,vj->i", projectors, centers - middle) / len(centers)
+    return middle + np.linalg.solve(normal_matrix, right_side)
+
+
+def share_in_front(world_from_cam: np.ndarray, point: np.ndarray) -> float:
+    """Share of the cameras (V, 4, 4) that have ``point`` (3,) before them."""
+    depth = np.einsum("vi,vi->v", point - world_from_cam[:, :3, 3], world_from_cam[:, :3, 2])
+    return float((depth > 0).mean())

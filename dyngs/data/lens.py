@@ -1,0 +1,118 @@
+"""Lens distortion removed by resampling: from the stored picture to a pinhole one with the same camera matrix."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.data.capture import Lens
+
+_ROWS_PER_CHUNK = 256
+
+
+@dataclass(frozen=True)
+class LensMap:
+    """Where each pixel of the pinhole picture is found in the stored one.
+
+    Attributes:
+        grid: (H, W, 2) float32 positions (x, y) in [-1, 1] from outer edge to outer edge of the stored picture.
+        valid: (H, W) bool, the position lies inside the stored picture.
+    """
+
+    grid: Tensor
+    valid: Tensor
+
+
+def is_pinhole(lens: Lens) -> bool:
+    """Whether the lens needs no resampling. A fisheye with zero coefficients is not a pinhole."""
+    return lens.model == "none" or (lens.model == "opencv" and not any(lens.params))
+
+
+def distort(lens: Lens, points: Tensor) -> Tensor:
+    """(..., 2) positions at which the lens images ``points``, both on the plane z = 1.
+
+    "opencv": Brown-Conrady, ``x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)`` plus the tangential
+    terms. "fisheye": ``theta (1 + k1 theta^2 + .. + k4 theta^8)`` along the direction of the point, theta = atan(r).
+    """
+    if is_pinhole(lens):
+        return points
+    if lens.model == "fisheye":
+        return _distort_fisheye(lens, points)
+    from kornia.geometry.calibration import distort_points
+
+    identity = torch.eye(3, dtype=points.dtype)[None]
+    coefficients = torch.tensor([_padded(lens.params)], dtype=points.dtype)
+    return distort_points(points.reshape(1, -1, 2), identity, coefficients).reshape(points.shape)
+
+
+def undistort_map(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> LensMap:
+    """The resampling map of a picture of that size; the pinhole picture has the same size and ``intrinsics`` (3, 3).
+
+    Computed in float64. Where the polynomial of the lens turns back (far outside its field of view) nothing is valid:
+    otherwise the inside of the picture would appear there a second time.
+    """
+    fx, fy, cx, cy = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    center, focal = torch.tensor([cx, cy], dtype=torch.float64), torch.tensor([fx, fy], dtype=torch.float64)
+    size = torch.tensor([width, height], dtype=torch.float64)
+    x = torch.arange(width, dtype=torch.float64) + 0.5
+    limit = _radius_limit(lens, intrinsics, width, height)
+    grid = torch.empty(height, width, 2)
+    valid = torch.empty(height, width, dtype=torch.bool)
+    for top in range(0, height, _ROWS_PER_CHUNK):
+        rows = slice(top, min(top + _ROWS_PER_CHUNK, height))
+        y = torch.arange(rows.start, rows.stop, dtype=torch.float64) + 0.5
+        points = (torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1) - center) / focal
+        found = distort(lens, points) * focal + center
+        grid[rows] = (2 * found / size - 1).float()
+        inside = ((found >= 0) & (found <= size)).all(dim=-1)
+        valid[rows] = inside & (points.norm(dim=-1) <= limit)
+    return LensMap(grid, valid)
+
+
+def undistort(pixels: Tensor, lens_map: LensMap) -> Tensor:
+    """(H, W, D) float pinhole picture in [0, 1], bicubic; zero where ``lens_map`` is not valid.
+
+    Args:
+        pixels: (H, W, D) float in [0, 1], colours premultiplied.
+    """
+    resampled = torch.nn.functional.grid_sample(
+        pixels.permute(2, 0, 1)[None], lens_map.grid[None], mode="bicubic", padding_mode="border", align_corners=False
+    )[0].permute(1, 2, 0)
+    return resampled.clamp(0, 1) * lens_map.valid[..., None]
+
+
+def _padded(params: tuple[float, ...]) -> tuple[float, ...]:
+    """The coefficients padded with zeros to a length that OpenCV's order knows (4, 5 or 8)."""
+    size = next(n for n in (4, 5, 8) if n >= len(params))
+    return params + (0.0,) * (size - len(params))
+
+
+def _distort_fisheye(lens: Lens, points: Tensor) -> Tensor:
+    radius = points.norm(dim=-1, keepdim=True)
+    angle = torch.atan(radius)
+    return points * torch.where(radius > 1e-9, _fisheye_radius(lens, angle) / radius.clamp(min=1e-9), 1.0)
+
+
+def _fisheye_radius(lens: Lens, angle: Tensor) -> Tensor:
+    series = torch.ones_like(angle)
+    for power, k in enumerate(lens.params, start=1):
+        series = series + k * angle ** (2 * power)
+    return angle * series
+
+
+def _radius_limit(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> float:
+    """Radius on z = 1 up to which the distorted radius grows, looked for within the picture's corners."""
+    corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], dtype=np.float64)
+    corners = (corners - intrinsics[:2, 2]) / np.diag(intrinsics)[:2]
+    radii = torch.linspace(0, float(np.linalg.norm(corners, axis=1).max()), 4096, dtype=torch.float64)
+    if lens.model == "fisheye":
+        distorted = _fisheye_radius(lens, torch.atan(radii))
+    else:
+        k1, k2, _, _, k3, k4, k5, k6 = (*lens.params, *(0.0,) * 8)[:8]
+        r2 = radii**2
+        distorted = radii * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    turns = torch.nonzero(~(distorted.diff() > 0))
+    return float(radii[turns[0, 0]]) if len(turns) else float("inf")

@@ -1,0 +1,202 @@
+"""Pictures ready for training: decoded, undistorted, downscaled and cached within a memory limit."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from threading import Lock
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.config import DataConfig
+from dyngs.data.capture import View
+from dyngs.data.images import (
+    area_downscale,
+    check_picture,
+    premultiplied,
+    read_mask,
+    read_picture,
+    straight_uint8,
+    target_size,
+)
+from dyngs.data.intrinsics import scaled_intrinsics
+from dyngs.data.lens import LensMap, is_pinhole, undistort, undistort_map
+from dyngs.errors import DyngsError
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One view as a training target.
+
+    Attributes:
+        name: the view's.
+        cameras: V = 1 pinhole camera of this picture's size, float32.
+        rgb_premultiplied: (H, W, 3) float32, colours times alpha.
+        alpha: (H, W) float32 in [0, 1], None where the file has no alpha.
+        mask: (H, W) float32, 1 = counts in the loss, 0 = ignore; None where all pixels count.
+        time: in [0, 1] or None.
+    """
+
+    name: str
+    cameras: Cameras
+    rgb_premultiplied: Tensor
+    alpha: Tensor | None
+    mask: Tensor | None
+    time: float | None
+
+    def composite(self, background: Tensor) -> Tensor:
+        """(H, W, 3) picture over ``background`` (3,)."""
+        if self.alpha is None:
+            return self.rgb_premultiplied
+        return self.rgb_premultiplied + (1 - self.alpha[..., None]) * background
+
+
+@dataclass(frozen=True)
+class _Decoded:
+    """What the cache holds: (H, W, 3 or 4) uint8 straight-alpha pixels and the (H, W) bool mask."""
+
+    pixels: Tensor
+    mask: Tensor | None
+
+    @property
+    def num_bytes(self) -> int:
+        return self.pixels.numel() + (0 if self.mask is None else self.mask.numel())
+
+
+class PictureLoader:
+    """A sequence of pictures that decodes on demand and keeps the last used ones, up to ``options.cache_mb``.
+
+    The same index always gives the same bytes, cached or not. Safe to use from several threads.
+    """
+
+    def __init__(self, views: Sequence[View], options: DataConfig) -> None:
+        """Checks every file (not every pixel) at once, so that a bad capture fails before training starts.
+
+        Args:
+            views: one split of a capture.
+            options: downscale, longest_side, cache_mb.
+
+        Raises:
+            DyngsError: missing pictures (count and first), damaged ones, or a size that is not the view's.
+        """
+        self._views = tuple(views)
+        self._options = options
+        self._cache: OrderedDict[int, _Decoded] = OrderedDict()
+        self._cached_bytes = 0
+        self._last_map: tuple[object, LensMap] | None = None
+        self._lock = Lock()
+        check_files(self._views)
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, index: int) -> Picture:
+        """The picture of view ``index``.
+
+        Raises:
+            DyngsError: the file turns out to be truncated, or its mask has another size.
+        """
+        view = self._views[index]
+        decoded = self._decoded(index % len(self._views))
+        height, width = decoded.pixels.shape[:2]
+        intrinsics = scaled_intrinsics(view.intrinsics, width / view.width, height / view.height)
+        pixels = premultiplied(decoded.pixels)
+        return Picture(
+            name=view.name,
+            cameras=Cameras(
+                torch.from_numpy(view.cam_from_world).float()[None],
+                torch.from_numpy(intrinsics).float()[None],
+                width,
+                height,
+            ),
+            rgb_premultiplied=pixels[..., :3].contiguous(),
+            alpha=pixels[..., 3].contiguous() if pixels.shape[-1] == 4 else None,
+            mask=None if decoded.mask is None else decoded.mask.float(),
+            time=view.time,
+        )
+
+    @property
+    def cached_bytes(self) -> int:
+        """Memory that decoded pictures occupy at the moment."""
+        return self._cached_bytes
+
+    def _decoded(self, index: int) -> _Decoded:
+        with self._lock:
+            if index in self._cache:
+                self._cache.move_to_end(index)
+                return self._cache[index]
+        decoded = self._decode(self._views[index])
+        limit = self._options.cache_mb * 1e6
+        with self._lock:
+            if index not in self._cache and decoded.num_bytes <= limit:
+                self._cache[index] = decoded
+                self._cached_bytes += decoded.num_bytes
+            while self._cached_bytes > limit:
+                self._cached_bytes -= self._cache.popitem(last=False)[1].num_bytes
+        return decoded
+
+    def _decode(self, view: View) -> _Decoded:
+        pixels = read_picture(view.image_path)
+        mask = None if view.mask_path is None else read_mask(view.mask_path)
+        if mask is not None and mask.shape != pixels.shape[:2]:
+            raise DyngsError(
+                f"{view.mask_path}: the mask is {mask.shape[1]}x{mask.shape[0]} but its picture is {view.width}x"
+                f"{view.height}; make them the same size"
+            )
+        size = target_size(view.width, view.height, self._options.downscale, self._options.longest_side)
+        if is_pinhole(view.lens) and size == (view.width, view.height):
+            return _Decoded(pixels, mask)
+        linear = premultiplied(pixels)
+        if not is_pinhole(view.lens):
+            lens_map = self._lens_map(view)
+            linear = undistort(linear, lens_map)
+            mask = _undistorted_mask(mask, lens_map)
+        linear = area_downscale(linear, *size)
+        if mask is not None:
+            # A pixel counts only if all that it covers counts: otherwise what is masked out bleeds in.
+            mask = area_downscale(mask.float()[..., None], *size)[..., 0] > 1 - 1e-4
+        return _Decoded(straight_uint8(linear), mask)
+
+    def _lens_map(self, view: View) -> LensMap:
+        """The map of the last used camera is kept: captures mostly have one camera, and a map is big."""
+        key = (view.lens, view.intrinsics.tobytes(), view.width, view.height)
+        last = self._last_map
+        if last is None or last[0] != key:
+            last = (key, undistort_map(view.lens, view.intrinsics, view.width, view.height))
+            self._last_map = last
+        return last[1]
+
+
+def check_files(views: Sequence[View]) -> None:
+    """Nothing, if all pictures and masks of ``views`` are there, look complete and have the size of their view.
+
+    Raises:
+        DyngsError: otherwise; missing files are counted and the first is named.
+    """
+    paths = [path for view in views for path in (view.image_path, view.mask_path) if path is not None]
+    missing = [path for path in paths if not path.is_file()]
+    if missing:
+        raise DyngsError(
+            f"{len(missing)} of {len(paths)} pictures are missing, the first is {missing[0]}; restore them or remove "
+            f"them from the capture"
+        )
+    for view in views:
+        header = check_picture(view.image_path)
+        if (header.width, header.height) != (view.width, view.height):
+            raise DyngsError(
+                f"{view.image_path}: the picture is {header.width}x{header.height}, but {view.width}x{view.height} was "
+                f"expected; restore the original or correct its intrinsics"
+            )
+        if view.mask_path is not None:
+            check_picture(view.mask_path)
+
+
+def _undistorted_mask(mask: Tensor | None, lens_map: LensMap) -> Tensor | None:
+    """(H, W) bool: valid and kept with all of its neighbourhood; None where everything is."""
+    keep = lens_map.valid
+    if mask is not None:
+        keep = keep & (undistort(mask.float()[..., None], lens_map)[..., 0] > 0.999)
+    return None if bool(keep.all()) else keep

@@ -1,0 +1,84 @@
+"""Reader for nerfstudio's and instant-ngp's ``transforms.json``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dyngs.data.capture import Capture, PointCloud, Split, View
+from dyngs.data.transforms import FrameFile, read_frame_file, read_views
+from dyngs.errors import DyngsError
+
+
+def is_nerfstudio(root: Path) -> bool:
+    """Whether the folder holds ``transforms.json``."""
+    return (root / "transforms.json").is_file()
+
+
+def read_nerfstudio(root: Path) -> Capture:
+    """The capture of ``transforms.json``, with OpenGL camera-to-world poses and, if named, a ``.ply`` of points.
+
+    The lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` decide the splits; a val list without a test
+    list is the test set, as that is what is held out. Points and poses are read as they stand: ``applied_transform``
+    has been applied to both.
+
+    Raises:
+        DyngsError: see ``dyngs.data.transforms.read_views``; an unreadable ``.ply``.
+    """
+    file = read_frame_file(root / "transforms.json")
+    views, warnings = read_views(file)
+    splits, notes = _splits(file, views)
+    written = file.fields.get("ply_file_path")
+    points = read_points(root / written) if isinstance(written, str) and written else None
+    return Capture(root, "nerfstudio", splits, points, warnings=(*warnings, *notes))
+
+
+def read_points(path: Path) -> PointCloud:
+    """Points of a mesh or point file (through trimesh), grey where it has no colours.
+
+    Raises:
+        DyngsError: missing or unreadable.
+    """
+    import trimesh
+
+    if not path.is_file():
+        raise DyngsError(f"{path}: no such point file; restore it or remove ply_file_path")
+    try:
+        loaded = trimesh.load(path, process=False)
+        xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)  # type: ignore[union-attr]
+        colours = loaded.colors if isinstance(loaded, trimesh.PointCloud) else loaded.visual.vertex_colors  # type: ignore
+    except Exception as error:  # trimesh raises whatever its parser stumbled over
+        reason = " ".join(str(error).split())[:100]
+        raise DyngsError(f"{path}: cannot be read as points ({reason}); export it again") from None
+    rgb = np.full((len(xyz), 3), 128, np.uint8)
+    if colours is not None and len(colours) == len(xyz):
+        rgb = np.ascontiguousarray(np.asarray(colours)[:, :3].astype(np.uint8))
+    return PointCloud(xyz, rgb)
+
+
+def _splits(file: FrameFile, views: dict[str, View]) -> tuple[dict[Split, tuple[View, ...]], list[str]]:
+    """Splits by the file's lists; all views as train where it has none."""
+    names: tuple[Split, ...] = ("train", "val", "test")
+    listed = {name: file.fields.get(f"{name}_filenames") for name in names}
+    if all(value is None for value in listed.values()):
+        return {"train": tuple(views.values())}, []
+    splits: dict[Split, tuple[View, ...]] = {}
+    unknown: list[str] = []
+    for name in names:
+        value = listed[name]
+        if value is None:
+            continue
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise DyngsError(f"{file.path}: '{name}_filenames' must be a list of file paths")
+        splits[name] = tuple(views[item] for item in dict.fromkeys(value) if item in views)
+        unknown += [item for item in value if item not in views]
+    held_out = {view.name for kept in splits.values() for view in kept}
+    splits.setdefault("train", tuple(view for view in views.values() if view.name not in held_out))
+    if "test" not in splits and "val" in splits:
+        splits["test"] = splits.pop("val")
+    used = {view.name for kept in splits.values() for view in kept}
+    notes = [f"{len(unknown)} listed pictures have no frame, first {unknown[0]}"] if unknown else []
+    if len(used) < len(views):
+        notes.append(f"{len(views) - len(used)} frames are in no split and are ignored")
+    return splits, notes

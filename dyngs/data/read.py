@@ -1,0 +1,139 @@
+"""The one entrance to captures on disk: recognise the format, read it, and bring it into its final form."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from dyngs.config import DataConfig
+from dyngs.data.blender import is_blender, read_blender
+from dyngs.data.capture import Capture, PointCloud, Split, View
+from dyngs.data.colmap import MODEL_FOLDERS, is_colmap, read_colmap
+from dyngs.data.images import read_header
+from dyngs.data.nerfstudio import is_nerfstudio, read_nerfstudio
+from dyngs.data.rebase import rebase
+from dyngs.errors import DyngsError
+
+Splits = dict[Split, tuple[View, ...]]
+
+_READERS = {
+    "blender": (is_blender, read_blender, "transforms_train.json"),
+    "nerfstudio": (is_nerfstudio, read_nerfstudio, "transforms.json"),
+    "colmap": (is_colmap, read_colmap, f"cameras.bin or cameras.txt in {', '.join(MODEL_FOLDERS)}"),
+}
+
+
+def read_capture(options: DataConfig) -> Capture:
+    """The capture in ``options.root``; pictures are not decoded, only their headers are read.
+
+    Views are sorted by name. Where the format names no test set, every ``options.test_every``-th picture is one. Times
+    are brought to [0, 1], a far-away world to its origin. All three splits are present, val and test possibly empty.
+
+    Raises:
+        DyngsError: no such folder, no capture in it, or anything in it that cannot be right; names the file.
+    """
+    root = options.root
+    if not root.is_dir():
+        problem = "is a file; give the folder that holds it" if root.is_file() else "no such folder; check data.root"
+        raise DyngsError(f"{root}: {problem}")
+    found = [name for name, (is_format, _, _) in _READERS.items() if is_format(root)]
+    if options.format == "auto" and not found:
+        wanted = "; ".join(f"{name}: {files}" for name, (_, _, files) in _READERS.items())
+        raise DyngsError(f"{root}: no capture found; looked for {wanted}")
+    if options.format not in ("auto", *found):
+        also = f"; but there is a {found[0]} capture" if found else ""
+        raise DyngsError(f"{root}: no {options.format} capture, which would have {_READERS[options.format][2]}{also}")
+    name = found[0] if options.format == "auto" else options.format
+    capture = _finished(_READERS[name][1](root), options)
+    if options.format == "auto" and len(found) > 1:
+        note = f"read as {name}, but there is also a {found[1]} capture; data.format= chooses"
+        capture = replace(capture, warnings=(note, *capture.warnings))
+    return capture
+
+
+def hold_out(views: tuple[View, ...], test_every: int) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """Training and test views of ``views`` sorted by name: index 0, n, 2n, .. are test; none if ``test_every`` is 0."""
+    if test_every == 0:
+        return views, ()
+    test = views[::test_every]
+    return tuple(view for index, view in enumerate(views) if index % test_every), test
+
+
+def _finished(capture: Capture, options: DataConfig) -> Capture:
+    splits: Splits = {name: tuple(sorted(views, key=lambda view: view.name)) for name, views in capture.splits.items()}
+    if not splits.get("train"):
+        raise DyngsError(f"{capture.root}: the {capture.format} capture has no training views; add posed pictures")
+    if "test" not in splits:
+        splits["train"], splits["test"] = hold_out(splits["train"], options.test_every)
+        if not splits["train"]:
+            raise DyngsError(f"{capture.root}: data.test_every={options.test_every} leaves no training views; raise it")
+    splits.setdefault("val", ())
+    warnings = [*capture.warnings, *_check_names(capture.root, splits), *_missing_pictures(splits)]
+    splits, notes = _with_unit_times(capture.root, splits)
+    points, more = _finite_points(capture.points)
+    capture = replace(
+        capture,
+        splits=splits,
+        points=points,
+        has_alpha=_first_has_alpha(splits["train"]),
+        warnings=(*warnings, *notes, *more),
+    )
+    return rebase(capture)
+
+
+def _check_names(root: Path, splits: Splits) -> list[str]:
+    for views in splits.values():
+        twice = [name for name, count in Counter(view.name for view in views).items() if count > 1]
+        if twice:
+            raise DyngsError(f"{root}: two pictures are called {twice[0]}; give them different names")
+    train = {view.image_path for view in splits["train"]}
+    leaked = [view.name for view in splits["test"] if view.image_path in train]
+    return [f"{len(leaked)} test pictures are also training pictures, first {leaked[0]}"] if leaked else []
+
+
+def _missing_pictures(splits: Splits) -> list[str]:
+    paths = [view.image_path for views in splits.values() for view in views]
+    missing = [path for path in paths if not path.is_file()]
+    return [f"{len(missing)} of {len(paths)} pictures are missing, first {missing[0]}"] if missing else []
+
+
+def _first_has_alpha(views: tuple[View, ...]) -> bool:
+    for view in views:
+        try:
+            return read_header(view.image_path).has_alpha
+        except DyngsError:
+            continue
+    return False
+
+
+def _with_unit_times(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
+    """The splits with times in [0, 1]: shifted and scaled over all splits where one lies outside."""
+    views = [view for kept in splits.values() for view in kept]
+    timed = [view.time for view in views if view.time is not None]
+    if not timed:
+        return splits, []
+    if len(timed) < len(views):
+        untimed = next(view.name for view in views if view.time is None)
+        raise DyngsError(f"{root}: {untimed} has no time although other pictures have; give time for all or none")
+    first, last = min(timed), max(timed)
+    if first >= 0 and last <= 1:
+        return splits, []
+    span = last - first if last > first else math.inf
+    scaled: Splits = {
+        name: tuple(replace(view, time=((view.time or 0.0) - first) / span) for view in kept)
+        for name, kept in splits.items()
+    }
+    return scaled, [f"times run from {first:g} to {last:g} and were scaled to [0, 1]"]
+
+
+def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, list[str]]:
+    if points is None:
+        return None, []
+    keep = np.isfinite(points.xyz).all(axis=1)
+    notes = [f"{int((~keep).sum())} points hold NaN or infinite numbers and are ignored"] if not keep.all() else []
+    points = PointCloud(points.xyz[keep], points.rgb[keep])
+    return (points if len(points.xyz) else None), notes

@@ -1,0 +1,44 @@
+"""Move a far-away scene to its origin in float64, before anything is rounded to float32."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dyngs.data.capture import Capture, PointCloud, View
+from dyngs.data.poses import camera_center
+
+MAX_DISTANCE = 1e5
+MAX_DISTANCE_PER_SPREAD = 1e4
+HARMLESS_DISTANCE = 1e3
+"""Nearer scenes stay where they are, however close together their cameras (a fixed camera has no spread at all)."""
+
+
+def rebase(capture: Capture) -> Capture:
+    """The capture with its median camera at the origin if it lies far out, else the capture itself.
+
+    Far: the median camera centre is more than 1e5 units from the origin, or more than 1e4 times the cameras' spread
+    (median distance from that centre). ``world_offset`` of the result is what was subtracted, on top of what the
+    capture already carried.
+    """
+    centers = np.array([camera_center(view.cam_from_world) for views in capture.splits.values() for view in views])
+    median = np.median(centers, axis=0)
+    spread = float(np.median(np.linalg.norm(centers - median, axis=1)))
+    distance = float(np.linalg.norm(median))
+    too_far = distance > MAX_DISTANCE or distance > max(MAX_DISTANCE_PER_SPREAD * spread, HARMLESS_DISTANCE)
+    return shifted(capture, median) if too_far else capture
+
+
+def shifted(capture: Capture, offset: np.ndarray) -> Capture:
+    """The capture with ``offset`` (3,) subtracted from all positions and added to ``world_offset``."""
+    splits = {name: tuple(_shifted_view(view, offset) for view in views) for name, views in capture.splits.items()}
+    points = capture.points and PointCloud(capture.points.xyz - offset, capture.points.rgb)
+    return replace(capture, splits=splits, points=points, world_offset=capture.world_offset + offset)
+
+
+def _shifted_view(view: View, offset: np.ndarray) -> View:
+    pose = view.cam_from_world.copy()
+    # Through the centre: R @ offset + t would first round both terms at the size of the offset.
+    pose[:3, 3] = -pose[:3, :3] @ (camera_center(pose) - offset)
+    return replace(view, cam_from_world=pose)

@@ -1,0 +1,1 @@
+"""Files for other programs: the standard 3DGS .ply."""

@@ -1,0 +1,169 @@
+"""A strict parser of .ply headers, and of the vertex rows behind them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from dyngs.errors import DyngsError
+
+_SCALARS = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
+_MAX_HEADER_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class _Element:
+    """One element: ``properties`` are (name, numpy type) pairs; a list property makes its size unknown."""
+
+    name: str
+    count: int
+    properties: tuple[tuple[str, str], ...] = ()
+    has_list: bool = False
+
+    def dtype(self, byte_order: str) -> np.dtype:
+        return np.dtype([(name, byte_order + kind) for name, kind in self.properties])
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """The header of a .ply that has a ``vertex`` element.
+
+    Attributes:
+        byte_order: "<", ">" or None for ascii.
+        elements: all elements in file order, up to and including ``vertex``.
+        comments: the header's comments.
+        data_start: offset of the first byte behind the header.
+    """
+
+    byte_order: str | None
+    elements: tuple[_Element, ...]
+    comments: tuple[str, ...]
+    data_start: int
+
+    @property
+    def vertex_names(self) -> tuple[str, ...]:
+        """Names of the vertex properties, in file order."""
+        return tuple(name for name, _ in self.elements[-1].properties)
+
+    def read_vertices(self, file: BinaryIO, path: Path) -> np.ndarray:
+        """(N,) structured array of the vertices. Raises DyngsError where the data is shorter than announced."""
+        vertex, earlier = self.elements[-1], self.elements[:-1]
+        if any(element.has_list for element in self.elements):
+            raise DyngsError(f"{path}: has list properties in or before its vertices, so it is not a 3DGS .ply")
+        file.seek(0, os.SEEK_END)
+        available = file.tell() - self.data_start
+        file.seek(self.data_start)
+        if self.byte_order is None:
+            return self._read_ascii(file, path, available)
+        skipped = sum(e.count * e.dtype(self.byte_order).itemsize for e in earlier)
+        dtype = vertex.dtype(self.byte_order)
+        expected = skipped + vertex.count * dtype.itemsize
+        if available < expected:
+            raise DyngsError(
+                f"{path}: is truncated: {vertex.count} vertices of {dtype.itemsize} bytes need {expected} bytes after "
+                f"the header, found {available}"
+            )
+        file.seek(self.data_start + skipped)
+        return np.fromfile(file, dtype=dtype, count=vertex.count)
+
+    def _read_ascii(self, file: BinaryIO, path: Path, available: int) -> np.ndarray:
+        vertex = self.elements[-1]
+        width, skipped = len(vertex.properties), sum(element.count for element in self.elements[:-1])
+        # The shortest possible row is one character and one separator per value.
+        expected = skipped + max(2 * width * vertex.count - 1, 0)
+        if available < expected:
+            raise DyngsError(
+                f"{path}: is truncated: {vertex.count} vertices of {width} values need at least {expected} bytes after "
+                f"the header, found {available}"
+            )
+        rows = np.empty((vertex.count, width), dtype=np.float64)
+        for _ in range(skipped):
+            file.readline()
+        for i in range(vertex.count):
+            rows[i] = _ascii_row(file.readline(), width, i, path)
+        return rows.view([(name, "f8") for name in self.vertex_names])[:, 0]
+
+
+def read_header(file: BinaryIO, path: Path) -> PlyHeader:
+    """The header of the .ply opened at its start. Raises DyngsError naming ``path`` and the line that is wrong."""
+    if file.readline(16).rstrip(b"\r\n") != b"ply":
+        raise DyngsError(f"{path}: is not a .ply file (it does not start with 'ply')")
+    byte_order: str | None = None
+    seen_format = False
+    elements: list[_Element] = []
+    comments: list[str] = []
+    while True:
+        line = _next_line(file, path)
+        words = line.split()
+        keyword = words[0] if words else ""
+        if keyword == "end_header":
+            break
+        if keyword in ("comment", "obj_info"):
+            comments.append(line[len(keyword) :].strip())
+        elif keyword == "format" and len(words) == 3 and words[1] in _BYTE_ORDERS and not seen_format:
+            byte_order, seen_format = _BYTE_ORDERS[words[1]], True
+        elif keyword == "element" and len(words) == 3 and _is_count(words[2]):
+            elements.append(_Element(words[1], int(words[2])))
+        elif keyword == "property" and elements:
+            elements[-1] = _with_property(elements[-1], words, path)
+        elif keyword:
+            raise DyngsError(f"{path}: bad .ply header line {_shown(line)}")
+    if not seen_format:
+        raise DyngsError(f"{path}: the .ply header names no known format")
+    names = [element.name for element in elements]
+    if "vertex" not in names:
+        raise DyngsError(f"{path}: has no vertices, so it is not a 3DGS .ply")
+    upto = names.index("vertex") + 1
+    return PlyHeader(byte_order, tuple(elements[:upto]), tuple(comments), file.tell())
+
+
+def _next_line(file: BinaryIO, path: Path) -> str:
+    if file.tell() > _MAX_HEADER_BYTES:
+        raise DyngsError(f"{path}: the .ply header is longer than {_MAX_HEADER_BYTES} bytes, the file is damaged")
+    raw = file.readline(_MAX_HEADER_BYTES)
+    if not raw.endswith(b"\n"):
+        raise DyngsError(f"{path}: the .ply header has no end_header, the file is truncated or damaged")
+    return raw.decode("utf-8", errors="replace").strip()
+
+
+def _with_property(element: _Element, words: list[str], path: Path) -> _Element:
+    if len(words) == 5 and words[1] == "list":
+        return _Element(element.name, element.count, element.properties, has_list=True)
+    if len(words) != 3 or words[1] not in _SCALARS:
+        raise DyngsError(f"{path}: bad .ply header line {_shown(' '.join(words))}")
+    if any(name == words[2] for name, _ in element.properties):
+        raise DyngsError(f"{path}: the .ply header has the property {words[2]} twice")
+    properties = (*element.properties, (words[2], _SCALARS[words[1]]))
+    return _Element(element.name, element.count, properties, element.has_list)
+
+
+def _ascii_row(line: bytes, width: int, index: int, path: Path) -> list[float]:
+    try:
+        values = [float(word) for word in line.split()]
+    except ValueError:
+        values = []
+    if len(values) != width:
+        raise DyngsError(f"{path}: vertex {index} should hold {width} numbers")
+    return values
+
+
+def _is_count(word: str) -> bool:
+    return word.isascii() and word.isdigit() and len(word) <= 18
+
+
+def _shown(line: str) -> str:
+    return repr(line if len(line) <= 60 else line[:57] + "...")

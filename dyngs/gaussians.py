@@ -1,0 +1,108 @@
+"""The set of Gaussians, as optimised, and the one way in which its topology changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from dyngs.conventions import SH_C0
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians in the parametrisation that is optimised.
+
+    Attributes:
+        means: (N, 3) centres in world units.
+        quats: (N, 4) rotations wxyz; normalised by the rasterizer, a zero quaternion means identity.
+        log_scales: (N, 3) natural logarithms of the standard deviations along the local axes.
+        logit_opacities: (N,) opacities before the sigmoid.
+        sh: (N, K, 3) spherical-harmonics coefficients, term 0 is the base colour.
+    """
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    logit_opacities: Tensor
+    sh: Tensor
+
+    def __post_init__(self) -> None:
+        n = len(self.means)
+        wanted = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
+        for name, shape in wanted.items():
+            if tuple(getattr(self, name).shape) != shape:
+                raise ValueError(f"{name} must be {shape}, got {tuple(getattr(self, name).shape)}")
+        if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[2] != 3:
+            raise ValueError(f"sh must be ({n}, K, 3), got {tuple(self.sh.shape)}")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def scales(self) -> Tensor:
+        """(N, 3) standard deviations in world units."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """(N,) in [0, 1]."""
+        # Not torch.sigmoid: its last bit depends on the number of threads.
+        return torch.nn.functional.logsigmoid(self.logit_opacities).exp()
+
+    @property
+    def base_rgb(self) -> Tensor:
+        """(N, 3) view-independent colour, unclamped."""
+        return self.sh[:, 0] * SH_C0 + 0.5
+
+    @property
+    def sh_degree(self) -> int:
+        return int(round(self.sh.shape[1] ** 0.5)) - 1
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Field name to tensor, in declaration order."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def select(self, index: Tensor) -> Gaussians:
+        """The Gaussians at ``index`` (long or bool)."""
+        return Gaussians(**{name: x[index] for name, x in self.tensors().items()})
+
+    def detach(self) -> Gaussians:
+        return Gaussians(**{name: x.detach() for name, x in self.tensors().items()})
+
+    def replace(self, **changes: Tensor) -> Gaussians:
+        """A copy with some fields exchanged."""
+        return replace(self, **changes)
+
+
+@dataclass(frozen=True)
+class TopologyEdit:
+    """How a densification step rearranges everything that is stored per Gaussian.
+
+    Row ``i`` of the new set descends from row ``source[i]`` of the old one: clone, split, prune and relocate are all
+    ``x[source]``. Where ``is_new`` is set, optimizer moments start at zero.
+
+    Attributes:
+        source: (N_new,) long indices into the old set.
+        is_new: (N_new,) bool.
+    """
+
+    source: Tensor
+    is_new: Tensor
+
+    def apply(self, x: Tensor) -> Tensor:
+        """Rows of ``x`` (N_old, ...) rearranged to (N_new, ...)."""
+        return x[self.source]
+
+    def apply_moments(self, x: Tensor) -> Tensor:
+        """As ``apply``, with zeros where a row is new."""
+        moved = x[self.source]
+        moved[self.is_new] = 0
+        return moved
+
+    @staticmethod
+    def keep(mask: Tensor) -> TopologyEdit:
+        """The edit that keeps the rows where ``mask`` (N,) is true."""
+        source = torch.nonzero(mask)[:, 0]
+        return TopologyEdit(source, torch.zeros_like(source, dtype=torch.bool))

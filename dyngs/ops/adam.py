@@ -1,0 +1,121 @@
+"""Adam in place on arrays of rows, for all rows or only some: one native pass over the memory in float32 on the CPU."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dyngs.errors import DyngsError
+from dyngs.ops.native import core, num_threads
+
+
+@torch.no_grad()
+def adam_step_(
+    param: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    *,
+    lr: float | Tensor,
+    step: int,
+    eps: float = 1e-15,
+    betas: tuple[float, float] = (0.9, 0.999),
+    rows: Tensor | None = None,
+) -> int:
+    """Number of rows left out for a non-finite gradient; updates ``param`` and its two moments in place.
+
+    The update of Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global ``step``
+    also for rows that were left out before. Rows left out keep their value and moments unchanged.
+
+    Args:
+        param: (N, ...) contiguous parameter, seen as N rows of C numbers; a vector (N,) has rows of one number.
+        grad: same shape; copied if not contiguous.
+        exp_avg: same shape, contiguous: running mean of the gradient.
+        exp_avg_sq: same shape, contiguous: running mean of its square.
+        lr: learning rate, or (C,) rates, one per column of a row.
+        step: count of this step, 1 for the first.
+        eps: added to the root of the second moment.
+        betas: decay rates of the moments.
+        rows: (N,) bool, the rows to update; None = all. Rows left out by it are not counted.
+
+    Raises:
+        DyngsError: shapes or dtypes that do not fit, a parameter or moment that is not contiguous, or ``step`` < 1.
+    """
+    _check(param, grad, exp_avg, exp_avg_sq, rows, step)
+    if param.numel() == 0:
+        return 0
+    row_size = param.numel() // len(param)
+    rates = _column_rates(lr, row_size, param)
+    arrays = [x.detach().view(len(param), row_size) for x in (param, grad.contiguous(), exp_avg, exp_avg_sq)]
+    if param.dtype != torch.float32 or param.device.type != "cpu":
+        return _torch_step(*arrays, rates=rates, step=step, eps=eps, betas=betas, rows=rows)
+    chosen = None if rows is None else rows.contiguous()
+    options = (betas[0], betas[1], eps, step)
+    return core.adam_step(*arrays, rates, chosen, options, num_threads())
+
+
+@torch.no_grad()
+def seen_rows(grads: Tensor) -> Tensor:
+    """(N,) bool: the rows of ``grads`` (N, ...) with an element other than zero; NaN counts as such."""
+    if grads.numel() == 0:
+        return torch.zeros(len(grads), dtype=torch.bool, device=grads.device)
+    flat = grads.detach().reshape(len(grads), -1)
+    if flat.dtype != torch.float32 or flat.device.type != "cpu":
+        return (flat != 0).any(dim=1)
+    seen = torch.empty(len(flat), dtype=torch.bool)
+    core.seen_rows(flat.contiguous(), seen, num_threads())
+    return seen
+
+
+def _torch_step(
+    param: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    *,
+    rates: Tensor,
+    step: int,
+    eps: float,
+    betas: tuple[float, float],
+    rows: Tensor | None,
+) -> int:
+    """`adam_step_` on (N, C) arrays in plain torch, for other dtypes and devices."""
+    finite = grad.isfinite().all(dim=1)
+    wanted = torch.ones_like(finite) if rows is None else rows
+    active = (wanted & finite)[:, None]
+    new_avg = exp_avg.lerp(grad, 1 - betas[0])
+    new_avg_sq = (exp_avg_sq * betas[1]).addcmul(grad, grad, value=1 - betas[1])
+    denominator = (new_avg_sq.sqrt() / (1 - betas[1] ** step) ** 0.5).add(eps)
+    new_param = param - rates / (1 - betas[0] ** step) * new_avg / denominator
+    for old, new in ((param, new_param), (exp_avg, new_avg), (exp_avg_sq, new_avg_sq)):
+        old.copy_(torch.where(active, new, old))
+    return int((wanted & ~finite).sum())
+
+
+def _column_rates(lr: float | Tensor, row_size: int, param: Tensor) -> Tensor:
+    """(C,) learning rates in the dtype and on the device of ``param``."""
+    rates = torch.as_tensor(lr, dtype=param.dtype, device=param.device).detach()
+    if rates.ndim == 0:
+        return rates.expand(row_size).contiguous()
+    if rates.shape != (row_size,):
+        raise DyngsError(f"Adam: lr must be a number or ({row_size},), one rate per column, got {tuple(rates.shape)}")
+    return rates.contiguous()
+
+
+def _check(
+    param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rows: Tensor | None, step: int
+) -> None:
+    if param.ndim == 0:
+        raise DyngsError("Adam: the parameter must have at least one dimension, got a scalar")
+    for name, x in (("grad", grad), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
+        if x.shape != param.shape or x.dtype != param.dtype:
+            raise DyngsError(
+                f"Adam: {name} is {tuple(x.shape)} {x.dtype}, but the parameter {tuple(param.shape)} {param.dtype}"
+            )
+    for name, x in (("param", param), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
+        if not x.is_contiguous():
+            raise DyngsError(f"Adam: {name} must be contiguous, as it is updated in place; call .contiguous() first")
+    if rows is not None and (rows.shape != param.shape[:1] or rows.dtype != torch.bool):
+        raise DyngsError(f"Adam: rows must be ({len(param)},) bool, got {tuple(rows.shape)} {rows.dtype}")
+    if step < 1:
+        raise DyngsError(f"Adam: step counts from 1, got {step}")

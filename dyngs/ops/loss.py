@@ -1,0 +1,140 @@
+"""Fused L1 + SSIM loss of one picture, and SSIM as a measure.
+
+On the CPU in float32 the value and its gradient come from one native call; elsewhere from the plain torch formula,
+which is also the reference of the tests.
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from dyngs.errors import DyngsError
+from dyngs.ops.native import core, num_threads
+
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+SSIM_RADIUS = 5
+SSIM_SIGMA = 1.5
+
+
+def l1_ssim_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
+    """The training loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)`` as a scalar, differentiable in ``rendered``.
+
+    L1 is the mean of ``|x - y|``; SSIM is the mean over pixels and channels of the SSIM map with an 11x11 Gaussian
+    window of sigma 1.5, zero padding and data range 1, as in 3DGS. With a mask both pictures are multiplied by it first,
+    and both means are weighted by it: ``sum(m |x - y|) / (3 sum m)`` and ``sum(m SSIM(m x, m y)) / (3 sum m)``. A mask that
+    is zero everywhere gives a loss of 0.
+
+    Args:
+        rendered: (H, W, 3) picture x, any strides. Half precision is computed in float32.
+        target: (H, W, 3) picture y, a constant: no gradient flows to it.
+        ssim_weight: share of the SSIM part, in [0, 1]; at 0 no SSIM is computed.
+        mask: (H, W) weights in [0, 1], a constant.
+
+    Raises:
+        DyngsError: shapes that do not fit, an empty picture, or integer pictures.
+    """
+    _check(rendered, target, mask)
+    x, y, m = _in_common_precision(rendered, target, mask)
+    if x.dtype != torch.float32 or x.device.type != "cpu":
+        return reference_l1_ssim(x, y, ssim_weight, m)
+    with_gradient = torch.is_grad_enabled() and x.requires_grad
+    return _l1_ssim(x, y, m, ssim_weight, with_gradient)[0]
+
+
+def ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Mean SSIM of two (H, W, 3) pictures in [0, 1] as a scalar, differentiable in ``a``; see `l1_ssim_loss`."""
+    return 1 - l1_ssim_loss(a, b, ssim_weight=1.0)
+
+
+def reference_l1_ssim(
+    rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None
+) -> Tensor:
+    """The value of `l1_ssim_loss` in plain torch: any floating dtype and device, differentiable in every tensor."""
+    weight = torch.ones_like(rendered[..., 0]) if mask is None else mask
+    total = 3 * weight.sum()
+    total = torch.where(total == 0, 1, total)
+    x, y = weight[..., None] * rendered, weight[..., None] * target
+    loss = (1 - ssim_weight) * (x - y).abs().sum() / total
+    if ssim_weight == 0:
+        return loss
+    return loss + ssim_weight * (weight[..., None] * (1 - _ssim_map(x, y))).sum() / total
+
+
+def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
+    """(H, W, 3) structural similarity of two pictures, Wang et al. 2004."""
+    taps = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=x.dtype, device=x.device)
+    taps = torch.exp(-(taps**2) / (2 * SSIM_SIGMA**2))
+    column = (taps / taps.sum()).view(1, 1, -1, 1)
+    planes = torch.stack([x, y, x * x, y * y, x * y]).permute(0, 3, 1, 2).flatten(0, 1)[:, None]  # (5 * 3, 1, H, W)
+    blurred = conv2d(planes, column, padding=(SSIM_RADIUS, 0))
+    blurred = conv2d(blurred, column.transpose(2, 3), padding=(0, SSIM_RADIUS))
+    mean_x, mean_y, square_x, square_y, product = blurred.view(5, 3, *x.shape[:2]).permute(0, 2, 3, 1)
+    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
+    variances = square_x - mean_x**2 + square_y - mean_y**2
+    return luminance * (2 * (product - mean_x * mean_y) + SSIM_C2) / (variances + SSIM_C2)
+
+
+def _check(rendered: Tensor, target: Tensor, mask: Tensor | None) -> None:
+    if rendered.ndim != 3 or rendered.shape[2] != 3 or rendered.numel() == 0:
+        raise DyngsError(f"loss: the rendered picture must be (H, W, 3) and not empty, got {tuple(rendered.shape)}")
+    if target.shape != rendered.shape:
+        raise DyngsError(f"loss: the target is {tuple(target.shape)}, but the picture {tuple(rendered.shape)}")
+    if mask is not None and mask.shape != rendered.shape[:2]:
+        raise DyngsError(f"loss: the mask must be (H, W) = {tuple(rendered.shape[:2])}, got {tuple(mask.shape)}")
+    if not (rendered.is_floating_point() and target.is_floating_point()):
+        raise DyngsError(f"loss: pictures must be floating point, got {rendered.dtype} and {target.dtype}")
+
+
+def _in_common_precision(rendered: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The inputs contiguous and in one dtype, at least float32; target and mask cut off from autograd."""
+    given = [rendered.dtype, target.dtype, torch.float32]
+    dtype = reduce(torch.promote_types, given)
+    constants = [None if x is None else x.detach().to(dtype).contiguous() for x in (target, mask)]
+    assert constants[0] is not None
+    return rendered.to(dtype).contiguous(), constants[0], constants[1]
+
+
+@torch.library.custom_op("dyngs::l1_ssim", mutates_args=(), device_types="cpu")
+def _l1_ssim(
+    rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, with_gradient: bool
+) -> tuple[Tensor, Tensor]:
+    """The loss () and its gradient by ``rendered`` (H, W, 3), which is empty if not asked for. Float32, contiguous."""
+    gradient = torch.empty_like(rendered) if with_gradient else None
+    loss = core.l1_ssim(
+        rendered.detach(),
+        target.detach(),
+        None if mask is None else mask.detach(),
+        gradient,
+        ssim_weight,
+        num_threads(),
+    )
+    return rendered.new_tensor(loss), rendered.new_empty(0) if gradient is None else gradient
+
+
+@_l1_ssim.register_fake
+def _(
+    rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, with_gradient: bool
+) -> tuple[Tensor, Tensor]:
+    gradient = torch.empty_like(rendered) if with_gradient else rendered.new_empty(0)
+    return rendered.new_empty(()), gradient
+
+
+def _save_gradient(ctx, inputs, output) -> None:  # noqa: ANN001 (torch's untyped hooks)
+    _, gradient = output
+    ctx.mark_non_differentiable(gradient)
+    ctx.save_for_backward(gradient)
+
+
+def _scale_gradient(ctx, grad_loss: Tensor, _: Tensor | None):  # noqa: ANN001, ANN202
+    (gradient,) = ctx.saved_tensors
+    if gradient.numel() == 0:
+        raise RuntimeError("dyngs::l1_ssim was called without with_gradient, so it has no gradient")
+    return grad_loss * gradient, None, None, None, None
+
+
+_l1_ssim.register_autograd(_scale_gradient, setup_context=_save_gradient)

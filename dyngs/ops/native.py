@@ -1,0 +1,46 @@
+"""The compiled core for this processor, and how tensors reach it.
+
+The wheel holds one module per x86-64 level; the newest that the processor runs is imported. ``DYNGS_ISA=v2|v3|v4`` picks
+an older one, for tests.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from types import ModuleType
+
+import torch  # first: its libgomp is then the one that both use
+from torch import Tensor
+
+from dyngs.errors import DyngsError
+
+
+def _load_core() -> tuple[ModuleType, str]:
+    try:
+        baseline = import_module("dyngs.ops._core_v2")
+    except ImportError as error:
+        raise ImportError(f"the compiled core of dyngs is missing ({error}); install with `pip install .`") from error
+    best = baseline.best_isa()
+    isa = os.environ.get("DYNGS_ISA", best)
+    if isa not in ("v2", "v3", "v4") or isa > best:
+        raise DyngsError(f"DYNGS_ISA={isa}: this processor runs v2 to {best}; unset the variable or choose one of these")
+    return (baseline if isa == "v2" else import_module(f"dyngs.ops._core_{isa}")), isa
+
+
+core, _ISA = _load_core()
+
+
+def active_isa() -> str:
+    """Instruction set of the loaded kernels: ``v2``, ``v3`` (AVX2) or ``v4`` (AVX-512)."""
+    return _ISA
+
+
+def num_threads() -> int:
+    """Threads that the kernels use: torch's setting, so that one number rules both."""
+    return torch.get_num_threads()
+
+
+def contiguous(x: Tensor) -> Tensor:
+    """``x`` as the kernels take it: detached, C-contiguous."""
+    return x.detach().contiguous()

@@ -1,0 +1,187 @@
+"""Projection of 3D Gaussians to image planes as a differentiable torch op."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.ops.native import contiguous, core, num_threads
+
+
+@dataclass(frozen=True)
+class ProjectionOptions:
+    """Limits of the projection.
+
+    Attributes:
+        eps2d: low-pass variance added to the 2D covariance, px^2.
+        near, far: Gaussians whose centre is not strictly between are culled, world units.
+        alpha_min: pixels with less alpha are not drawn; sets the extent of a splat.
+        radius_clip: splats with no larger half extent are culled, px.
+        antialiased: the extent uses the compensated opacity.
+    """
+
+    eps2d: float = 0.3
+    near: float = 0.2
+    far: float = 1e10
+    alpha_min: float = 1 / 255
+    radius_clip: float = 0.0
+    antialiased: bool = False
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Splats of N Gaussians in V views; rows of culled Gaussians are zero.
+
+    Attributes:
+        means2d: (V, N, 2) px, centre of the first pixel at (0.5, 0.5).
+        depths: (V, N) view-space z.
+        factors: (V, N, 3) entries U, W, V of F = [[U, W], [0, V]] with conic = F^T F, 1/px.
+        compensations: (V, N) sqrt of the determinant ratio before / after the low-pass.
+        radii: (V, N, 2) int32 half extents, px; 0 = culled.
+    """
+
+    means2d: Tensor
+    depths: Tensor
+    factors: Tensor
+    compensations: Tensor
+    radii: Tensor
+
+    @property
+    def conics(self) -> Tensor:
+        """(V, N, 3) inverse 2D covariances a, b, c: power = -(a dx^2 + 2 b dx dy + c dy^2) / 2."""
+        u, w, v = self.factors.unbind(-1)
+        return torch.stack([u * u, u * w, w * w + v * v], dim=-1)
+
+
+def _settings(width: int, height: int, limits: list[float], antialiased: bool):
+    eps2d, near, far, alpha_min, radius_clip = limits
+    return core.ProjectSettings(width, height, eps2d, near, far, alpha_min, radius_clip, antialiased, num_threads())
+
+
+def _arrays(*tensors: Tensor):
+    kind = core.GaussianArraysF32 if tensors[0].dtype == torch.float32 else core.GaussianArraysF64
+    return kind(*(contiguous(x) for x in tensors))
+
+
+@torch.library.custom_op("dyngs::project", mutates_args=(), device_types="cpu")
+def _project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmats: Tensor,
+    intrinsics: Tensor,
+    size: list[int],
+    limits: list[float],
+    antialiased: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    rows = (viewmats.shape[0], means.shape[0])
+    means2d, depths = means.new_empty(*rows, 2), means.new_empty(rows)
+    factors, compensations = means.new_empty(*rows, 3), means.new_empty(rows)
+    radii = torch.empty(*rows, 2, dtype=torch.int32)
+    arrays = _arrays(means, quats, scales, opacities, viewmats, intrinsics)
+    settings = _settings(size[0], size[1], limits, antialiased)
+    core.project_forward(arrays, settings, means2d, depths, factors, compensations, radii)
+    return means2d, depths, factors, compensations, radii
+
+
+@_project.register_fake
+def _(means, quats, scales, opacities, viewmats, intrinsics, size, limits, antialiased):
+    rows = (viewmats.shape[0], means.shape[0])
+    return (
+        means.new_empty(*rows, 2),
+        means.new_empty(rows),
+        means.new_empty(*rows, 3),
+        means.new_empty(rows),
+        means.new_empty(*rows, 2, dtype=torch.int32),
+    )
+
+
+@torch.library.custom_op("dyngs::project_backward", mutates_args=(), device_types="cpu")
+def _project_backward(
+    gaussians: list[Tensor],
+    radii: Tensor,
+    grads: list[Tensor],
+    size: list[int],
+    limits: list[float],
+    antialiased: bool,
+    with_viewmats: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    means, quats, scales, _, viewmats, _ = gaussians
+    out = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means, quats, scales)]
+    g_viewmats = viewmats.new_zeros(viewmats.shape)
+    settings = _settings(size[0], size[1], limits, antialiased)
+    core.project_backward(
+        _arrays(*gaussians),
+        settings,
+        radii.contiguous(),
+        tuple(contiguous(g) for g in grads),
+        (*out, g_viewmats if with_viewmats else None),
+    )
+    return out[0], out[1], out[2], g_viewmats
+
+
+@_project_backward.register_fake
+def _(gaussians, radii, grads, size, limits, antialiased, with_viewmats):
+    return tuple(torch.empty_like(gaussians[i], memory_format=torch.contiguous_format) for i in (0, 1, 2, 4))
+
+
+def _setup_context(ctx, inputs, output) -> None:
+    *tensors, ctx.size, ctx.limits, ctx.antialiased = inputs
+    ctx.save_for_backward(*tensors, output[4])
+    ctx.mark_non_differentiable(output[4])
+
+
+def _backward(ctx, g_means2d, g_depths, g_factors, g_compensations, _g_radii):
+    *gaussians, radii = ctx.saved_tensors
+    g_means, g_quats, g_scales, g_viewmats = _project_backward(
+        gaussians,
+        radii,
+        [g_means2d, g_depths, g_factors, g_compensations],
+        ctx.size,
+        ctx.limits,
+        ctx.antialiased,
+        ctx.needs_input_grad[4],
+    )
+    return g_means, g_quats, g_scales, None, g_viewmats if ctx.needs_input_grad[4] else None, None, None, None, None
+
+
+torch.library.register_autograd("dyngs::project", _backward, setup_context=_setup_context)
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    cameras: Cameras,
+    options: ProjectionOptions = ProjectionOptions(),
+) -> Projection:
+    """Splats of the Gaussians in every camera (EWA splatting; Zwicker et al. 2001, Kerbl et al. 2023).
+
+    Differentiable in means, quats, scales and ``cameras.cam_from_world``.
+
+    Args:
+        means: (N, 3) world.
+        quats: (N, 4) wxyz, any norm; zero means identity.
+        scales: (N, 3) standard deviations, world units.
+        opacities: (N,) in [0, 1]; they only set the extents.
+        cameras: V cameras.
+        options: see ``ProjectionOptions``.
+    """
+    limits = [options.eps2d, options.near, options.far, options.alpha_min, options.radius_clip]
+    outputs = _project(
+        means,
+        quats,
+        scales,
+        opacities,
+        cameras.cam_from_world,
+        cameras.intrinsics,
+        [cameras.width, cameras.height],
+        limits,
+        options.antialiased,
+    )
+    return Projection(*outputs)

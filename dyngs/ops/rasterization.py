@@ -1,0 +1,264 @@
+"""Tile binning and alpha blending of splats as a differentiable torch op."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyngs.errors import DyngsError
+from dyngs.ops.native import contiguous, core, num_threads
+from dyngs.ops.projection import Projection
+
+TILE = 16
+MAX_CHANNELS = 40
+MAX_ENTRIES = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class BlendOptions:
+    """Thresholds of the blending (3DGS): set the minima to 0 for exact comparisons.
+
+    Attributes:
+        alpha_min: a pixel skips Gaussians with less alpha.
+        alpha_max: alpha is clamped here, and the clamp stops the gradient.
+        transmittance_min: a pixel stops before the Gaussian that would take it below.
+        absgrad: also sum the absolute gradients of the 2D means into the probe.
+        max_entries: refuse renders with more (Gaussian, tile) pairs, before allocating them.
+    """
+
+    alpha_min: float = 1 / 255
+    alpha_max: float = 0.99
+    transmittance_min: float = 1e-4
+    absgrad: bool = False
+    max_entries: int = MAX_ENTRIES
+
+
+@dataclass(frozen=True)
+class Blended:
+    """What the splats leave on the image plane.
+
+    Attributes:
+        color: (V, H, W, D), background composited.
+        transmittance: (V, H, W) what remains of the background; alpha is 1 minus it.
+    """
+
+    color: Tensor
+    transmittance: Tensor
+
+
+def _settings(size: list[int], thresholds: list[float]):
+    return core.BlendSettings(size[0], size[1], thresholds[0], thresholds[1], thresholds[2], num_threads())
+
+
+def _arrays(means2d: Tensor, factors: Tensor, opacities: Tensor, radii: Tensor):
+    kind = core.SplatArraysF32 if means2d.dtype == torch.float32 else core.SplatArraysF64
+    return kind(*(contiguous(x) for x in (means2d, factors, opacities, radii)))
+
+
+@torch.library.custom_op("dyngs::bin_tiles", mutates_args=(), device_types="cpu")
+def _bin_tiles(
+    splats: list[Tensor], depths: Tensor, size: list[int], thresholds: list[float], max_entries: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    try:
+        entries = core.bin_tiles(
+            _arrays(*splats), contiguous(depths), _settings(size, thresholds), min(max_entries, MAX_ENTRIES)
+        )
+    except ValueError as error:  # std::length_error
+        raise DyngsError(f"render refused: {error}; lower the resolution, the scales or the number of views") from None
+    tile_offsets, slot_offsets, gaussians, slots = (torch.from_numpy(x) for x in entries)
+    return tile_offsets, slot_offsets, gaussians, slots
+
+
+@_bin_tiles.register_fake
+def _(splats, depths, size, thresholds, max_entries):
+    entries = torch.library.get_ctx().new_dynamic_size()
+    tiles = ((size[0] + TILE - 1) // TILE) * ((size[1] + TILE - 1) // TILE)
+    views, n = depths.shape
+    return (
+        depths.new_empty(views * tiles + 1, dtype=torch.int64),
+        depths.new_empty(views * n + 1, dtype=torch.int64),
+        depths.new_empty(entries, dtype=torch.int32),
+        depths.new_empty(entries, dtype=torch.int32),
+    )
+
+
+@torch.library.custom_op("dyngs::blend", mutates_args=(), device_types="cpu")
+def _blend(
+    means2d: Tensor,
+    factors: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    background: Tensor | None,
+    probe: Tensor | None,
+    radii: Tensor,
+    entries: list[Tensor],
+    size: list[int],
+    thresholds: list[float],
+    absgrad: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    shape = (colors.shape[0], size[1], size[0])
+    color, transmittance = colors.new_empty(*shape, colors.shape[2]), colors.new_empty(shape)
+    stop = torch.empty(shape, dtype=torch.int32)
+    core.rasterize_forward(
+        _arrays(means2d, factors, opacities, radii),
+        contiguous(colors),
+        None if background is None else contiguous(background),
+        tuple(entries),
+        _settings(size, thresholds),
+        (color, transmittance, stop, None),
+    )
+    return color, transmittance, stop
+
+
+@_blend.register_fake
+def _(means2d, factors, opacities, colors, background, probe, radii, entries, size, thresholds, absgrad):
+    shape = (colors.shape[0], size[1], size[0])
+    return (
+        colors.new_empty(*shape, colors.shape[2]),
+        colors.new_empty(shape),
+        colors.new_empty(shape, dtype=torch.int32),
+    )
+
+
+@torch.library.custom_op("dyngs::blend_backward", mutates_args=(), device_types="cpu")
+def _blend_backward(
+    splats: list[Tensor],
+    background: Tensor | None,
+    entries: list[Tensor],
+    image: list[Tensor],
+    grads: list[Tensor],
+    size: list[int],
+    thresholds: list[float],
+    absgrad: bool,
+    with_probe: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    means2d, factors, opacities, colors, radii = splats
+    out = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means2d, factors, opacities, colors)]
+    probe = means2d.new_empty(*opacities.shape, 4) if with_probe else means2d.new_empty(0)
+    core.rasterize_backward(
+        _arrays(means2d, factors, opacities, radii),
+        contiguous(colors),
+        None if background is None else contiguous(background),
+        tuple(entries),
+        _settings(size, thresholds),
+        (*(contiguous(g) for g in grads), *image),
+        (*out, probe if with_probe else None),
+        absgrad,
+    )
+    return out[0], out[1], out[2], out[3], probe
+
+
+@_blend_backward.register_fake
+def _(splats, background, entries, image, grads, size, thresholds, absgrad, with_probe):
+    means2d, factors, opacities, colors, _ = splats
+    out = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means2d, factors, opacities, colors)]
+    return (*out, means2d.new_empty(*opacities.shape, 4) if with_probe else means2d.new_empty(0))
+
+
+def _setup_context(ctx, inputs, output) -> None:
+    means2d, factors, opacities, colors, background, _, radii, entries, ctx.size, ctx.thresholds, ctx.absgrad = inputs
+    _, transmittance, stop = output
+    ctx.mark_non_differentiable(stop)
+    ctx.has_background = background is not None
+    kept = [background] if ctx.has_background else []
+    ctx.save_for_backward(means2d, factors, opacities, colors, radii, transmittance, stop, *entries, *kept)
+
+
+def _backward(ctx, g_color, g_transmittance, _g_stop):
+    saved = ctx.saved_tensors
+    splats, image, entries = list(saved[:5]), list(saved[5:7]), list(saved[7:11])
+    background = saved[11] if ctx.has_background else None
+    with_probe = ctx.needs_input_grad[5]
+    *out, probe = _blend_backward(
+        splats,
+        background,
+        entries,
+        image,
+        [g_color, g_transmittance],
+        ctx.size,
+        ctx.thresholds,
+        ctx.absgrad,
+        with_probe,
+    )
+    g_background = None
+    if ctx.needs_input_grad[4]:
+        g_background = torch.einsum("vhw,vhwd->vd", image[0], g_color)
+    return *out, g_background, probe if with_probe else None, None, [None] * 4, None, None, None
+
+
+torch.library.register_autograd("dyngs::blend", _backward, setup_context=_setup_context)
+
+
+def _splat_lists(projection: Projection, opacities: Tensor, size: list[int], options: BlendOptions):
+    thresholds = [options.alpha_min, options.alpha_max, options.transmittance_min]
+    with torch.no_grad():
+        splats = [projection.means2d, projection.factors, opacities, projection.radii]
+        entries = _bin_tiles(splats, projection.depths, size, thresholds, options.max_entries)
+    return list(entries), thresholds
+
+
+def rasterize(
+    projection: Projection,
+    opacities: Tensor,
+    colors: Tensor,
+    size: tuple[int, int],
+    *,
+    background: Tensor | None = None,
+    probe: Tensor | None = None,
+    options: BlendOptions = BlendOptions(),
+) -> Blended:
+    """Splats blended front to back into V images of D channels.
+
+    Differentiable in means2d, factors, opacities, colors and background.
+
+    Args:
+        projection: splats, see ``project``.
+        opacities: (V, N) in [0, 1], compensated already if wanted.
+        colors: (V, N, D), D up to 40.
+        size: width, height in px.
+        background: (V, D) or None for black.
+        probe: (V, N, 4) zeros; its gradient is the signed gradient of the 2D means in px, then (with ``absgrad``) the
+            sum over pixels of its absolute values.
+        options: thresholds.
+
+    Raises:
+        DyngsError: too many channels, or more (Gaussian, tile) pairs than ``options.max_entries``.
+    """
+    if not 1 <= colors.shape[-1] <= MAX_CHANNELS:
+        raise DyngsError(f"colors have {colors.shape[-1]} channels; 1 to {MAX_CHANNELS} can be blended in one call")
+    entries, thresholds = _splat_lists(projection, opacities, list(size), options)
+    color, transmittance, _ = _blend(
+        projection.means2d,
+        projection.factors,
+        opacities,
+        colors,
+        background,
+        probe,
+        projection.radii,
+        entries,
+        list(size),
+        thresholds,
+        options.absgrad,
+    )
+    return Blended(color, transmittance)
+
+
+def contribution_sums(
+    projection: Projection, opacities: Tensor, size: tuple[int, int], options: BlendOptions = BlendOptions()
+) -> Tensor:
+    """(V, N) sums over pixels of alpha times transmittance: how much of each picture every Gaussian makes up.
+
+    Arguments as for ``rasterize``; not differentiable.
+    """
+    entries, thresholds = _splat_lists(projection, opacities, list(size), options)
+    shape = (opacities.shape[0], size[1], size[0])
+    colors = torch.zeros_like(opacities)[..., None]
+    sums = torch.empty_like(opacities, memory_format=torch.contiguous_format)
+    image = (colors.new_empty(*shape, 1), colors.new_empty(shape), torch.empty(shape, dtype=torch.int32), sums)
+    splats = _arrays(projection.means2d, projection.factors, opacities, projection.radii)
+    core.rasterize_forward(
+        splats, contiguous(colors), None, tuple(entries), _settings(list(size), thresholds), image
+    )
+    return sums

@@ -1,0 +1,169 @@
+"""Slow, obvious versions of the native ops in plain torch: what the kernels are tested against.
+
+Everything is dense: every pixel looks at every Gaussian. Meant for float64 and a few Gaussians on a few pixels. Gradients
+come from autograd. Sources: Zwicker et al. 2001, Kerbl et al. 2023, Yu et al. 2024 (compensation).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.ops.projection import Projection, ProjectionOptions
+from dyngs.ops.rasterization import Blended, BlendOptions
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """(N, 3, 3) rotations of quaternions (N, 4) wxyz of any norm; zero gives the identity."""
+    norm = quats.norm(dim=-1, keepdim=True)
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype).expand_as(quats)
+    w, x, y, z = torch.where(norm > 0, quats / torch.where(norm > 0, norm, 1.0), identity).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def covariances2d(means: Tensor, quats: Tensor, scales: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """2D covariances (V, N, 2, 2) in px^2 without low-pass, and centres in the camera (V, N, 3)."""
+    rotation, translation = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
+    centers = torch.einsum("vij,nj->vni", rotation, means) + translation[:, None]
+    x, y, z = centers.unbind(-1)
+    fx, fy = cameras.intrinsics[:, 0, 0, None], cameras.intrinsics[:, 1, 1, None]
+    cx, cy = cameras.intrinsics[:, 0, 2, None], cameras.intrinsics[:, 1, 2, None]
+    margin_x, margin_y = 0.15 * cameras.width / fx, 0.15 * cameras.height / fy
+    tan_x = torch.minimum(torch.maximum(x / z, -cx / fx - margin_x), (cameras.width - cx) / fx + margin_x)
+    tan_y = torch.minimum(torch.maximum(y / z, -cy / fy - margin_y), (cameras.height - cy) / fy + margin_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack([fx / z, zero, -fx * tan_x / z, zero, fy / z, -fy * tan_y / z], -1).unflatten(-1, (2, 3))
+    half = jacobian @ rotation[:, None] @ (rotation_matrices(quats) * scales[:, None, :])
+    return half @ half.transpose(-1, -2), centers
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    cameras: Cameras,
+    options: ProjectionOptions = ProjectionOptions(),
+) -> Projection:
+    """As ``dyngs.ops.projection.project``."""
+    bare, centers = covariances2d(means, quats, scales, cameras)
+    low_pass = options.eps2d * torch.eye(2, dtype=means.dtype)
+    cov = bare + low_pass
+    det = cov[..., 0, 0] * cov[..., 1, 1] - cov[..., 0, 1] ** 2
+    bare_det = bare[..., 0, 0] * bare[..., 1, 1] - bare[..., 0, 1] ** 2
+    compensation = (bare_det / det).clamp_min(0).sqrt()
+    var_x, var_y, mixed = cov[..., 0, 0], cov[..., 1, 1], cov[..., 0, 1]
+    factors = torch.stack([(var_y / det).sqrt(), -mixed / (var_y * det).sqrt(), var_y.rsqrt()], -1)
+    x, y, z = centers.unbind(-1)
+    means2d = torch.stack(
+        [
+            cameras.intrinsics[:, 0, 0, None] * x / z + cameras.intrinsics[:, 0, 2, None],
+            cameras.intrinsics[:, 1, 1, None] * y / z + cameras.intrinsics[:, 1, 2, None],
+        ],
+        -1,
+    )
+    with torch.no_grad():
+        shown = opacities * compensation if options.antialiased else opacities.expand_as(z)
+        reach = 2 * (shown / options.alpha_min).log() if options.alpha_min > 0 else torch.full_like(z, float("inf"))
+        extents = (reach.clamp_min(0)[..., None] * torch.stack([var_x, var_y], -1)).sqrt().ceil().clamp_max(1e9)
+        size = torch.tensor([cameras.width, cameras.height])
+        visible = (z > options.near) & (z < options.far) & (reach > 0) & (extents > options.radius_clip).any(-1)
+        visible &= ((means2d + extents > 0) & (means2d - extents < size)).all(-1)
+    keep = visible[..., None]
+    return Projection(
+        means2d=torch.where(keep, means2d, 0.0),
+        depths=torch.where(visible, z, 0.0),
+        factors=torch.where(keep, factors, 0.0),
+        compensations=torch.where(visible, compensation, 0.0),
+        radii=torch.where(keep, extents, 0.0).int(),
+    )
+
+
+def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
+    """(..., K) real spherical harmonics of unit directions (..., 3), from the associated Legendre recursion.
+
+    Independent of the polynomials in csrc/math/harmonics.hpp; signs as in 3DGS (Condon-Shortley phase included).
+    """
+    x, y, z = directions.unbind(-1)
+    azimuth = torch.complex(x, y)
+    terms = []
+    for order in range(degree + 1):
+        for m in range(-order, order + 1):
+            norm = ((2 * order + 1) / (4 * torch.pi) * _factorial_ratio(order, abs(m))) ** 0.5
+            polynomial = norm * _legendre_without_sine(order, abs(m), z)
+            power = azimuth ** abs(m)
+            part = power.imag if m < 0 else power.real
+            terms.append(polynomial * part * (1.0 if m == 0 else 2**0.5))
+    return torch.stack(terms, -1)
+
+
+def _factorial_ratio(order: int, m: int) -> float:
+    ratio = 1.0
+    for k in range(order - m + 1, order + m + 1):
+        ratio /= k
+    return ratio
+
+
+def _legendre_without_sine(order: int, m: int, z: Tensor) -> Tensor:
+    """Associated Legendre function P_order^m(z) / sin(theta)^m, with the Condon-Shortley phase (-1)^m."""
+    current = torch.ones_like(z)
+    for k in range(1, m + 1):
+        current = current * -(2 * k - 1)
+    previous = torch.zeros_like(z)
+    for k in range(m + 1, order + 1):
+        current, previous = ((2 * k - 1) * z * current - (k + m - 1) * previous) / (k - m), current
+    return current
+
+
+def evaluate_harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:
+    """As ``dyngs.ops.harmonics.evaluate_harmonics``."""
+    offsets = means[None] - centers[:, None]
+    directions = offsets / offsets.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+    basis = harmonics_basis(directions, degree)
+    colors = torch.einsum("vnk,nkc->vnc", basis, sh[:, : basis.shape[-1]]) + 0.5
+    return torch.where((radii > 0).all(-1, keepdim=True), colors.clamp_min(0), 0.0)
+
+
+def rasterize(
+    projection: Projection,
+    opacities: Tensor,
+    colors: Tensor,
+    size: tuple[int, int],
+    *,
+    background: Tensor | None = None,
+    options: BlendOptions = BlendOptions(),
+) -> Blended:
+    """As ``dyngs.ops.rasterization.rasterize``, without probe: a loop over Gaussians, vectorised over pixels."""
+    width, height = size
+    rows, columns = (torch.arange(n, dtype=colors.dtype) + 0.5 for n in (height, width))
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    pictures, remains = [], []
+    for v in range(len(opacities)):
+        transmittance = torch.ones(height, width, dtype=colors.dtype)
+        picture = torch.zeros(height, width, colors.shape[-1], dtype=colors.dtype)
+        full = torch.zeros(height, width, dtype=torch.bool)
+        visible = torch.nonzero((projection.radii[v] > 0).all(-1))[:, 0]
+        for i in visible[projection.depths[v, visible].argsort(stable=True)]:
+            u_x, u_y, v_y = projection.factors[v, i]
+            dx, dy = projection.means2d[v, i, 0] - x, projection.means2d[v, i, 1] - y
+            power = -0.5 * ((u_x * dx + u_y * dy) ** 2 + (v_y * dy) ** 2)
+            alpha = (opacities[v, i] * power.exp()).clamp_max(options.alpha_max)
+            alpha = torch.where((alpha >= options.alpha_min) & ~full, alpha, 0.0)
+            after = transmittance * (1 - alpha)
+            full = full | ((after < options.transmittance_min) & (alpha > 0))
+            alpha = torch.where(full, 0.0, alpha)
+            picture = picture + (alpha * transmittance)[..., None] * colors[v, i]
+            transmittance = transmittance * (1 - alpha)
+        if background is not None:
+            picture = picture + transmittance[..., None] * background[v]
+        pictures.append(picture)
+        remains.append(transmittance)
+    return Blended(torch.stack(pictures), torch.stack(remains))
+
+

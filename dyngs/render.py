@@ -1,0 +1,161 @@
+"""The one verb: Gaussians seen by cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.conventions import RasterizeMode
+from dyngs.gaussians import Gaussians
+from dyngs.ops.finite import check_finite, finite_rows
+from dyngs.ops.harmonics import evaluate_harmonics
+from dyngs.ops.projection import Projection, ProjectionOptions, project
+from dyngs.ops.rasterization import BlendOptions, contribution_sums, rasterize
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How to draw.
+
+    Attributes:
+        near, far: centres outside are culled, world units (3DGS: 0.2).
+        eps2d: 2D low-pass variance, px^2 (3DGS: 0.3; Mip-Splatting: 0.1).
+        mode: classic, or antialiased (opacity compensated for the low-pass).
+        sh_degree: highest degree used; None = all that is stored.
+        alpha_min, alpha_max, transmittance_min: see ``BlendOptions``.
+        depth: none, accumulated (sum of weight times depth) or expected (that, divided by alpha).
+        absgrad: fill the absolute part of the probe's gradient.
+        nonfinite: NaN or infinite input is an ``error``, or its Gaussians are left out (``skip``), or nobody looks
+            (``trust``; the trainer, whose optimizer never writes such values).
+    """
+
+    near: float = 0.2
+    far: float = 1e10
+    eps2d: float = 0.3
+    mode: RasterizeMode = RasterizeMode.CLASSIC
+    sh_degree: int | None = None
+    alpha_min: float = 1 / 255
+    alpha_max: float = 0.99
+    transmittance_min: float = 1e-4
+    depth: Literal["none", "accumulated", "expected"] = "none"
+    absgrad: bool = False
+    nonfinite: Literal["error", "skip", "trust"] = "error"
+
+    @property
+    def projection(self) -> ProjectionOptions:
+        antialiased = self.mode == RasterizeMode.ANTIALIASED
+        return ProjectionOptions(self.eps2d, self.near, self.far, self.alpha_min, antialiased=antialiased)
+
+    @property
+    def blending(self) -> BlendOptions:
+        return BlendOptions(self.alpha_min, self.alpha_max, self.transmittance_min, self.absgrad)
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """V pictures.
+
+    Attributes:
+        rgb: (V, H, W, 3), background composited; not clamped above 1.
+        alpha: (V, H, W) in [0, 1].
+        depth: (V, H, W) view-space z in world units, or None; 0 where nothing is drawn.
+        radii: (V, N, 2) int32 half extents in px, 0 = not drawn.
+    """
+
+    rgb: Tensor
+    alpha: Tensor
+    depth: Tensor | None
+    radii: Tensor
+
+
+def render(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    options: RenderOptions = RenderOptions(),
+    *,
+    background: Tensor | None = None,
+    probe: Tensor | None = None,
+) -> Rendering:
+    """Pictures of the Gaussians from every camera (Kerbl et al. 2023), differentiable in all of them.
+
+    Args:
+        gaussians: N Gaussians, float32 (production), float64 (checks) or half (computed in float32).
+        cameras: V cameras.
+        options: how to draw.
+        background: (3,) or (V, 3) colour; None = black.
+        probe: (V, N, 4) zeros whose gradient is the densification signal, see ``rasterize``.
+
+    Raises:
+        DyngsError: NaN or infinite input (names the argument and the count), or a render too large to bin.
+    """
+    gaussians, cameras = _one_dtype(gaussians, cameras)
+    if options.nonfinite != "trust":
+        gaussians = _deal_with_nonfinite(gaussians, cameras, options.nonfinite)
+    projection, opacities = _project(gaussians, cameras, options)
+    degree = gaussians.sh_degree if options.sh_degree is None else min(options.sh_degree, gaussians.sh_degree)
+    colors = evaluate_harmonics(gaussians.means, cameras.centers, gaussians.sh, projection.radii, degree)
+    if background is not None:
+        background = background.to(colors.dtype).expand(len(cameras), 3)
+    if options.depth != "none":
+        colors = torch.cat([colors, projection.depths[..., None]], dim=-1)
+        if background is not None:
+            background = torch.cat([background, torch.zeros_like(background[:, :1])], dim=-1)
+    size = (cameras.width, cameras.height)
+    blended = rasterize(
+        projection, opacities, colors, size, background=background, probe=probe, options=options.blending
+    )
+    alpha = 1 - blended.transmittance
+    depth = None
+    if options.depth != "none":
+        depth = blended.color[..., 3]
+        if options.depth == "expected":
+            depth = depth / torch.where(alpha > 0, alpha, 1.0)
+    return Rendering(blended.color[..., :3], alpha, depth, projection.radii)
+
+
+def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()) -> Tensor:
+    """(V, N) sum over pixels of each Gaussian's blending weight: its share of every picture, for pruning scores."""
+    gaussians, cameras = _one_dtype(gaussians.detach(), cameras)
+    projection, opacities = _project(gaussians, cameras, options)
+    return contribution_sums(projection, opacities, (cameras.width, cameras.height), options.blending)
+
+
+def _project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Projection, Tensor]:
+    opacities = gaussians.opacities
+    projection = project(
+        gaussians.means, gaussians.quats, gaussians.scales, opacities, cameras, options.projection
+    )
+    per_view = opacities.expand(len(cameras), -1)
+    if options.mode == RasterizeMode.ANTIALIASED:
+        per_view = per_view * projection.compensations
+    return projection, per_view
+
+
+def _one_dtype(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
+    dtype = torch.float64 if gaussians.means.dtype == torch.float64 else torch.float32
+    if any(x.dtype != dtype for x in gaussians.tensors().values()):
+        gaussians = gaussians.replace(**{name: x.to(dtype) for name, x in gaussians.tensors().items()})
+    if cameras.cam_from_world.dtype != dtype or cameras.intrinsics.dtype != dtype:
+        cameras = cameras.to(dtype=dtype)
+    return gaussians, cameras
+
+
+def _deal_with_nonfinite(gaussians: Gaussians, cameras: Cameras, policy: str) -> Gaussians:
+    check_finite({"cam_from_world": cameras.cam_from_world, "intrinsics": cameras.intrinsics})
+    if policy == "error":
+        check_finite(gaussians.tensors())
+        return gaussians
+    keep = finite_rows(list(gaussians.tensors().values()))
+    if bool(keep.all()):
+        return gaussians
+    cleaned = {}
+    for name, x in gaussians.tensors().items():
+        mask = keep.view(-1, *[1] * (x.ndim - 1))
+        cleaned[name] = torch.where(mask, x, torch.zeros_like(x))
+    hidden = torch.full_like(gaussians.logit_opacities, -1e4)  # opacity exactly 0: culled, no gradient
+    cleaned["logit_opacities"] = torch.where(keep, cleaned["logit_opacities"], hidden)
+    return Gaussians(**cleaned)

@@ -1,0 +1,1 @@
+"""The static model: how Gaussians start, are optimised, multiply and are filtered."""

@@ -1,0 +1,225 @@
+"""Where Gaussians are added and removed: clone, split and prune by the gradient of the 2D means (3DGS, AbsGS).
+
+``Densifier`` is what the trainer asks of any strategy; the other one is in ``mcmc.py``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from dyngs.config import DefaultStrategy
+from dyngs.gaussians import Gaussians, TopologyEdit
+
+SPLIT_SHRINK = 1.6
+RESET_OPACITY = 0.01
+
+
+@dataclass(frozen=True)
+class DensifySchedule:
+    """When the set of Gaussians changes, in steps of this run (already scaled with its length).
+
+    Attributes:
+        start, stop: changes happen strictly between the two.
+        every: steps between changes.
+        resets: steps at which opacities are lowered.
+        prune_scale_after: from this step on, Gaussians that are too large are removed.
+    """
+
+    start: int
+    stop: int
+    every: int
+    resets: tuple[int, ...] = ()
+    prune_scale_after: int = 0
+
+    def densifies_at(self, step: int) -> bool:
+        return self.start < step < self.stop and step % self.every == 0
+
+
+@dataclass(frozen=True)
+class EditResult:
+    """A change of the set of Gaussians.
+
+    Attributes:
+        edit: how rows move; None where all stay in place.
+        changes: field name to its new values (N_new, ...), for the fields that are not just rows moved.
+        zero_moments: fields whose optimizer moments start anew in every row.
+    """
+
+    edit: TopologyEdit | None
+    changes: dict[str, Tensor] = field(default_factory=dict)
+    zero_moments: frozenset[str] = frozenset()
+
+
+class Densifier(Protocol):
+    """A strategy that changes the set of Gaussians during training."""
+
+    touches_all: bool
+    """Every Gaussian receives a gradient in every step, seen or not."""
+
+    def wants_signal(self, step: int) -> bool:
+        """Whether ``after_backward`` needs the gradient of the 2D means at ``step``."""
+        ...
+
+    def after_backward(self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]) -> None:
+        """Take in the probe's gradient (V, N, 4) and radii (V, N, 2) of pictures of ``size`` (width, height)."""
+        ...
+
+    def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
+        """What changes after ``step``; None if nothing does."""
+        ...
+
+    def regularizers(self, parameters: Gaussians) -> dict[str, Tensor]:
+        """Differentiable scalars, already weighted, that are added to the loss, by name."""
+        ...
+
+    def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
+        """Add the strategy's noise to the parameters, in place, after the optimizer's step."""
+        ...
+
+    def state(self) -> dict[str, Tensor]:
+        """What a checkpoint must hold."""
+        ...
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Take over what ``state()`` returned."""
+        ...
+
+
+class DefaultDensifier:
+    """Clone, split and prune by the mean norm of the 2D mean's gradient over the views that saw a Gaussian (3DGS).
+
+    Small Gaussians with a large gradient are copied, large ones replaced by two samples of themselves, transparent and
+    (later) huge ones removed; opacities are lowered now and then. At least one Gaussian is always left. Where the cap
+    ``max_gaussians`` leaves no room for all, those with the largest gradients go first.
+    """
+
+    touches_all = False
+
+    def __init__(self, options: DefaultStrategy, schedule: DensifySchedule, extent: float) -> None:
+        self.options, self.schedule, self.extent = options, schedule, extent
+        self.grad_sum = torch.zeros(0)
+        self.seen = torch.zeros(0)
+
+    def wants_signal(self, step: int) -> bool:
+        return step < self.schedule.stop
+
+    def after_backward(self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]) -> None:
+        if not self.wants_signal(step):
+            return
+        if len(self.seen) != probe_grad.shape[1]:
+            self.grad_sum = torch.zeros(probe_grad.shape[1])
+            self.seen = torch.zeros(probe_grad.shape[1])
+        grad = probe_grad[..., 2:] if self.options.absgrad else probe_grad[..., :2]
+        x, y = grad[..., 0] * (0.5 * size[0]), grad[..., 1] * (0.5 * size[1])
+        visible = (radii > 0).all(-1)
+        self.grad_sum += torch.where(visible, torch.hypot(x, y), 0.0).sum(0)
+        self.seen += visible.sum(0)
+
+    def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
+        resets = step in self.schedule.resets
+        parameters = parameters.detach()
+        if self.schedule.densifies_at(step) and len(self.seen) == len(parameters):
+            result = self._densify(step, parameters, generator)
+            self.grad_sum, self.seen = torch.zeros(0), torch.zeros(0)
+        elif resets:
+            result = EditResult(None)
+        else:
+            return None
+        return _with_lowered_opacities(result, parameters.logit_opacities) if resets else result
+
+    def regularizers(self, parameters: Gaussians) -> dict[str, Tensor]:
+        return {}
+
+    def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
+        return None
+
+    def state(self) -> dict[str, Tensor]:
+        return {"grad_sum": self.grad_sum, "seen": self.seen}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self.grad_sum, self.seen = state["grad_sum"].clone(), state["seen"].clone()
+
+    def _densify(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
+        max_scale = self.options.prune_scale * self.extent if step > self.schedule.prune_scale_after else math.inf
+        plan = plan_edit(parameters, self.grad_sum / self.seen.clamp_min(1), self.options, self.extent, max_scale)
+        kept, cloned, split = (torch.nonzero(mask)[:, 0] for mask in (plan.kept, plan.cloned, plan.split))
+        source = torch.cat([kept, cloned, split, split])
+        is_new = torch.ones(len(source), dtype=torch.bool)
+        is_new[: len(kept)] = False
+        means, log_scales = parameters.means[source], parameters.log_scales[source]
+        children = slice(len(kept) + len(cloned), None)
+        noise = torch.randn((2 * len(split), 3), generator=generator) * log_scales[children].exp()
+        means[children] += rotate(parameters.quats[source[children]], noise)
+        log_scales[children] -= math.log(SPLIT_SHRINK)
+        return EditResult(TopologyEdit(source, is_new), {"means": means, "log_scales": log_scales})
+
+
+@dataclass(frozen=True)
+class EditPlan:
+    """Which of the N old Gaussians stay as they are, are copied, are split in two: (N,) bool each.
+
+    A copied Gaussian is also kept, a split one is not; those in none of the three are removed.
+    """
+
+    kept: Tensor
+    cloned: Tensor
+    split: Tensor
+
+
+def plan_edit(
+    parameters: Gaussians, score: Tensor, options: DefaultStrategy, extent: float, max_scale: float
+) -> EditPlan:
+    """The plan of one densification.
+
+    Args:
+        score: (N,) mean gradient norm of the 2D means in NDC units.
+        extent: of the scene, world units.
+        max_scale: larger Gaussians are removed, world units.
+    """
+    scale = parameters.log_scales.amax(1).exp()
+    opaque = parameters.opacities >= options.prune_opacity
+    survives = opaque & (scale <= max_scale)
+    wanted = opaque & (score >= options.grad_threshold)
+    large = scale > options.dense_fraction * extent
+    split = wanted & large & (scale / SPLIT_SHRINK <= max_scale)
+    cloned = wanted & ~large & survives
+    # A candidate adds one Gaussian; a split one that would otherwise have been removed adds two.
+    cost = torch.where(split & ~survives, 2, 1)
+    chosen = _best_within(split | cloned, score, cost, options.max_gaussians - int(survives.sum()))
+    split, cloned = split & chosen, cloned & chosen
+    kept = survives & ~split
+    if not bool((kept | split).any()):
+        kept[parameters.logit_opacities.nan_to_num(nan=-math.inf).argmax()] = True
+    return EditPlan(kept, cloned, split)
+
+
+def _best_within(candidates: Tensor, score: Tensor, cost: Tensor, room: int) -> Tensor:
+    """(N,) bool: the candidates of highest score whose costs add up to at most ``room``; ties by index."""
+    indices = torch.nonzero(candidates)[:, 0]
+    if int(cost[indices].sum()) <= room:
+        return candidates
+    indices = indices[torch.sort(score[indices], descending=True, stable=True).indices]
+    chosen = torch.zeros_like(candidates)
+    chosen[indices[torch.cumsum(cost[indices], 0) <= room]] = True
+    return chosen
+
+
+def _with_lowered_opacities(result: EditResult, logit_opacities: Tensor) -> EditResult:
+    """``result`` followed by an opacity reset: at most 0.01 everywhere, its moments at zero."""
+    moved = logit_opacities if result.edit is None else result.edit.apply(logit_opacities)
+    lowered = moved.clamp_max(math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    changes = {**result.changes, "logit_opacities": lowered}
+    return EditResult(result.edit, changes, result.zero_moments | {"logit_opacities"})
+
+
+def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
+    """(N, 3) ``vectors`` turned by ``quats`` (N, 4) wxyz of any length; a zero quaternion turns nothing."""
+    unit = torch.nn.functional.normalize(quats, dim=-1)
+    w, axis = unit[:, :1], unit[:, 1:]
+    twice = 2 * torch.linalg.cross(axis, vectors)
+    return vectors + w * twice + torch.linalg.cross(axis, twice)

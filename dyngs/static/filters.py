@@ -1,0 +1,71 @@
+"""Mip-Splatting's 3D smoothing filter: no Gaussian is smaller than what the training cameras can resolve."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import logsigmoid
+
+from dyngs.camera import Cameras
+from dyngs.gaussians import Gaussians
+
+FILTER_VARIANCE = 0.2
+"""Variance of the filter in squared sampling intervals."""
+NEAR = 0.2
+MARGIN = 0.15
+"""Cameras count as seeing what lies within the image enlarged by this fraction on each side."""
+
+
+def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
+    """(N,) standard deviation of the 3D filter in world units: sqrt(0.2) * nearest depth / largest focal length.
+
+    The nearest depth is over the cameras that see a Gaussian at depth > 0.2; a Gaussian that none sees gets the largest
+    nearest depth of the others (1 where there are no others). Constant with respect to gradients.
+
+    Args:
+        means: (N, 3) in the world.
+        cameras: the training cameras, with the intrinsics of the pictures that are trained on.
+    """
+    means = means.detach()
+    nearest = torch.full((len(means),), torch.inf)
+    focal = max(float(group.intrinsics[:, 0, 0].max()) for group in cameras)
+    for group in cameras:
+        for pose, intrinsics in zip(group.cam_from_world, group.intrinsics, strict=True):
+            depth = _visible_depth(means, pose, intrinsics, group.width, group.height)
+            nearest = torch.minimum(nearest, depth)
+    seen = torch.isfinite(nearest)
+    farthest = nearest[seen].max() if bool(seen.any()) else torch.tensor(1.0)
+    return torch.where(seen, nearest, farthest) * (FILTER_VARIANCE**0.5 / focal)
+
+
+def _visible_depth(means: Tensor, pose: Tensor, intrinsics: Tensor, width: int, height: int) -> Tensor:
+    """(N,) depth in one camera, infinite where it does not see the point."""
+    # Written out instead of a matrix product, whose sums depend on the number of threads.
+    rotation, translation = pose[:3, :3], pose[:3, 3]
+    x, y, z = (means[:, 0] * r[0] + means[:, 1] * r[1] + means[:, 2] * r[2] + t for r, t in zip(rotation, translation))
+    u = (intrinsics[0, 0] * x + intrinsics[0, 1] * y) / z + intrinsics[0, 2]
+    v = intrinsics[1, 1] * y / z + intrinsics[1, 2]
+    inside = (
+        (u >= -MARGIN * width) & (u <= (1 + MARGIN) * width) & (v >= -MARGIN * height) & (v <= (1 + MARGIN) * height)
+    )
+    return torch.where(inside & (z > NEAR), z, torch.inf)
+
+
+def fuse_filter(gaussians: Gaussians, std: Tensor) -> Gaussians:
+    """Gaussians convolved with the filter: s' = sqrt(s^2 + f^2), o' = o * prod_k s_k / s'_k; differentiable.
+
+    All in logarithms, one axis at a time, because products of scales underflow: log o' / (1 - o') is taken from
+    log o' and 1 - o' = (1 - o) + o (1 - prod), both sums of positive terms.
+
+    Args:
+        std: (N,) from ``filter_std``.
+    """
+    log_scales = torch.logaddexp(2 * gaussians.log_scales, 2 * std.log()[:, None]) / 2
+    log_ratio = (gaussians.log_scales - log_scales).sum(1).clamp_max(0)
+    logits = gaussians.logit_opacities
+    log_opacity = logsigmoid(logits)  # and not sigmoid, whose last bit depends on the number of threads
+    missing = logsigmoid(-logits).exp() - log_opacity.exp() * torch.expm1(log_ratio)
+    fused = log_opacity + log_ratio - missing.clamp_min(torch.finfo(missing.dtype).tiny).log()
+    return gaussians.replace(log_scales=log_scales, logit_opacities=fused)

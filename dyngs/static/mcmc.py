@@ -1,0 +1,138 @@
+"""3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024): a cap, relocation of dead Gaussians, noise."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from dyngs.config import McmcStrategy
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.static.densify import DensifySchedule, EditResult, rotate
+
+MAX_COPIES = 50
+NOISE_STEEPNESS = 100.0
+NOISE_OPACITY = 0.005
+NOISE_MAX_OPACITY = 0.3
+"""More opaque Gaussians would move by less than 1e-12 of the published noise; nothing is drawn for them."""
+
+
+class McmcDensifier:
+    """Moves dead Gaussians onto living ones, grows the set up to a cap, and shakes the nearly transparent ones.
+
+    Relocation keeps the composited appearance, so there is no threshold on gradients, no opacity reset, no pruning.
+    """
+
+    touches_all = True
+
+    def __init__(self, options: McmcStrategy, schedule: DensifySchedule, growth: float) -> None:
+        """``growth`` is the fraction of Gaussians added per change, adapted to the run's length."""
+        self.options, self.schedule, self.growth = options, schedule, growth
+
+    def wants_signal(self, step: int) -> bool:
+        return False
+
+    def after_backward(self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]) -> None:
+        return None
+
+    def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
+        if not self.schedule.densifies_at(step):
+            return None
+        parameters = parameters.detach()
+        opacities = parameters.opacities.double()
+        log_scales = parameters.log_scales
+        alive = opacities > self.options.min_opacity
+        if not bool(alive.any()):
+            return None
+        n = len(opacities)
+        dead = torch.nonzero(~alive)[:, 0]
+        source, is_new = torch.arange(n), ~alive
+        if len(dead) > 0:
+            picks = torch.multinomial(
+                torch.where(alive, opacities, 0.0), len(dead), replacement=True, generator=generator
+            )
+            opacities, log_scales, shared = self._share(opacities, log_scales, picks)
+            source[dead], opacities[dead], log_scales[dead] = picks, opacities[picks], log_scales[picks]
+            is_new = is_new | shared
+        added = max(0, min(self.options.max_gaussians, int((1 + self.growth) * n)) - n)
+        if added > 0:
+            picks = torch.multinomial(opacities, added, replacement=True, generator=generator)
+            opacities, log_scales, shared = self._share(opacities, log_scales, picks)
+            is_new = torch.cat([is_new | shared, torch.ones(added, dtype=torch.bool)])
+            source = torch.cat([source, source[picks]])
+            opacities = torch.cat([opacities, opacities[picks]])
+            log_scales = torch.cat([log_scales, log_scales[picks]])
+        logits = torch.where(
+            is_new, (opacities.log() - torch.log1p(-opacities)).float(), parameters.logit_opacities[source]
+        )
+        return EditResult(TopologyEdit(source, is_new), {"logit_opacities": logits, "log_scales": log_scales})
+
+    def regularizers(self, parameters: Gaussians) -> dict[str, Tensor]:
+        return {
+            "opacity": self.options.opacity_reg * parameters.opacities.mean(),
+            "scale": self.options.scale_reg * parameters.scales.mean(),
+        }
+
+    def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
+        """means += noise * lr * sigmoid(100 (0.005 - o)) * Sigma eta, with eta standard normal."""
+        if self.options.noise == 0:
+            return
+        drawn = parameters.logit_opacities.detach() < math.log(NOISE_MAX_OPACITY / (1 - NOISE_MAX_OPACITY))
+        rows = torch.nonzero(drawn)[:, 0]
+        quats, log_scales, logits = (
+            x.detach()[rows] for x in (parameters.quats, parameters.log_scales, parameters.logit_opacities)
+        )
+        eta = torch.randn((len(rows), 3), generator=generator)
+        shake = rotate(quats, rotate(quats * torch.tensor([1.0, -1.0, -1.0, -1.0]), eta) * (2 * log_scales).exp())
+        opacities = torch.nn.functional.logsigmoid(logits).exp()  # unlike sigmoid, the same on any number of threads
+        weight = 1 / (1 + (NOISE_STEEPNESS * (opacities - NOISE_OPACITY)).exp())
+        parameters.means.detach().index_add_(0, rows, shake * (weight * (self.options.noise * lr_means))[:, None])
+
+    def state(self) -> dict[str, Tensor]:
+        return {}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        return None
+
+    def _share(self, opacities: Tensor, log_scales: Tensor, picks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Opacities, log scales and a mask of changed rows, after each row shares itself with its ``picks``."""
+        copies = torch.bincount(picks, minlength=len(opacities)) + 1
+        shared = copies > 1
+        opacities, log_scales = opacities.clone(), log_scales.clone()
+        thinner, factor = relocated(opacities[shared], copies[shared], self.options.min_opacity)
+        opacities[shared] = thinner
+        log_scales[shared] += factor.log().float()[:, None]
+        return opacities, log_scales, shared
+
+
+def relocated(opacities: Tensor, copies: Tensor, min_opacity: float = 0.005) -> tuple[Tensor, Tensor]:
+    """Opacity and scale factor of N coincident copies that composite to one Gaussian of opacity o.
+
+    o' = 1 - (1 - o)^(1/N); the scale factor keeps the integral of the composited 1-D profile:
+    o / sum_{j=1..N} C(N, j) (-1)^(j-1) o'^j / sqrt(j), which is the published double sum with its inner binomials added
+    up.
+
+    Args:
+        opacities: (n,) float64 in (0, 1].
+        copies: (n,) long, how many there will be (treated as at most 50).
+        min_opacity: lower bound of o'; where it acts, the integral is not kept.
+
+    Returns:
+        o' (n,) and the factor (n,), float64.
+    """
+    eps = torch.finfo(torch.float32).eps
+    opacities = opacities.double().clamp_max(1 - eps)
+    copies = copies.clamp(1, MAX_COPIES)
+    thinner = -torch.expm1(torch.log1p(-opacities) / copies)
+    thinner = thinner.clamp(min_opacity, 1 - eps)
+    j = torch.arange(1, MAX_COPIES + 1, dtype=torch.float64)
+    profile = _binomials()[copies][:, 1:] * torch.where(j % 2 == 1, 1.0, -1.0) / j.sqrt()
+    powers = (thinner.log()[:, None] * j).exp()  # torch.pow depends on the number of threads
+    return thinner, opacities / (profile * powers).sum(1)
+
+
+def _binomials() -> Tensor:
+    """(51, 51) table of C(N, j), float64."""
+    rows = [[float(math.comb(n, j)) for j in range(MAX_COPIES + 1)] for n in range(MAX_COPIES + 1)]
+    return torch.tensor(rows, dtype=torch.float64)

@@ -1,0 +1,104 @@
+"""Adam over everything that is stored per Gaussian, following changes of the set."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dyngs.config import OptimConfig
+from dyngs.gaussians import Gaussians
+from dyngs.ops.adam import adam_step_, seen_rows
+from dyngs.static.densify import EditResult
+
+
+class GaussianOptimizer:
+    """The parameters of N Gaussians and their Adam moments.
+
+    Attributes:
+        parameters: leaf tensors that receive gradients; exchanged for new ones by ``apply``.
+    """
+
+    def __init__(self, gaussians: Gaussians, options: OptimConfig) -> None:
+        self.options = options
+        self.parameters = _as_leaves(gaussians.tensors())
+        self._exp_avg = {name: torch.zeros_like(x.detach()) for name, x in gaussians.tensors().items()}
+        self._exp_avg_sq = {name: torch.zeros_like(x.detach()) for name, x in gaussians.tensors().items()}
+        self._lr_sh = torch.full((gaussians.sh.shape[1], 3), options.lr_sh_rest)
+        self._lr_sh[0] = options.lr_sh_dc
+        self._lr_sh = self._lr_sh.reshape(-1)
+
+    def step(self, step: int, lr_means: float, *, dense: bool) -> int:
+        """How many rows were left out because their gradient is not finite; updates the parameters, drops the gradients.
+
+        Args:
+            step: number of this step, from 1, for Adam's bias correction.
+            lr_means: learning rate of the means, world units.
+            dense: update all Gaussians; otherwise, if ``optim.sparse``, only those that received a gradient: the others
+                keep parameters and moments.
+        """
+        rows = None if dense or not self.options.sparse else self._rows_with_gradient()
+        rates: dict[str, float | Tensor] = {
+            "means": lr_means,
+            "quats": self.options.lr_quats,
+            "log_scales": self.options.lr_scales,
+            "logit_opacities": self.options.lr_opacities,
+            "sh": self._lr_sh,
+        }
+        left_out = 0
+        for name, x in self.parameters.tensors().items():
+            if x.grad is not None:
+                left_out += adam_step_(
+                    x.detach(),
+                    x.grad,
+                    self._exp_avg[name],
+                    self._exp_avg_sq[name],
+                    lr=rates[name],
+                    step=step,
+                    eps=self.options.eps,
+                    rows=rows,
+                )
+                x.grad = None
+        return left_out
+
+    def apply(self, result: EditResult) -> None:
+        """Change the set of Gaussians: parameters and moments of survivors move along, new rows start without moments.
+
+        All parameters become new leaf tensors; gradients are dropped.
+        """
+        moved: dict[str, Tensor] = {}
+        for name, x in self.parameters.tensors().items():
+            if result.edit is not None:
+                self._exp_avg[name] = result.edit.apply_moments(self._exp_avg[name])
+                self._exp_avg_sq[name] = result.edit.apply_moments(self._exp_avg_sq[name])
+            if name in result.zero_moments:
+                self._exp_avg[name].zero_()
+                self._exp_avg_sq[name].zero_()
+            if name in result.changes:
+                moved[name] = result.changes[name]
+            else:
+                moved[name] = x if result.edit is None else result.edit.apply(x.detach())
+        self.parameters = _as_leaves(moved)
+
+    def state(self) -> dict[str, Tensor]:
+        """Parameters and moments by name, for a checkpoint: ``gaussians.*``, ``exp_avg.*``, ``exp_avg_sq.*``."""
+        state = {f"gaussians.{name}": x.detach() for name, x in self.parameters.tensors().items()}
+        state |= {f"exp_avg.{name}": x for name, x in self._exp_avg.items()}
+        return state | {f"exp_avg_sq.{name}": x for name, x in self._exp_avg_sq.items()}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Take over what ``state()`` returned."""
+        names = list(self.parameters.tensors())
+        self.parameters = _as_leaves({name: state[f"gaussians.{name}"].clone() for name in names})
+        self._exp_avg = {name: state[f"exp_avg.{name}"].clone() for name in names}
+        self._exp_avg_sq = {name: state[f"exp_avg_sq.{name}"].clone() for name in names}
+
+    def _rows_with_gradient(self) -> Tensor:
+        """(N,) bool; opacity or position: a Gaussian at full opacity gets no gradient on its opacity alone."""
+        opacity_grad, means_grad = self.parameters.logit_opacities.grad, self.parameters.means.grad
+        if opacity_grad is None or means_grad is None:
+            return torch.ones(len(self.parameters), dtype=torch.bool)
+        return (opacity_grad != 0) | seen_rows(means_grad)
+
+
+def _as_leaves(tensors: dict[str, Tensor]) -> Gaussians:
+    return Gaussians(**{name: x.detach().contiguous().requires_grad_() for name, x in tensors.items()})

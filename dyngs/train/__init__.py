@@ -1,0 +1,1 @@
+"""Training and evaluation: the loop, its schedules, checkpoints, logs and metrics."""

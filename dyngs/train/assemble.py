@@ -1,0 +1,107 @@
+"""From a configuration to a trainer that is ready for its first step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from dyngs.camera import Cameras
+from dyngs.config import Config, DataConfig, McmcStrategy
+from dyngs.data.capture import Capture, View
+from dyngs.data.images import target_size
+from dyngs.data.intrinsics import scaled_intrinsics
+from dyngs.data.loader import PictureLoader
+from dyngs.data.read import read_capture
+from dyngs.render import RenderOptions
+from dyngs.static.densify import DefaultDensifier, Densifier
+from dyngs.static.init import StartValues, Surroundings, initial_gaussians
+from dyngs.static.mcmc import McmcDensifier
+from dyngs.static.model import StaticScene
+from dyngs.static.optimizer import GaussianOptimizer
+from dyngs.train.sampler import ViewSampler
+from dyngs.train.schedule import densify_schedule, filter_steps, growth_per_change
+from dyngs.train.step import Trainer
+
+
+def assemble(config: Config) -> Trainer:
+    """The trainer of a configuration: capture read, Gaussians initialised, nothing trained.
+
+    Raises:
+        DyngsError: a capture that cannot be read.
+    """
+    capture = read_capture(config.data)
+    scene = surroundings(capture)
+    generator = torch.Generator().manual_seed(config.run.seed)
+    start = StartValues.for_strategy(config.strategy)
+    gaussians = initial_gaussians(scene, config.init, start, config.model.sh_degree, generator)
+    background = resolved_background(config, capture)
+    pictures = PictureLoader(capture.splits["train"], config.data)
+    x, y, z = (float(value) for value in capture.world_offset)
+    return Trainer(
+        config=config,
+        model=_model(config, capture),
+        optimizer=GaussianOptimizer(gaussians, config.optim),
+        densifier=_densifier(config, background, scene.extent),
+        pictures=pictures,
+        sampler=ViewSampler(len(pictures)),
+        options=_render_options(config),
+        background=background,
+        extent=scene.extent,
+        world_offset=(x, y, z),
+        has_test_views=bool(capture.splits.get("test")),
+        generator=generator,
+    )
+
+
+def surroundings(capture: Capture) -> Surroundings:
+    """What initialisation needs to know of a capture."""
+    poses = np.stack([view.cam_from_world for view in capture.splits["train"]])
+    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    points = capture.points
+    return Surroundings(
+        camera_centers=centers,
+        points=None if points is None else points.xyz,
+        points_rgb=None if points is None else points.rgb,
+        around_origin=capture.format == "blender",
+    )
+
+
+def resolved_background(config: Config, capture: Capture) -> str:
+    """White, black or random; "auto" is white where pictures have alpha, as 3DGS has it, and black otherwise."""
+    if config.data.background == "auto":
+        return "white" if capture.has_alpha else "black"
+    return config.data.background
+
+
+def training_cameras(views: Sequence[View], options: DataConfig) -> list[Cameras]:
+    """The cameras of ``views`` as pictures of their training size, one each; no picture is read."""
+    cameras = []
+    for view in views:
+        width, height = target_size(view.width, view.height, options.downscale, options.longest_side)
+        intrinsics = scaled_intrinsics(view.intrinsics, width / view.width, height / view.height)
+        pose = torch.from_numpy(view.cam_from_world).float()
+        cameras.append(Cameras(pose[None], torch.from_numpy(intrinsics).float()[None], width, height))
+    return cameras
+
+
+def _model(config: Config, capture: Capture) -> StaticScene:
+    if not config.model.filter_3d:
+        return StaticScene()
+    cameras = training_cameras(capture.splits["train"], config.data)
+    return StaticScene(cameras, filter_steps(config.strategy, config.train.steps))
+
+
+def _densifier(config: Config, background: str, extent: float) -> Densifier:
+    strategy, steps = config.strategy, config.train.steps
+    schedule = densify_schedule(strategy, steps, background == "white")
+    if isinstance(strategy, McmcStrategy):
+        return McmcDensifier(strategy, schedule, growth_per_change(strategy, steps))
+    return DefaultDensifier(strategy, schedule, extent)
+
+
+def _render_options(config: Config) -> RenderOptions:
+    strategy, model = config.strategy, config.model
+    absgrad = not isinstance(strategy, McmcStrategy) and strategy.absgrad
+    return RenderOptions(near=model.near, eps2d=model.eps2d, mode=model.rasterize_mode, absgrad=absgrad)

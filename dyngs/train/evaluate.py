@@ -1,0 +1,249 @@
+"""Measures a finished run on held-out views and writes the report beside it."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from statistics import fmean, median
+
+import torch
+from torch import Tensor
+
+from dyngs.config import StaticModel
+from dyngs.data.capture import Capture, View
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.read import read_capture
+from dyngs.data.write import write_text
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.render import RenderOptions, render
+from dyngs.train.checkpoint import load_run
+from dyngs.train.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
+
+_BACKGROUNDS = {"white": 1.0, "black": 0.0}
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Metrics of one view; None where a metric cannot be had (``EvalReport.reasons`` says why)."""
+
+    name: str
+    width: int
+    height: int
+    psnr: float
+    ssim: float
+    flip: float | None
+    lpips: float | None
+    render_seconds: float
+
+
+@dataclass(frozen=True)
+class EvalReport:
+    """What ``dyngs eval`` prints and writes; the fields are the keys of the file (docs/formats.md).
+
+    Attributes:
+        split: which views.
+        num_views, width, height: how many, and the size of the first in pixels.
+        background: name of the colour behind pictures and renders, "white" or "black".
+        psnr, ssim, flip, lpips: means over the views of the per-view values.
+        lpips_net: backbone that LPIPS uses, or would use.
+        num_gaussians: N.
+        model_mb: float32 parameters of all Gaussians in 1e6 bytes; an exported .ply adds 12 bytes per Gaussian.
+        fps: one over the median time of rendering one view, after a warm-up; loading and metrics not counted.
+        seconds_train, step: how long and how far the run was trained.
+        reasons: metric name to why it is None.
+        notes: anything else that a reader of the numbers should know.
+        per_view: the single views.
+    """
+
+    split: str
+    num_views: int
+    width: int
+    height: int
+    background: str
+    psnr: float
+    ssim: float
+    flip: float | None
+    lpips: float | None
+    lpips_net: str
+    num_gaussians: int
+    model_mb: float
+    fps: float
+    seconds_train: float
+    step: int
+    reasons: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    per_view: tuple[ViewScore, ...] = ()
+
+    def to_json(self) -> str:
+        """The report as strict JSON (no NaN or Infinity), ending in a newline."""
+        return json.dumps(asdict(self), indent=2, allow_nan=False) + "\n"
+
+
+def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "alex", threads: int = 0) -> EvalReport:
+    """Report of a run on one split, also written into its folder: ``metrics.json``, ``metrics_SPLIT.json`` if not test.
+
+    Args:
+        run_dir: folder of a run with at least one checkpoint.
+        split: "test", "val" or "train".
+        lpips_net: "alex", "vgg" or "squeeze".
+        threads: for rendering and metrics; 0 leaves the number as it is.
+
+    Raises:
+        DyngsError: no such run or split, unreadable pictures, a render or metric that is not finite, unwritable folder.
+    """
+    run = load_run(run_dir)
+    capture = read_capture(run.config.data)
+    views = split_views(capture, split)
+    choice = run.config.data.background
+    background, colour = evaluation_background(choice, capture.has_alpha)
+    notes = ["trained on random backgrounds, evaluated on black"] if choice == "random" else []
+    lpips = load_lpips(lpips_net)
+    with _num_threads(threads):
+        loader = PictureLoader(views, run.config.data)
+        pictures = (loader[i] for i in range(len(loader)))
+        scores, reasons = score_views(run.gaussians, pictures, render_options(run.config.model), colour, lpips)
+    if len({(s.width, s.height) for s in scores}) > 1:
+        notes.append("views differ in size; width and height are those of the first")
+    report = EvalReport(
+        split=split,
+        num_views=len(scores),
+        width=scores[0].width,
+        height=scores[0].height,
+        background=background,
+        psnr=fmean(s.psnr for s in scores),
+        ssim=fmean(s.ssim for s in scores),
+        flip=_mean([s.flip for s in scores]),
+        lpips=_mean([s.lpips for s in scores]),
+        lpips_net=lpips_net,
+        num_gaussians=len(run.gaussians),
+        model_mb=parameter_megabytes(run.gaussians),
+        fps=1 / median(s.render_seconds for s in scores),
+        seconds_train=run.seconds_train,
+        step=run.step,
+        reasons=reasons,
+        notes=tuple(notes),
+        per_view=tuple(scores),
+    )
+    write_text(report_path(run_dir, split), report.to_json())
+    return report
+
+
+def report_path(run_dir: Path, split: str) -> Path:
+    """Where the report of ``split`` lies in a run folder."""
+    return run_dir / ("metrics.json" if split == "test" else f"metrics_{split}.json")
+
+
+def score_views(
+    gaussians: Gaussians, pictures: Iterable[Picture], options: RenderOptions, background: Tensor, lpips: Lpips
+) -> tuple[list[ViewScore], dict[str, str]]:
+    """Scores of the Gaussians against pictures, and the reasons for metrics that are None.
+
+    Args:
+        gaussians: N Gaussians.
+        pictures: truth and camera of each view, drawn one at a time.
+        options: as in training, without depth.
+        background: (3,) colour behind both the truth and the render.
+        lpips: from ``load_lpips``.
+
+    Raises:
+        DyngsError: a value that is not finite, naming the view.
+    """
+    scores: list[ViewScore] = []
+    reasons: dict[str, str] = {}
+    for picture in pictures:
+        if not scores:
+            _timed_render(gaussians, picture, options, background)  # the warm-up
+        rendered, seconds = _timed_render(gaussians, picture, options, background)
+        if not rendered.isfinite().all():
+            raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
+        truth, mask = picture.composite(background), picture.mask
+        optional = {"flip": flip(rendered, truth, mask), "lpips": lpips(rendered, truth, mask)}
+        for name, metric in optional.items():
+            if metric.reason is not None:
+                reasons.setdefault(name, metric.reason)
+        score = ViewScore(
+            name=picture.name,
+            width=picture.cameras.width,
+            height=picture.cameras.height,
+            psnr=psnr(rendered, truth, mask),
+            ssim=ssim(rendered, truth, mask),
+            flip=optional["flip"].value,
+            lpips=optional["lpips"].value,
+            render_seconds=seconds,
+        )
+        _require_finite(score, mask)
+        scores.append(score)
+    return scores, reasons
+
+
+def split_views(capture: Capture, split: str) -> Sequence[View]:
+    """Views of a split, at least one. Raises DyngsError that lists the splits which there are."""
+    views = {name: views for name, views in capture.splits.items() if views}
+    for name, found in views.items():
+        if name == split:
+            return found
+    there = ", ".join(f"{name} ({len(found)} views)" for name, found in views.items())
+    raise DyngsError(f"{capture.root}: the split {split!r} has no views; there is {there or 'none'}")
+
+
+def evaluation_background(choice: str, has_alpha: bool) -> tuple[str, Tensor]:
+    """Name and (3,) colour of the background to evaluate on: that of training, black where that was random.
+
+    Args:
+        choice: ``data.background`` of the config.
+        has_alpha: of the capture; decides what "auto" means.
+    """
+    resolved = {"auto": "white" if has_alpha else "black", "random": "black"}.get(choice, choice)
+    return resolved, torch.full((3,), _BACKGROUNDS[resolved])
+
+
+def render_options(model: StaticModel) -> RenderOptions:
+    """How a trained model wants to be drawn."""
+    return RenderOptions(near=model.near, eps2d=model.eps2d, mode=model.rasterize_mode)
+
+
+def parameter_megabytes(gaussians: Gaussians) -> float:
+    """Size of the parameters in MB (1e6 bytes) as float32: 236 bytes per Gaussian at SH degree 3."""
+    return 4e-6 * sum(x.numel() for x in gaussians.tensors().values())
+
+
+def _timed_render(
+    gaussians: Gaussians, picture: Picture, options: RenderOptions, background: Tensor
+) -> tuple[Tensor, float]:
+    """(H, W, 3) rendered picture and the seconds that it took."""
+    with torch.no_grad():
+        start = time.perf_counter()
+        rendering = render(gaussians, picture.cameras, options, background=background)
+        seconds = time.perf_counter() - start
+    return rendering.rgb[0], seconds
+
+
+def _require_finite(score: ViewScore, mask: Tensor | None) -> None:
+    for name in ("psnr", "ssim", "flip", "lpips"):
+        value = getattr(score, name)
+        if value is not None and not math.isfinite(value):
+            empty = mask is not None and not bool((mask > 0).any())
+            why = "its mask ignores every pixel" if empty else "the picture holds NaN or Inf"
+            raise DyngsError(f"view {score.name!r}: {name} is not finite, {why}")
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if len(known) == len(values) else None
+
+
+@contextmanager
+def _num_threads(threads: int) -> Iterator[None]:
+    """Run the block with ``threads`` threads (0 = as they are)."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,168 @@
+"""Image metrics: PSNR, SSIM, FLIP and LPIPS, with the conventions written out.
+
+All functions take pictures (H, W, 3), display-referred sRGB, clamped here to [0, 1]; nothing is rounded to 8 bit.
+``mask`` (H, W) holds weights in [0, 1], 1 = counts, 0 = ignore; a mask of zeros gives NaN. FLIP and LPIPS depend on
+optional packages: where one is missing, the result is a ``MetricValue`` with the reason and no value. Nothing is ever
+downloaded.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+LpipsNet = Literal["alex", "vgg", "squeeze"]
+
+MAX_PSNR = 100.0
+"""Reported for pictures that agree to a mean squared error of 1e-10 or better, so that no infinity enters a mean."""
+
+_WINDOW, _SIGMA = 11, 1.5
+_C1, _C2 = 0.01**2, 0.03**2
+_FLIP_PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
+"""FLIP's default viewing conditions: 0.7 m from a monitor 0.7 m and 3840 px wide."""
+
+
+@dataclass(frozen=True)
+class MetricValue:
+    """A number, or None with the reason why there is none."""
+
+    value: float | None
+    reason: str | None = None
+
+
+def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB over all pixels and channels, at most ``MAX_PSNR``."""
+    squared = (_clamped(rendered).double() - _clamped(truth).double()).square().mean(dim=-1)
+    mse = _weighted_mean(squared, mask)
+    return math.nan if math.isnan(mse) else -10 * math.log10(max(mse, 10 ** (-MAX_PSNR / 10)))
+
+
+def ssim(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
+    """Mean structural similarity in [-1, 1] with the convention of 3DGS.
+
+    Gaussian window 11x11 with sigma 1.5, zero padding, data range 1, C1 = 0.01^2, C2 = 0.03^2, mean over pixels and
+    channels. With a mask, ignored pixels are replaced by the truth and the map is weighted (Wang et al. 2004).
+    """
+    return _weighted_mean(ssim_map(masked(rendered, truth, mask), truth).mean(dim=-1), mask)
+
+
+def ssim_map(rendered: Tensor, truth: Tensor) -> Tensor:
+    """(H, W, 3) structural similarity per pixel and channel; see ``ssim``."""
+    a, b = (_clamped(x).permute(2, 0, 1)[:, None] for x in (rendered, truth))
+    offsets = torch.arange(_WINDOW, dtype=a.dtype, device=a.device) - _WINDOW // 2
+    window = torch.exp(-offsets.square() / (2 * _SIGMA**2))
+    window = window / window.sum()
+
+    def blur(x: Tensor) -> Tensor:
+        rows = torch.nn.functional.conv2d(x, window.view(1, 1, 1, -1), padding=(0, _WINDOW // 2))
+        return torch.nn.functional.conv2d(rows, window.view(1, 1, -1, 1), padding=(_WINDOW // 2, 0))
+
+    mean_a, mean_b = blur(a), blur(b)
+    var_a, var_b = blur(a * a) - mean_a.square(), blur(b * b) - mean_b.square()
+    covariance = blur(a * b) - mean_a * mean_b
+    similarity = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
+    similarity = similarity / ((mean_a.square() + mean_b.square() + _C1) * (var_a + var_b + _C2))
+    return similarity[:, 0].permute(1, 2, 0)
+
+
+def flip(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> MetricValue:
+    """Mean LDR-FLIP error in [0, 1], 0 = equal, at 67.02 pixels per degree (Andersson et al. 2020).
+
+    Needs the package ``flip-evaluator`` (the extra ``metrics``).
+    """
+    if find_spec("flip_evaluator") is None:
+        return MetricValue(None, "the package flip-evaluator is not installed (pip install 'dyngs[metrics]')")
+    from flip_evaluator import evaluate  # pyright: ignore[reportMissingImports]
+
+    a, b = (_clamped(x).cpu().float().contiguous().numpy() for x in (truth, masked(rendered, truth, mask)))
+    viewing = {"ppd": _FLIP_PIXELS_PER_DEGREE}
+    error, _, _ = evaluate(a, b, "LDR", applyMagma=False, computeMeanError=False, parameters=viewing)
+    # Our own mean, as it takes weights and sums in a fixed order.
+    return MetricValue(_weighted_mean(torch.from_numpy(error)[..., 0], mask if mask is None else mask.cpu()))
+
+
+def masked(rendered: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
+    """(H, W, 3) the rendered picture with ignored pixels replaced by the truth."""
+    return rendered if mask is None else torch.lerp(truth, rendered, mask[..., None].to(rendered.dtype))
+
+
+@dataclass(frozen=True)
+class Lpips:
+    """LPIPS with one backbone, or the reason why it cannot be had here.
+
+    Attributes:
+        net: backbone.
+        reason: one line where ``distance`` is None.
+        distance: maps two pictures (1, 3, H, W) in [-1, 1] to the distance, or None.
+    """
+
+    net: LpipsNet
+    reason: str | None = None
+    distance: Callable[[Tensor, Tensor], Tensor] | None = None
+
+    def __call__(self, rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> MetricValue:
+        """Perceptual distance, 0 = equal (Zhang et al. 2018)."""
+        if self.distance is None:
+            return MetricValue(None, self.reason)
+        a, b = (_clamped(x).float().permute(2, 0, 1)[None] * 2 - 1 for x in (masked(rendered, truth, mask), truth))
+        try:
+            with torch.no_grad():
+                return MetricValue(self.distance(a, b).item())
+        except RuntimeError:
+            return MetricValue(None, f"pictures of {a.shape[3]}x{a.shape[2]} are too small for LPIPS ({self.net})")
+
+
+def load_lpips(net: LpipsNet = "alex") -> Lpips:
+    """LPIPS from ``torchmetrics`` or ``lpips``, only if the backbone's weights already lie in torch's cache.
+
+    Both packages would download missing weights, hence the check before either is constructed.
+    """
+    package = next((name for name in ("torchmetrics", "lpips") if find_spec(name) is not None), None)
+    if package is None or find_spec("torchvision") is None:
+        return Lpips(net, "the packages lpips (or torchmetrics) and torchvision are not installed (dyngs[metrics])")
+    try:
+        weights = _backbone_file(net)
+        if not weights.is_file():
+            return Lpips(net, f"the weights {weights.name} are not in torch's cache ({weights.parent})")
+        return Lpips(net, None, _lpips_distance(package, net))
+    except Exception as error:  # whatever a third-party package raises is a reason, never a failed evaluation
+        return Lpips(net, f"{package} could not be set up: {' '.join(str(error).split())[:200]}")
+
+
+def _backbone_file(net: LpipsNet) -> Path:
+    """Where torch looks for the ImageNet weights of ``net`` before it downloads them."""
+    from torchvision import models  # pyright: ignore[reportMissingImports]
+
+    weights = {
+        "alex": models.AlexNet_Weights.IMAGENET1K_V1,
+        "vgg": models.VGG16_Weights.IMAGENET1K_V1,
+        "squeeze": models.SqueezeNet1_1_Weights.IMAGENET1K_V1,
+    }
+    return Path(torch.hub.get_dir()) / "checkpoints" / weights[net].url.rsplit("/", 1)[1]
+
+
+def _lpips_distance(package: str, net: LpipsNet) -> Callable[[Tensor, Tensor], Tensor]:
+    if package == "lpips":
+        from lpips import LPIPS  # pyright: ignore[reportMissingImports]
+
+        return LPIPS(net=net, verbose=False).eval()
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity as Metric  # pyright: ignore[reportMissingImports]
+
+    return Metric(net_type=net, normalize=False).eval()
+
+
+def _weighted_mean(values: Tensor, mask: Tensor | None) -> float:
+    """Mean of ``values`` (H, W), weighted with ``mask`` (H, W), in float64; NaN where all weights are zero."""
+    values = values.double()
+    return (values.mean() if mask is None else (values * mask).sum() / mask.double().sum()).item()
+
+
+def _clamped(x: Tensor) -> Tensor:
+    return x.detach().clamp(0, 1)

@@ -1,0 +1,29 @@
+"""The order in which training views are drawn."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+class ViewSampler:
+    """Every view once per epoch, in a new random order each time."""
+
+    def __init__(self, num_views: int) -> None:
+        self.num_views = num_views
+        self._order = torch.zeros(0, dtype=torch.long)
+        self._position = 0
+
+    def next(self, generator: torch.Generator) -> int:
+        """Index of the next view; ``generator`` is drawn from once per epoch."""
+        if self._position >= len(self._order):
+            self._order = torch.randperm(self.num_views, generator=generator)
+            self._position = 0
+        self._position += 1
+        return int(self._order[self._position - 1])
+
+    def state(self) -> dict[str, Tensor]:
+        return {"order": self._order, "position": torch.tensor([self._position])}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self._order, self._position = state["order"].clone(), int(state["position"])

@@ -1,0 +1,66 @@
+"""Everything that depends on the step: numbers published for 30,000 steps, scaled to the length of the run."""
+
+from __future__ import annotations
+
+import math
+
+from dyngs.config import DefaultStrategy, McmcStrategy, OptimConfig, TrainConfig
+from dyngs.static.densify import DensifySchedule
+
+PUBLISHED_STEPS = 30_000
+MIN_START = 100
+"""Densification never starts earlier: the first gradients say little."""
+MIN_RESET_GAP = 400
+"""Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)."""
+MAX_GROWTH = 0.25
+FILTER_EVERY = 100
+
+
+def scaled(step: int, steps: int) -> int:
+    """``step`` of a 30,000-step run in a run of ``steps``; at least 1."""
+    return max(1, round(step * steps / PUBLISHED_STEPS))
+
+
+def means_rate(options: OptimConfig, step: int, steps: int, extent: float) -> float:
+    """Learning rate of the means at ``step``, world units: log-linear over the run, times the scene's extent."""
+    t = min(max(step / steps, 0.0), 1.0)
+    return extent * math.exp((1 - t) * math.log(options.lr_means) + t * math.log(options.lr_means_final))
+
+
+def active_sh_degree(options: TrainConfig, step: int, max_degree: int) -> int:
+    """SH degree drawn at ``step``: one more each ``sh_every`` (scaled) steps."""
+    return min(max_degree, step // scaled(options.sh_every, options.steps))
+
+
+def densify_schedule(strategy: DefaultStrategy | McmcStrategy, steps: int, white_background: bool) -> DensifySchedule:
+    """When ``strategy`` changes the set of Gaussians in a run of ``steps``.
+
+    Opacity resets keep at least ``MIN_RESET_GAP`` steps between each other and as long as one period before
+    densification stops (at 30,000: 3000, 6000, 9000, 12000). On a white background there is one more at the start, which
+    clears the white floaters, unless the next one follows within the gap.
+    """
+    start = max(scaled(strategy.start, steps), min(strategy.start, MIN_START))
+    stop = scaled(strategy.stop, steps)
+    if isinstance(strategy, McmcStrategy):
+        return DensifySchedule(start, stop, strategy.every)
+    period = max(scaled(strategy.reset_every, steps), min(strategy.reset_every, MIN_RESET_GAP))
+    resets = tuple(range(period, stop - period + 1, period))
+    if white_background and start + min(period, MIN_RESET_GAP) <= min((*resets, stop)):
+        resets = (start, *resets)
+    return DensifySchedule(start, stop, strategy.every, resets, prune_scale_after=period)
+
+
+def growth_per_change(strategy: McmcStrategy, steps: int) -> float:
+    """Fraction of Gaussians that MCMC adds per change.
+
+    Changes come every ``every`` steps whatever the run's length, so that a short run has fewer of them; each then adds
+    more, up to a quarter, and the count follows the same curve over the run.
+    """
+    grown = (1 + strategy.growth) ** (PUBLISHED_STEPS / steps) - 1
+    return max(strategy.growth, min(grown, MAX_GROWTH)) if steps < PUBLISHED_STEPS else strategy.growth
+
+
+def filter_steps(strategy: DefaultStrategy | McmcStrategy, steps: int) -> range:
+    """Steps after which Mip-Splatting's 3D filter is recomputed: each 100 from the end of densification on."""
+    first = -(-scaled(strategy.stop, steps) // FILTER_EVERY) * FILTER_EVERY
+    return range(first, steps - FILTER_EVERY + 1, FILTER_EVERY)

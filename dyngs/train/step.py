@@ -1,0 +1,160 @@
+"""One training step. It knows parameters per Gaussian and pictures, not what kind of model lies between them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from dyngs.config import Config
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.ops.loss import l1_ssim_loss
+from dyngs.render import RenderOptions, render
+from dyngs.static.densify import Densifier
+from dyngs.static.optimizer import GaussianOptimizer
+from dyngs.train.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.train.sampler import ViewSampler
+from dyngs.train.schedule import active_sh_degree, means_rate
+
+
+class Model(Protocol):
+    """What turns the parameters stored per Gaussian into the Gaussians of a picture."""
+
+    def gaussians_at(self, parameters: Gaussians, batch: Picture) -> Gaussians:
+        """What is drawn for ``batch``; differentiable in ``parameters``."""
+        ...
+
+    def after_step(self, parameters: Gaussians, step: int, *, edited: bool) -> None:
+        """Bring what depends on the parameters up to date; ``edited``: the set of Gaussians has changed."""
+        ...
+
+    def state(self) -> dict[str, Tensor]: ...
+
+    def load_state(self, state: dict[str, Tensor]) -> None: ...
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one step did.
+
+    Attributes:
+        step: its number, from 1.
+        loss: regularizers included.
+        picture: what was trained on.
+        rendered, truth: (H, W, 3) on the same background.
+    """
+
+    step: int
+    loss: float
+    picture: Picture
+    rendered: Tensor
+    truth: Tensor
+
+
+@dataclass
+class Trainer:
+    """A run in memory: everything that a step reads and changes.
+
+    Attributes:
+        background: "white", "black" or "random" (a new colour in each step, behind render and truth alike).
+        generator: the only source of randomness, on the CPU.
+        done: steps done.
+        bad_gradients: how often a Gaussian was left out of a step because its gradient was not finite.
+    """
+
+    config: Config
+    model: Model
+    optimizer: GaussianOptimizer
+    densifier: Densifier
+    pictures: PictureLoader
+    sampler: ViewSampler
+    options: RenderOptions
+    background: str
+    extent: float
+    world_offset: tuple[float, float, float]
+    has_test_views: bool
+    generator: torch.Generator
+    done: int = 0
+    bad_gradients: int = 0
+
+    def step(self) -> StepReport:
+        """Train on one picture.
+
+        Raises:
+            DyngsError: the loss is not finite; says which term, and changes nothing.
+        """
+        config, step = self.config, self.done + 1
+        picture = self.pictures[self.sampler.next(self.generator)]
+        background = self._background_colour()
+        parameters = self.optimizer.parameters
+        gaussians = self.model.gaussians_at(parameters, picture)
+        probe = torch.zeros(1, len(gaussians), 4, requires_grad=True) if self.densifier.wants_signal(step) else None
+        options = replace(self.options, sh_degree=active_sh_degree(config.train, step, parameters.sh_degree))
+        rendering = render(gaussians, picture.cameras, options, background=background, probe=probe)
+        rendered, truth = rendering.rgb[0], picture.composite(background)
+        terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
+        terms |= self.densifier.regularizers(parameters)
+        loss = _finite_sum(terms, step, picture.name)
+        sum(terms.values(), torch.zeros(())).backward()
+        if probe is not None and probe.grad is not None:
+            size = (picture.cameras.width, picture.cameras.height)
+            self.densifier.after_backward(step, probe.grad, rendering.radii, size)
+        self._update(step)
+        return StepReport(step, loss, picture, rendered.detach(), truth)
+
+    def _update(self, step: int) -> None:
+        """Optimize, let the strategy act, and count the step."""
+        lr_means = means_rate(self.config.optim, step, self.config.train.steps, self.extent)
+        self.bad_gradients += self.optimizer.step(step, lr_means, dense=self.densifier.touches_all)
+        result = self.densifier.edit(step, self.optimizer.parameters, self.generator)
+        if result is not None:
+            self.optimizer.apply(result)
+        self.densifier.perturb(self.optimizer.parameters, lr_means, self.generator)
+        self.model.after_step(self.optimizer.parameters, step, edited=result is not None)
+        self.done = step
+
+    def checkpoint(self) -> Checkpoint:
+        """Everything that ``restore`` needs."""
+        parts = {"model": self.model.state(), "strategy": self.densifier.state(), "sampler": self.sampler.state()}
+        tensors = {f"{part}.{name}": x for part, state in parts.items() for name, x in state.items()}
+        tensors |= self.optimizer.state() | {"rng": self.generator.get_state()}
+        mode = self.config.model.rasterize_mode.value
+        return Checkpoint(CheckpointInfo(self.done, self.extent, self.world_offset, self.background, mode), tensors)
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go back to where ``checkpoint`` was taken.
+
+        Raises:
+            DyngsError: it belongs to another model or strategy.
+        """
+        try:
+            self.optimizer.load_state(checkpoint.tensors)
+            self.model.load_state(checkpoint.part("model"))
+            self.densifier.load_state(checkpoint.part("strategy"))
+            self.sampler.load_state(checkpoint.part("sampler"))
+            self.generator.set_state(checkpoint.tensors["rng"])
+        except KeyError as missing:
+            raise DyngsError(
+                f"the checkpoint of step {checkpoint.info.step} lacks {missing}; was its config changed?"
+            ) from None
+        self.done = checkpoint.info.step
+
+    def _background_colour(self) -> Tensor:
+        if self.background == "random":
+            return torch.rand(3, generator=self.generator)
+        return torch.full((3,), 1.0 if self.background == "white" else 0.0)
+
+
+def _finite_sum(terms: dict[str, Tensor], step: int, view: str) -> float:
+    values = {name: float(term.detach()) for name, term in terms.items()}
+    for name, value in values.items():
+        if not math.isfinite(value):
+            raise DyngsError(
+                f"step {step}, view {view!r}: the loss term {name!r} is {value}; lower the rates in optim, or look at that picture"
+            )
+    return sum(values.values())

@@ -1,0 +1,162 @@
+"""The training loop around ``Trainer.step``: run folder, checkpoints, logs, interruptions."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from dyngs.config import Config
+from dyngs.config_io import RESOLVED_NAME, save_config
+from dyngs.errors import DyngsError
+from dyngs.ops.memory import keep_freed_memory
+from dyngs.train.assemble import assemble
+from dyngs.train.checkpoint import (
+    Checkpoint,
+    checkpoint_paths,
+    last_good,
+    latest_checkpoint,
+    save_checkpoint,
+    seconds_at,
+)
+from dyngs.train.interrupt import Interrupts
+from dyngs.train.log import LogRecord, Progress, RunLog
+from dyngs.train.metrics import psnr
+from dyngs.train.step import StepReport, Trainer
+
+
+def train(config: Config, *, resume_from: Path | None = None) -> Path:
+    """The run folder of a finished training.
+
+    Args:
+        config: everything that decides the run; on resuming, that of the run folder.
+        resume_from: a run folder to go on with, from its newest checkpoint: the result has the same bytes as if the run had
+            never stopped.
+
+    Raises:
+        DyngsError: bad input, a run folder that already holds a run, a loss that is not finite, a full disk.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how to go on.
+    """
+    watch = _Stopwatch()
+    run_dir = resume_from or config.run.dir or Path("runs") / config.run.name
+    torch.set_num_threads(config.run.threads or _num_cores())
+    keep_freed_memory()
+    resumed = _start_of_run(run_dir, resuming=resume_from is not None)
+    if resumed is not None and resumed.info.step >= config.train.steps:
+        return run_dir
+    trainer = assemble(config)
+    if resumed is not None:
+        trainer.restore(resumed)
+        watch.pause(-seconds_at(run_dir, resumed.info.step))
+    else:
+        save_config(config, run_dir / RESOLVED_NAME)
+    with (
+        RunLog(run_dir, trainer.done, tensorboard=config.train.tensorboard) as log,
+        Progress(config.train.steps, trainer.done) as progress,
+        Interrupts() as interrupts,
+    ):
+        _Loop(config, run_dir, trainer, log, progress, watch).run(interrupts)
+    return run_dir
+
+
+class _Stopwatch:
+    """Training time: from reading the capture on, over all resumes, without evaluations."""
+
+    def __init__(self) -> None:
+        self._since = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self._since
+
+    def pause(self, seconds: float) -> None:
+        """Leave ``seconds`` out (negative: count them in)."""
+        self._since += seconds
+
+
+@dataclass
+class _Loop:
+    config: Config
+    run_dir: Path
+    trainer: Trainer
+    log: RunLog
+    progress: Progress
+    watch: _Stopwatch
+
+    def run(self, interrupts: Interrupts) -> None:
+        """Step until the end, or until interrupted."""
+        options, saved = self.config.train, self.trainer.done
+        while self.trainer.done < options.steps and not interrupts.requested:
+            try:
+                report = self.trainer.step()
+            except DyngsError as error:
+                raise DyngsError(f"{error}. {last_good(self.run_dir)}") from error
+            step = report.step
+            if step % options.log_every == 0 or step == options.steps:
+                self._tell(report)
+            evaluates = options.eval_every > 0 and step % options.eval_every == 0
+            if evaluates or step == options.steps or (options.save_every > 0 and step % options.save_every == 0):
+                saved = self._save()
+            if evaluates:
+                self._evaluate(step)
+        if interrupts.requested and self.trainer.done < options.steps:
+            if self.trainer.done > saved:
+                self._save()
+            raise KeyboardInterrupt(
+                f"stopped after step {self.trainer.done}; go on with: dyngs train --resume {self.run_dir}"
+            )
+
+    def _tell(self, report: StepReport) -> None:
+        quality = psnr(report.rendered, report.truth, report.picture.mask)
+        record = LogRecord(
+            step=report.step,
+            loss=report.loss,
+            psnr=quality if math.isfinite(quality) else None,
+            num_gaussians=len(self.trainer.optimizer.parameters),
+            bad_gradients=self.trainer.bad_gradients,
+            seconds=round(self.watch.seconds, 3),
+        )
+        self.log.write(record)
+        self.progress.update(record)
+
+    def _save(self) -> int:
+        save_checkpoint(self.run_dir, self.trainer.checkpoint(), self.watch.seconds)
+        return self.trainer.done
+
+    def _evaluate(self, step: int) -> None:
+        """Scores of the test split into the log, where there is one."""
+        from dyngs.train.evaluate import evaluate_run
+
+        if not self.trainer.has_test_views:
+            return
+        start = time.perf_counter()
+        report = evaluate_run(self.run_dir, "test")
+        self.log.write_scores(step, "test", report.psnr, report.ssim)
+        self.watch.pause(time.perf_counter() - start)
+        self.progress.pause(time.perf_counter() - start)
+
+
+def _start_of_run(run_dir: Path, *, resuming: bool) -> Checkpoint | None:
+    """The checkpoint to go on from, or None for a new run.
+
+    Raises:
+        DyngsError: resuming without a checkpoint, or a new run where there are some.
+    """
+    if resuming:
+        return latest_checkpoint(run_dir)
+    if checkpoint_paths(run_dir):
+        raise DyngsError(
+            f"{run_dir} already holds a run; go on with `dyngs train --resume {run_dir}` or give another run.dir"
+        )
+    return None
+
+
+def _num_cores() -> int:
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on Linux
+        return os.cpu_count() or 1

@@ -1,0 +1,1 @@
+"""What people look at: camera paths, videos, contact sheets."""

@@ -1,0 +1,248 @@
+"""Turns Gaussians into pictures: the views of a split beside their truth, or the frames of a camera path."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.data.loader import PictureLoader
+from dyngs.data.read import read_capture
+from dyngs.data.write import to_uint8, write_image
+from dyngs.errors import DyngsError
+from dyngs.export.ply import SplatFile
+from dyngs.gaussians import Gaussians
+from dyngs.render import RenderOptions, render
+from dyngs.train.checkpoint import load_run
+from dyngs.train.evaluate import evaluation_background, render_options, split_views
+from dyngs.train.metrics import psnr
+from dyngs.view.sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
+from dyngs.view.video import VideoWriter
+
+DEFAULT_OPTIONS = RenderOptions()
+_SHEET_ROWS = 12
+_DEPTH_SAMPLES = 8
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """What is written besides the colour pictures.
+
+    Attributes:
+        depth: ``NAME_depth.png`` (colours) and ``NAME_depth.exr`` (float32, world units along the optical axis).
+        alpha: ``NAME_alpha.png``, white = opaque.
+        video: MP4 of the colour pictures in order.
+        fps: of the video.
+    """
+
+    depth: bool = False
+    alpha: bool = False
+    video: Path | None = None
+    fps: float = 30.0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One rendered picture, float32.
+
+    Attributes:
+        rgb: (H, W, 3), composited on the background, clamped to [0, 1].
+        alpha: (H, W) in [0, 1].
+        depth: (H, W) expected depth, 0 where nothing was hit, or None where it was not asked for.
+    """
+
+    rgb: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray | None
+
+
+def render_frames(
+    gaussians: Gaussians, cameras: Cameras, options: RenderOptions = DEFAULT_OPTIONS, background: Tensor | None = None
+) -> Iterator[Frame]:
+    """The pictures that the cameras see, one at a time and without gradients: memory does not grow with their number.
+
+    Args:
+        gaussians: N Gaussians.
+        cameras: V cameras.
+        options: how to draw; ``depth`` other than "none" fills ``Frame.depth``.
+        background: (3,) colour; None is black.
+    """
+    for i in range(len(cameras)):
+        with torch.no_grad():
+            rendering = render(gaussians, cameras.select(i), options, background=background)
+        depth = None if rendering.depth is None else rendering.depth[0].cpu().numpy()
+        yield Frame(rendering.rgb[0].clamp(0, 1).cpu().numpy(), rendering.alpha[0].cpu().numpy(), depth)
+
+
+def write_path_frames(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    out_dir: Path | None,
+    options: RenderOptions = DEFAULT_OPTIONS,
+    background: Tensor | None = None,
+    output: OutputOptions = OutputOptions(),
+) -> list[Path]:
+    """Paths of the files written for a camera path: ``frame_0000.png`` and so on, and the video if one is asked for.
+
+    Args:
+        gaussians: N Gaussians.
+        cameras: V >= 1 cameras, in the order of the video.
+        out_dir: folder for the pictures; None writes only the video.
+        options: how to draw.
+        background: (3,) colour; None is black.
+        output: depth, alpha, video. The colours of depth share one range over the whole path.
+
+    Raises:
+        DyngsError: no cameras, nothing to write, or a file cannot be written.
+    """
+    if len(cameras) == 0:
+        raise DyngsError("the camera path has no cameras")
+    if out_dir is None and output.video is None:
+        raise DyngsError("nothing to write: give a folder for the pictures or a video file")
+    options = _with_depth(options, output)
+    limits = None
+    if output.depth and out_dir is not None:
+        limits = _shared_depth_limits(render_frames(gaussians, _sample(cameras), options, background))
+    digits = max(4, len(str(len(cameras) - 1)))
+    with _FrameWriter(out_dir, output, limits) as writer:
+        for i, frame in enumerate(render_frames(gaussians, cameras, options, background)):
+            writer.write(f"frame_{i:0{digits}d}", frame)
+    return writer.written
+
+
+def write_split(run_dir: Path, split: str, out_dir: Path, output: OutputOptions = OutputOptions()) -> list[Path]:
+    """Paths of the files written for a split of a run: ``NAME.png`` per view, and ``sheet.png`` (truth, render, error).
+
+    The sheet shows at most 12 views, evenly spread, with their PSNR. The background is that of training, black where
+    that was random.
+
+    Args:
+        run_dir: folder of a run with at least one checkpoint.
+        split: "test", "val" or "train".
+        out_dir: folder for the pictures; the names are the views' (``file_stems``).
+        output: depth, alpha, video (views of one size only).
+
+    Raises:
+        DyngsError: no such run or split, unreadable pictures, a file cannot be written.
+    """
+    run = load_run(run_dir)
+    capture = read_capture(run.config.data)
+    views = split_views(capture, split)
+    loader = PictureLoader(views, run.config.data)
+    _, background = evaluation_background(run.config.data.background, capture.has_alpha)
+    options = _with_depth(render_options(run.config.model), output)
+    shown = set(np.linspace(0, len(loader) - 1, min(len(loader), _SHEET_ROWS)).round().astype(int).tolist())
+    rows: list[SheetRow] = []
+    with _FrameWriter(out_dir, output) as writer:
+        for i, stem in enumerate(file_stems([view.name for view in views])):
+            picture = loader[i]
+            frame = next(render_frames(run.gaussians, picture.cameras, options, background))
+            writer.write(stem, frame)
+            if i in shown:
+                truth = picture.composite(background)
+                label = f"{picture.name}  {psnr(torch.from_numpy(frame.rgb), truth, picture.mask):.2f} dB"
+                rows.append(SheetRow(label, to_uint8(truth.numpy()), to_uint8(frame.rgb)))
+    sheet = out_dir / "sheet.png"
+    write_image(sheet, contact_sheet(rows))
+    return [*writer.written, sheet]
+
+
+def splat_options(splat: SplatFile) -> RenderOptions:
+    """How a splat file wants to be drawn: its mode, and its low-pass where it names one."""
+    options = RenderOptions(mode=splat.mode)
+    return options if splat.eps2d is None else replace(options, eps2d=splat.eps2d)
+
+
+def file_stems(names: Sequence[str]) -> list[str]:
+    """File names for views, without suffix: safe, unique, in order.
+
+    Folders that all names share are dropped, other folders become a prefix (``left/0001`` is ``left_0001``); parts such
+    as ``..`` and characters that file systems dislike are replaced, so that no name leaves the output folder.
+    """
+    parts = [[_safe(part) for part in name.replace("\\", "/").split("/") if part.strip(". ")] for name in names]
+    parts = [p or ["view"] for p in parts]
+    while all(len(p) > 1 for p in parts) and len({p[0] for p in parts}) == 1:
+        parts = [p[1:] for p in parts]
+    taken: set[str] = {"sheet"}
+    stems = []
+    for p in parts:
+        stem = base = "_".join(p)
+        number = 1
+        while taken & _files(stem):
+            number += 1
+            stem = f"{base}_{number}"
+        taken |= _files(stem)
+        stems.append(stem)
+    return stems
+
+
+class _FrameWriter:
+    """A context that writes frames as pictures and into a video; ``written`` lists the files."""
+
+    def __init__(self, out_dir: Path | None, output: OutputOptions, limits: tuple[float, float] | None = None) -> None:
+        self.written: list[Path] = []
+        self._out_dir, self._output, self._limits = out_dir, output, limits
+        self._stack = ExitStack()
+        self._video: VideoWriter | None = None
+        self._size: tuple[int, ...] | None = None
+
+    def __enter__(self) -> _FrameWriter:
+        if self._output.video is not None:
+            self._video = self._stack.enter_context(VideoWriter(self._output.video, fps=self._output.fps))
+        return self
+
+    def __exit__(self, *problem: object) -> None:
+        self._stack.__exit__(*problem)  # type: ignore[arg-type]
+        if problem[0] is None and self._output.video is not None:
+            self.written.append(self._output.video)
+
+    def write(self, stem: str, frame: Frame) -> None:
+        rgb = to_uint8(frame.rgb)
+        if self._video is not None:
+            self._size = self._size or rgb.shape
+            if rgb.shape != self._size:
+                raise DyngsError(f"{self._output.video}: a video needs views of one size, {stem} differs")
+            self._video.add(rgb)
+        if self._out_dir is None:
+            return
+        self._picture(self._out_dir / f"{stem}.png", rgb)
+        if self._output.alpha:
+            self._picture(self._out_dir / f"{stem}_alpha.png", frame.alpha)
+        if self._output.depth and frame.depth is not None:
+            self._picture(self._out_dir / f"{stem}_depth.png", depth_to_rgb(frame.depth, frame.alpha, self._limits))
+            self._picture(self._out_dir / f"{stem}_depth.exr", frame.depth)
+
+    def _picture(self, path: Path, pixels: np.ndarray) -> None:
+        write_image(path, pixels)
+        self.written.append(path)
+
+
+def _with_depth(options: RenderOptions, output: OutputOptions) -> RenderOptions:
+    return replace(options, depth="expected" if output.depth else "none")
+
+
+def _sample(cameras: Cameras) -> Cameras:
+    """At most 8 of the cameras, evenly spread."""
+    index = torch.linspace(0, len(cameras) - 1, min(len(cameras), _DEPTH_SAMPLES)).round().long()
+    return replace(cameras, cam_from_world=cameras.cam_from_world[index], intrinsics=cameras.intrinsics[index])
+
+
+def _shared_depth_limits(frames: Iterator[Frame]) -> tuple[float, float]:
+    """Near and far that suit all of the frames."""
+    seen = [(frame.depth.ravel(), frame.alpha.ravel()) for frame in frames if frame.depth is not None]
+    return depth_limits(np.concatenate([d for d, _ in seen]), np.concatenate([a for _, a in seen]))
+
+
+def _files(stem: str) -> set[str]:
+    """What may be written for a view, in lower case as some file systems see it."""
+    return {f"{stem}{suffix}".lower() for suffix in ("", "_depth", "_alpha")}
+
+
+def _safe(part: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in part).lstrip(".") or "_"

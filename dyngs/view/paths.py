@@ -1,0 +1,306 @@
+"""Camera paths for rendering: orbits, spirals, and a JSON file of one's own (see docs/camera_paths.md)."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dyngs.camera import Cameras
+from dyngs.data.focus import focus_point, share_in_front
+from dyngs.data.poses import cam_from_opengl, checked_pose
+from dyngs.data.write import write_text
+from dyngs.errors import DyngsError
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Cameras in the order in which they are shown.
+
+    Attributes:
+        cameras: F cameras.
+        fps: pictures per second.
+        times: (F,) scene times in [0, 1], or None for a still scene.
+    """
+
+    cameras: Cameras
+    fps: float = 30.0
+    times: tuple[float, ...] | None = None
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+
+def orbit_path(cameras: Cameras, num_frames: int, turns: float = 1.0) -> Cameras:
+    """``num_frames`` cameras on a level circle around the point that ``cameras`` look at.
+
+    Radius and height are the means of the given cameras; up is their mean up; intrinsics are the first camera's. A ring
+    of cameras gives the ring itself; cameras that all face one way a circle through the side from which they look.
+
+    Args:
+        cameras: V >= 1 cameras, those of training for instance.
+        num_frames: F; the first one is at the azimuth of the first camera.
+        turns: of the whole circle; negative turns the other way.
+    """
+    poses = _world_from_cam(cameras)
+    centers, up = poses[:, :3, 3], mean_up(cameras)
+    center = look_at_point(cameras)
+    offsets = centers - center
+    heights = offsets @ up
+    level = offsets - heights[:, None] * up
+    radius = np.linalg.norm(level, axis=1).mean()
+    first = level[np.argmax(np.linalg.norm(level, axis=1) > 1e-6)]
+    axis_x = _unit(first) if np.linalg.norm(first) > 1e-6 else _perpendicular(up)
+    radius = max(radius, 0.1 * float(np.linalg.norm(offsets, axis=1).mean()), 1e-6)
+    return _circle(center + heights.mean() * up, center, up, axis_x * radius, _Shot(cameras, num_frames, turns))
+
+
+def spiral_path(cameras: Cameras, num_frames: int, turns: float = 2.0, zoom: float = 0.5) -> Cameras:
+    """``num_frames`` cameras that wind before a scene seen from one side, as in LLFF; a closed loop.
+
+    Around the mean camera, as wide as 90% of the given cameras stray from it, all looking at the same point.
+
+    Args:
+        cameras: V >= 1 cameras, roughly facing one way.
+        num_frames: F.
+        turns: sideways rounds per loop.
+        zoom: how far the spiral goes along the viewing axis, as a share of the cameras' stray.
+    """
+    poses = _world_from_cam(cameras)
+    centers, target, up = poses[:, :3, 3], look_at_point(cameras), mean_up(cameras)
+    middle = centers.mean(axis=0)
+    base = look_at(middle, target, up)
+    radii = np.quantile(np.abs((centers - middle) @ base[:3, :3]), 0.9, axis=0)
+    distance = np.linalg.norm(target - middle)
+    radii = np.maximum(radii, 0.02 * distance)
+    radii[2] = min(zoom * radii.max(), 0.3 * distance)
+    phase = 2 * np.pi * np.arange(num_frames) / max(num_frames, 1)
+    local = np.stack([np.cos(turns * phase), -np.sin(turns * phase), np.sin(phase)], axis=-1) * radii
+    eyes = middle + local @ base[:3, :3].T
+    return _with_poses(cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
+
+
+def frame_orbit_for_points(
+    means: np.ndarray, num_frames: int, size: tuple[int, int] = (960, 720), up: tuple[float, float, float] = (0, 0, 1)
+) -> Cameras:
+    """An orbit for a bare set of points, without any camera: the robust extent of the points fills the picture.
+
+    The centre is the median; the extent the sphere around it that holds 99% of the points within the 1st to 99th
+    percentile of every axis, so that a few stray points do no harm.
+
+    Args:
+        means: (N, 3) points in world units; those that are not finite are ignored.
+        num_frames: F.
+        size: width and height in pixels.
+        up: world direction; many captures with COLMAP have (0, -1, 0).
+
+    Raises:
+        DyngsError: no finite point, or an up of no length.
+    """
+    points = np.asarray(means, np.float64).reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        raise DyngsError("cannot place an orbit: there are no points with finite coordinates")
+    if not np.linalg.norm(up) > 0:
+        raise DyngsError(f"cannot place an orbit: the up direction {up} has no length")
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    inside = points[((points >= low) & (points <= high)).all(axis=1)]
+    points = inside if len(inside) else points
+    center = np.median(points, axis=0)
+    extent = max(float(np.quantile(np.linalg.norm(points - center, axis=1), 0.99)), 1e-3)
+    width, height = size
+    half_fov = math.radians(25.0)
+    focal = 0.5 * max(width, height) / math.tan(half_fov)
+    narrow = math.atan(0.5 * min(width, height) / focal)
+    intrinsics = torch.tensor([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]], dtype=torch.float32)
+    distance = 0.85 * extent / math.sin(narrow)
+    axis_z = _unit(np.asarray(up, np.float64))
+    elevation = math.radians(20.0)
+    template = Cameras(torch.eye(4)[None], intrinsics[None], width, height)
+    eye_height = center + distance * math.sin(elevation) * axis_z
+    arm = distance * math.cos(elevation) * _perpendicular(axis_z)
+    return _circle(eye_height, center, axis_z, arm, _Shot(template, num_frames, 1.0))
+
+
+def look_at_point(cameras: Cameras) -> np.ndarray:
+    """(3,) float64 point nearest to all optical axes, in the least-squares sense, and before the cameras.
+
+    Where the axes are (nearly) parallel, the point is undetermined along them: then it lies before the mean camera, at
+    the cameras' spread (at least 1) times three.
+    """
+    poses = _world_from_cam(cameras)
+    centers, axes = poses[:, :3, 3], poses[:, :3, 2]
+    middle = centers.mean(axis=0)
+    spread = float(np.linalg.norm(centers - middle, axis=1).mean())
+    point = focus_point(poses)
+    if point is not None and share_in_front(poses, point) > 0.5:
+        return point
+    mean_axis = axes.mean(axis=0)
+    forward = _unit(mean_axis) if np.linalg.norm(mean_axis) > 1e-6 else axes[0]
+    return middle + 3.0 * (spread if spread > 1e-9 else 1.0) * forward
+
+
+def mean_up(cameras: Cameras) -> np.ndarray:
+    """(3,) unit vector: the mean of the cameras' up directions (minus y), the first camera's where they cancel."""
+    ups = -_world_from_cam(cameras)[:, :3, 1]
+    total = ups.mean(axis=0)
+    return _unit(total) if np.linalg.norm(total) > 1e-3 else ups[0]
+
+
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """(4, 4) OpenCV camera-to-world pose at ``eye``, z towards ``target``, y away from ``up``."""
+    forward = target - eye
+    forward = _unit(forward) if np.linalg.norm(forward) > 1e-12 else _perpendicular(up)
+    right = np.cross(forward, up)
+    right = _unit(right) if np.linalg.norm(right) > 1e-6 * np.linalg.norm(up) else _perpendicular(forward)
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(forward, right), forward, eye
+    return pose
+
+
+def write_path(file: Path, path: CameraPath, world_offset: np.ndarray | None = None) -> None:
+    """Write ``path`` as JSON in the format of ``read_path``, atomically; ``world_offset`` as there."""
+    cameras = path.cameras
+    poses = _rebased(cameras.cam_from_world.detach().cpu().double().numpy(), world_offset, sign=-1.0)
+    frames = []
+    for i in range(len(cameras)):
+        k = cameras.intrinsics[i].tolist()
+        frame: dict[str, Any] = {"cam_from_world": poses[i].tolist()}
+        frame |= {"fl_x": k[0][0], "fl_y": k[1][1], "cx": k[0][2], "cy": k[1][2]}
+        if path.times is not None:
+            frame["time"] = path.times[i]
+        frames.append(frame)
+    document = {"width": cameras.width, "height": cameras.height, "fps": path.fps, "frames": frames}
+    write_text(file, json.dumps(document, indent=1) + "\n")
+
+
+def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
+    """The camera path in a JSON file, float32.
+
+    Args:
+        file: see docs/camera_paths.md.
+        world_offset: (3,) the capture's offset (``Capture.world_offset``): the file's coordinates are the capture's,
+            the cameras returned are in the rebased world.
+
+    Raises:
+        DyngsError: names the file, the frame and the key that is missing or wrong.
+    """
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DyngsError(f"cannot read the camera path {file}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise DyngsError(f"{file} is not a JSON file ({error}); see docs/camera_paths.md for the format") from error
+    if not isinstance(document, dict) or not isinstance(document.get("frames"), list) or not document["frames"]:
+        raise DyngsError(f"{file}: a camera path needs a non-empty list 'frames'; see docs/camera_paths.md")
+    width, height = (int(_number(document, key, str(file), low=1, high=65536)) for key in ("width", "height"))
+    fps = _number(document, "fps", str(file), low=1e-3, high=1000, default=30.0)
+    poses, matrices, times = [], [], []
+    for i, frame in enumerate(document["frames"]):
+        where = f"{file}: frames[{i}]"
+        if not isinstance(frame, dict):
+            raise DyngsError(f"{where} must be an object with 'cam_from_world' or 'transform_matrix'")
+        poses.append(_read_pose(frame, where))
+        matrices.append(_read_intrinsics(document, frame, (width, height), where))
+        times.append(_number(frame, "time", where, low=0, high=1) if "time" in frame else None)
+    known = [t for t in times if t is not None]
+    if known and len(known) < len(times):
+        raise DyngsError(f"{file}: frames[{times.index(None)}] has no 'time', others have; give it to all or to none")
+    cam_from_world = torch.from_numpy(_rebased(np.stack(poses), world_offset, sign=1.0)).float()
+    cameras = Cameras(cam_from_world, torch.from_numpy(np.stack(matrices)).float(), width, height)
+    return CameraPath(cameras, fps, tuple(known) or None)
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """What a circle of cameras takes from outside: intrinsics, number of frames, part of the circle."""
+
+    cameras: Cameras
+    num_frames: int
+    turns: float
+
+
+def _circle(hub: np.ndarray, target: np.ndarray, up: np.ndarray, arm: np.ndarray, shot: _Shot) -> Cameras:
+    """Cameras around ``hub`` that look at ``target``, the first one at ``hub + arm``."""
+    angles = 2 * np.pi * shot.turns * np.arange(shot.num_frames) / max(shot.num_frames, 1)
+    eyes = hub + np.cos(angles)[:, None] * arm + np.sin(angles)[:, None] * np.cross(up, arm)
+    return _with_poses(shot.cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
+
+
+def _with_poses(cameras: Cameras, world_from_cam: np.ndarray) -> Cameras:
+    """Cameras at new poses with the first camera's intrinsics, dtype and device."""
+    cam_from_world = torch.from_numpy(np.linalg.inv(world_from_cam)).to(cameras.cam_from_world)
+    intrinsics = cameras.intrinsics[:1].expand(len(cam_from_world), 3, 3).clone()
+    return Cameras(cam_from_world, intrinsics, cameras.width, cameras.height)
+
+
+def _world_from_cam(cameras: Cameras) -> np.ndarray:
+    """(V, 4, 4) float64 poses."""
+    if not len(cameras):
+        raise ValueError("a camera path needs at least one camera to go by")
+    return np.linalg.inv(cameras.cam_from_world.detach().cpu().double().numpy())
+
+
+def _rebased(cam_from_world: np.ndarray, world_offset: np.ndarray | None, sign: float) -> np.ndarray:
+    """(F, 4, 4) poses that see points less (sign 1) or plus (sign -1) the offset as the given ones see the points."""
+    moved = cam_from_world.copy()
+    if world_offset is not None:
+        moved[:, :3, 3] += sign * moved[:, :3, :3] @ world_offset
+    return moved
+
+
+def _read_pose(frame: dict[str, Any], where: str) -> np.ndarray:
+    """(4, 4) world-to-camera pose of a frame, checked to be rigid."""
+    given = [key for key in ("cam_from_world", "transform_matrix") if key in frame]
+    if len(given) != 1:
+        raise DyngsError(f"{where} needs exactly one of 'cam_from_world' and 'transform_matrix'")
+    try:
+        matrix = np.array(frame[given[0]], np.float64)
+    except (TypeError, ValueError):
+        raise DyngsError(f"{where}: '{given[0]}' must be a 4x4 or 3x4 matrix of numbers") from None
+    pose, _ = checked_pose(matrix, f"{where}: '{given[0]}'")
+    return cam_from_opengl(pose) if given[0] == "transform_matrix" else pose
+
+
+def _read_intrinsics(document: dict[str, Any], frame: dict[str, Any], size: tuple[int, int], where: str) -> np.ndarray:
+    """(3, 3) intrinsics from 'fl_x' [fl_y, cx, cy] or 'camera_angle_x', in pixels; the frame's keys go first."""
+    width, height = size
+    focal_keys = {"fl_x", "fl_y", "camera_angle_x"}
+    own_focal = not focal_keys.isdisjoint(frame)
+    keys = {key: value for key, value in document.items() if not (own_focal and key in focal_keys)} | frame
+    if "fl_x" in keys:
+        focal_x = _number(keys, "fl_x", where, low=1e-3, high=1e9)
+    elif "camera_angle_x" in keys:
+        focal_x = 0.5 * width / math.tan(0.5 * _number(keys, "camera_angle_x", where, low=1e-4, high=3.14))
+    else:
+        raise DyngsError(f"{where} needs 'fl_x' or 'camera_angle_x' (in the frame or once for the whole file)")
+    focal_y = _number(keys, "fl_y", where, low=1e-3, high=1e9, default=focal_x)
+    cx = _number(keys, "cx", where, low=-1e9, high=1e9, default=0.5 * width)
+    cy = _number(keys, "cy", where, low=-1e9, high=1e9, default=0.5 * height)
+    return np.array([[focal_x, 0, cx], [0, focal_y, cy], [0, 0, 1]])
+
+
+def _number(
+    keys: dict[str, Any], key: str, where: str, *, low: float, high: float, default: float | None = None
+) -> float:
+    """The number at ``key``, checked to lie in [low, high]."""
+    value = keys.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        problem = "is missing" if value is None else f"is {value!r}"
+        raise DyngsError(f"{where}: '{key}' {problem}; it must be a number from {low:g} to {high:g}")
+    return float(value)
+
+
+def _unit(a: np.ndarray) -> np.ndarray:
+    return a / np.linalg.norm(a)
+
+
+def _perpendicular(a: np.ndarray) -> np.ndarray:
+    """A unit vector at right angles to ``a``."""
+    other = np.eye(3)[np.abs(a).argmin()]
+    return _unit(np.cross(a, other))

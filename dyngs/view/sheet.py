@@ -1,0 +1,128 @@
+"""Pictures for people: contact sheets of truth, render and error, and coloured depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dyngs.data.write import to_uint8, write_image
+
+__all__ = ["SheetRow", "color_map", "contact_sheet", "depth_limits", "depth_to_rgb", "write_image"]
+
+GAP = 6
+LABEL_HEIGHT = 22
+PAPER = 32
+
+
+@dataclass(frozen=True)
+class SheetRow:
+    """One view of a contact sheet.
+
+    Attributes:
+        label: the text above it, say its name and PSNR.
+        truth, rendered: (H, W, 3), uint8 or floats in [0, 1], of one size.
+    """
+
+    label: str
+    truth: np.ndarray
+    rendered: np.ndarray
+
+
+def contact_sheet(rows: Sequence[SheetRow], error_gain: float = 5.0, panel_width: int = 480) -> np.ndarray:
+    """(H', W', 3) uint8 sheet: truth, render and error side by side, one view per row, a label above each.
+
+    The error is the mean absolute difference of the channels times ``error_gain``, in magma colours (black = equal).
+    Pictures wider than ``panel_width`` are shrunk, after the difference was taken.
+
+    Raises:
+        ValueError: no rows, or a truth and a render of different sizes.
+    """
+    if not rows:
+        raise ValueError("a contact sheet needs at least one row")
+    bands = []
+    for row in rows:
+        if row.truth.shape != row.rendered.shape or row.truth.ndim != 3:
+            raise ValueError(f"{row.label}: truth {row.truth.shape} and render {row.rendered.shape} differ in shape")
+        truth, rendered = to_uint8(row.truth), to_uint8(row.rendered)
+        difference = np.abs(truth.astype(np.float32) - rendered.astype(np.float32)).mean(axis=2) / 255.0
+        panels = (truth, rendered, color_map(error_gain * difference, "magma"))
+        bands.append(_band(row.label, f"error x{error_gain:g}", [_shrink(panel, panel_width) for panel in panels]))
+    width = max(band.shape[1] for band in bands)
+    padded = [np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=PAPER) for b in bands]
+    return np.pad(np.concatenate(padded), ((0, GAP), (0, 0), (0, 0)), constant_values=PAPER)
+
+
+def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
+    """Near and far for ``depth_to_rgb``: the 1st and 99th percentile of ``depth`` where ``alpha`` is at least a half.
+
+    Any equal shapes, so limits can be shared by the frames of a video. (0, 1) where nothing is opaque.
+    """
+    seen = depth[(alpha >= 0.5) & np.isfinite(depth)]
+    if not seen.size:
+        return 0.0, 1.0
+    near, far = np.percentile(seen, [1.0, 99.0])
+    return float(near), float(far)
+
+
+def depth_to_rgb(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None) -> np.ndarray:
+    """(H, W, 3) uint8: near is red, far is blue (turbo), darkened to black where ``alpha`` is 0.
+
+    Args:
+        depth: (H, W) expected depth in world units; what is not finite is drawn as far.
+        alpha: (H, W) in [0, 1].
+        limits: near and far; ``depth_limits`` of this picture where None.
+    """
+    near, far = limits or depth_limits(depth, alpha)
+    share = (far - np.nan_to_num(depth, nan=far, posinf=far, neginf=near)) / max(far - near, 1e-12)
+    colors = color_map(np.clip(share, 0.0, 1.0), "turbo").astype(np.float32)
+    return (colors * np.clip(alpha, 0.0, 1.0)[..., None] + 0.5).astype(np.uint8)
+
+
+def color_map(values: np.ndarray, name: str) -> np.ndarray:
+    """(H, W, 3) uint8 colours of ``values`` (H, W) in [0, 1], by OpenImageIO's map ``name`` (magma, turbo...)."""
+    import OpenImageIO as oiio
+
+    source = oiio.ImageBuf(np.ascontiguousarray(np.clip(values, 0.0, 1.0)[..., None], dtype=np.float32))
+    colored = oiio.ImageBufAlgo.color_map(source, 0, name)
+    if colored.has_error:
+        raise ValueError(f"no colour map '{name}': {colored.geterror()}")
+    linear = np.clip(
+        np.asarray(colored.get_pixels(oiio.FLOAT))[..., :3], 0.0, 1.0
+    )  # OpenImageIO's tables are in linear light
+    return to_uint8(np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
+
+
+def _band(label: str, error_name: str, panels: list[np.ndarray]) -> np.ndarray:
+    """A labelled row of panels on paper."""
+    height, width = panels[0].shape[:2]
+    band = np.full((LABEL_HEIGHT + height, GAP + len(panels) * (width + GAP), 3), PAPER, np.uint8)
+    for i, panel in enumerate(panels):
+        left = GAP + i * (width + GAP)
+        band[LABEL_HEIGHT:, left : left + width] = panel
+    texts = (f"{label}   truth", "render", error_name)
+    for i, text in enumerate(texts):
+        left = GAP + i * (width + GAP)
+        _write_text(band[:LABEL_HEIGHT, left : left + width], text)
+    return band
+
+
+def _write_text(strip: np.ndarray, text: str) -> None:
+    """Write ``text`` into ``strip`` (H, W, 3) in place, as much as fits; nothing where no font is installed."""
+    import OpenImageIO as oiio
+
+    canvas = oiio.ImageBuf(np.ascontiguousarray(strip))
+    ink = (0.85, 0.85, 0.85)
+    if oiio.ImageBufAlgo.render_text(canvas, 2, LABEL_HEIGHT - 7, text, 14, textcolor=ink):
+        strip[:] = canvas.get_pixels(oiio.UINT8)
+
+
+def _shrink(rgb: np.ndarray, width: int) -> np.ndarray:
+    """The picture (H, W, 3) uint8, area-filtered to at most ``width`` columns."""
+    if rgb.shape[1] <= width:
+        return rgb
+    from skimage.transform import resize_local_mean
+
+    height = max(round(rgb.shape[0] * width / rgb.shape[1]), 1)
+    return to_uint8(resize_local_mean(rgb.astype(np.float32) / 255.0, (height, width)))

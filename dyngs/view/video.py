@@ -1,0 +1,147 @@
+"""Videos in and out: H.264 MP4 files through PyAV."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from dyngs.data.video import read_frames
+from dyngs.data.write import temporary_beside
+from dyngs.errors import DyngsError
+
+__all__ = ["VideoWriter", "read_frames"]
+
+
+class VideoWriter:
+    """A context that turns pictures into an MP4 which every player shows: H.264, yuv420p, BT.709, constant rate.
+
+    The file appears when the block ends well; after an error (or without any picture) there is none, and a former one
+    is left as it was. Pictures of odd width or height are padded by repeating the last column or row.
+
+        with VideoWriter(Path("orbit.mp4"), fps=30) as video:
+            video.add(rgb)
+    """
+
+    def __init__(self, path: Path, fps: float = 30.0, quality: int = 18, threads: int = 1) -> None:
+        """Prepare a writer; nothing is written yet.
+
+        Args:
+            path: where to; the suffix names the container, ``.mp4`` is what is tested.
+            fps: pictures per second, more than 0.
+            quality: x264's constant rate factor, 0 (lossless) to 51; 18 is visually lossless.
+            threads: of the encoder; other numbers give other bytes.
+        """
+        if not 0 < fps <= 1000:
+            raise DyngsError(f"cannot write {path}: fps must be in (0, 1000], got {fps:g}")
+        self.path, self.fps, self.quality, self.threads = path, fps, quality, threads
+        self.num_frames = 0
+        self._size: tuple[int, int] | None = None
+        self._temporary: Path | None = None
+        self._container: Any = None
+        self._stream: Any = None
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def add(self, rgb: np.ndarray) -> None:
+        """Append a picture (H, W, 3) uint8; all must have the first one's size."""
+        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
+            raise ValueError(f"a video picture must be (H, W, 3) uint8, got {rgb.shape} {rgb.dtype}")
+        if self._size is None:
+            self._open(rgb.shape[0], rgb.shape[1])
+        if rgb.shape[:2] != self._size:
+            raise ValueError(f"all pictures of a video must have one size, got {rgb.shape[:2]} after {self._size}")
+        height, width = rgb.shape[:2]
+        if height % 2 or width % 2:
+            rgb = np.pad(rgb, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        self._encode(rgb)
+        self.num_frames += 1
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None and self._container is None:
+            raise DyngsError(f"cannot write {self.path}: the video has no pictures")
+        try:
+            if kind is None:
+                self._encode(None)
+                self._close()
+                os.replace(self._temporary or self.path, self.path)
+        except OSError as problem:
+            raise DyngsError(f"cannot write the video {self.path}: {problem.strerror or problem}") from problem
+        finally:
+            self._discard()
+
+    def _open(self, height: int, width: int) -> None:
+        import av
+        from av.video.reformatter import ColorPrimaries, ColorTrc
+
+        rate = Fraction(self.fps).limit_denominator(1001)
+        try:
+            self._temporary = temporary_beside(self.path)
+            self._container = av.open(str(self._temporary), "w")
+            self._stream = self._container.add_stream("libx264", rate=rate)
+        except (OSError, ValueError) as error:
+            self._discard()
+            advice = "" if self.path.suffix == ".mp4" else "; use the suffix .mp4"
+            if "libx264" not in av.codecs_available:
+                advice = ": this PyAV lacks the H.264 encoder libx264; reinstall it with `pip install av`"
+            raise DyngsError(f"cannot write the video {self.path} ({error}){advice}") from error
+        self._size = (height, width)
+        stream = self._stream
+        stream.width, stream.height = width + width % 2, height + height % 2
+        stream.pix_fmt = "yuv420p"
+        stream.thread_count = self.threads
+        stream.options = {"crf": str(self.quality), "preset": "medium"}
+        context = stream.codec_context
+        context.color_range, context.colorspace = _tv_range(), _bt709()
+        context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+
+    def _encode(self, rgb: np.ndarray | None) -> None:
+        """Encode a picture, or flush at the end."""
+        import av
+        from av.error import FFmpegError
+
+        try:
+            if rgb is None:
+                self._container.mux(self._stream.encode(None))
+                return
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
+            frame = frame.reformat(
+                format="yuv420p", dst_colorspace=_bt709(), dst_color_range=_tv_range(), interpolation="AREA"
+            )
+            frame.pts = self.num_frames
+            frame.time_base = 1 / self._stream.codec_context.framerate
+            self._container.mux(self._stream.encode(frame))
+        except (FFmpegError, OSError) as error:
+            raise DyngsError(f"cannot write the video {self.path}: {error}") from error
+
+    def _close(self) -> None:
+        container, self._container = self._container, None
+        if container is not None:
+            container.close()
+
+    def _discard(self) -> None:
+        """Leave nothing behind of a video that was not finished."""
+        with suppress(OSError):
+            self._close()
+        if self._temporary is not None:
+            self._temporary.unlink(missing_ok=True)
+
+
+def _bt709() -> int:
+    from av.video.reformatter import Colorspace
+
+    return int(Colorspace.ITU709)
+
+
+def _tv_range() -> int:
+    from av.video.reformatter import ColorRange
+
+    return int(ColorRange.MPEG)

@@ -1,0 +1,172 @@
+"""The fused Adam step against torch.optim.Adam, and what it does with rows left out."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dyngs.errors import DyngsError
+from dyngs.ops.adam import adam_step_, seen_rows
+
+# Rows shorter and longer than a vector, tails, several blocks of 2048 floats, and one row longer than a block.
+SHAPES = [(1,), (700,), (5000,), (701, 3), (1, 4), (90, 15, 3), (130, 16, 3), (3, 2500)]
+
+
+def make_state(shape: tuple[int, ...], dtype: torch.dtype = torch.float32, seed: int = 0) -> tuple[Tensor, ...]:
+    """A parameter, its gradient, and moments as they are in the middle of a training."""
+    generator = torch.Generator().manual_seed(seed)
+    param, grad, exp_avg, exp_avg_sq = (torch.randn(shape, generator=generator, dtype=dtype) for _ in range(4))
+    return param, grad, exp_avg, exp_avg_sq.abs()
+
+
+def train(param: Tensor, lr: float | Tensor, steps: int, eps: float) -> Tensor:
+    """The parameter after some steps with gradients of very different sizes."""
+    generator = torch.Generator().manual_seed(1)
+    param = param.clone()
+    moments = torch.zeros_like(param), torch.zeros_like(param)
+    for step in range(1, steps + 1):
+        grad = 10.0 ** (-step % 7) * torch.randn(param.shape, generator=generator, dtype=param.dtype)
+        assert adam_step_(param, grad, *moments, lr=lr, step=step, eps=eps) == 0
+    return param
+
+
+def train_with_torch(param: Tensor, lr: float, steps: int, eps: float) -> Tensor:
+    generator = torch.Generator().manual_seed(1)
+    param = param.clone()
+    optimizer = torch.optim.Adam([param], lr=lr, eps=eps, foreach=False)
+    for step in range(1, steps + 1):
+        param.grad = 10.0 ** (-step % 7) * torch.randn(param.shape, generator=generator, dtype=param.dtype)
+        optimizer.step()
+    return param
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_equals_torch_over_50_steps(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    param = make_state(shape, dtype)[0]
+    expected = train_with_torch(param, 0.01, 50, 1e-15)
+    moved = train(param, 0.01, 50, 1e-15)
+    # 1e-6 of the distance moved (up to 0.5) and of the value: a few float32 roundings.
+    torch.testing.assert_close(moved, expected, rtol=1e-6, atol=5e-7)
+
+
+@pytest.mark.parametrize("shape", [(5000,), (701, 3), (130, 16, 3)])
+def test_column_rates_equal_one_optimizer_per_column(shape: tuple[int, ...]) -> None:
+    param = make_state(shape)[0]
+    columns = param[0].numel()
+    rates = torch.logspace(-4, -1, columns)
+    moved = train(param, rates, 10, 1e-8).view(len(param), columns)
+    for column in range(columns):
+        alone = train(param, rates[column].item(), 10, 1e-8).view(len(param), columns)
+        assert torch.equal(moved[:, column], alone[:, column])
+
+
+@given(
+    shape=st.sampled_from(SHAPES),
+    share=st.floats(0, 1),
+    step=st.integers(1, 30000),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=25, deadline=None)
+def test_only_the_rows_asked_for_change(shape: tuple[int, ...], share: float, step: int, seed: int) -> None:
+    param, grad, exp_avg, exp_avg_sq = make_state(shape, seed=seed)
+    rows = torch.rand(shape[0], generator=torch.Generator().manual_seed(seed)) < share
+    everywhere = [param.clone(), exp_avg.clone(), exp_avg_sq.clone()]
+    chosen = [x.clone() for x in everywhere]
+    adam_step_(everywhere[0], grad, *everywhere[1:], lr=0.1, step=step)
+    assert adam_step_(chosen[0], grad, *chosen[1:], lr=0.1, step=step, rows=rows) == 0
+    for before, full, partial in zip((param, exp_avg, exp_avg_sq), everywhere, chosen, strict=True):
+        assert torch.equal(partial[~rows], before[~rows])
+        # The same update; only vectors and tails may round differently.
+        torch.testing.assert_close(partial[rows], full[rows], rtol=1e-6, atol=1e-7)
+        assert not rows.any() or not torch.equal(partial[rows], before[rows])
+
+
+@pytest.mark.parametrize("shape", [(50,), (701, 3), (130, 16, 3)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_rows_with_non_finite_gradient_are_left_out_and_counted(
+    shape: tuple[int, ...], dtype: torch.dtype, bad: float
+) -> None:
+    param, grad, exp_avg, exp_avg_sq = make_state(shape, dtype)
+    rows = torch.ones(shape[0], dtype=torch.bool)
+    rows[7] = False
+    grad.view(shape[0], -1)[[3, 7, 20], -1] = bad
+    state = [param.clone(), exp_avg.clone(), exp_avg_sq.clone()]
+    assert adam_step_(state[0], grad, *state[1:], lr=0.1, step=5) == 3
+    for before, after in zip((param, exp_avg, exp_avg_sq), state, strict=True):
+        assert after.isfinite().all()
+        assert torch.equal(after[[3, 7, 20]], before[[3, 7, 20]])
+        assert not torch.equal(after[4], before[4])
+    assert adam_step_(*(x.clone() for x in (param, grad, exp_avg, exp_avg_sq)), lr=0.1, step=5, rows=rows) == 2
+
+
+def test_any_number_of_threads_gives_the_same_bytes() -> None:
+    param, grad, exp_avg, exp_avg_sq = make_state((9000, 16, 3))
+    rows = torch.rand(9000) < 0.5
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            state = [x.clone() for x in (param, exp_avg, exp_avg_sq)]
+            adam_step_(state[0], grad, *state[1:], lr=0.1, step=5, rows=rows)
+            results.append(state)
+    finally:
+        torch.set_num_threads(before)
+    for state in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(state, results[0], strict=True))
+
+
+def test_zero_gradient_from_rest_does_not_move() -> None:
+    # 0 / (0 + eps): an eps below float32's range would make this NaN.
+    param = torch.ones(40, 3)
+    adam_step_(param, torch.zeros(40, 3), torch.zeros(40, 3), torch.zeros(40, 3), lr=0.1, step=1, eps=1e-15)
+    assert torch.equal(param, torch.ones(40, 3))
+
+
+def test_parameter_that_requires_grad_and_strided_gradient() -> None:
+    param, grad, exp_avg, exp_avg_sq = make_state((60, 3))
+    expected = param.clone()
+    adam_step_(expected, grad, exp_avg.clone(), exp_avg_sq.clone(), lr=0.1, step=5)
+    param.requires_grad_()
+    adam_step_(param, grad.T.contiguous().T, exp_avg, exp_avg_sq, lr=0.1, step=5)
+    assert torch.equal(param.detach(), expected)
+
+
+def test_no_rows() -> None:
+    empty = torch.zeros(0, 3)
+    assert adam_step_(empty, empty, empty, empty, lr=0.1, step=1, rows=torch.zeros(0, dtype=torch.bool)) == 0
+    assert seen_rows(empty).shape == (0,)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_seen_rows(dtype: torch.dtype) -> None:
+    grads = torch.zeros(2000, 4, 3, dtype=dtype)
+    grads[5, 3, 2] = 1e-40
+    grads[700, 0, 0] = -1
+    grads[1999, 1, 1] = math.nan
+    grads[9, 0, 0] = -0.0
+    assert seen_rows(grads).nonzero().flatten().tolist() == [5, 700, 1999]
+    assert seen_rows(grads[:, 3, 2]).nonzero().flatten().tolist() == [5]
+
+
+def test_arguments_that_do_not_fit() -> None:
+    param, grad, exp_avg, exp_avg_sq = make_state((6, 3))
+    with pytest.raises(DyngsError, match="grad is"):
+        adam_step_(param, grad[:5], exp_avg, exp_avg_sq, lr=0.1, step=1)
+    with pytest.raises(DyngsError, match="exp_avg is"):
+        adam_step_(param, grad, exp_avg.double(), exp_avg_sq, lr=0.1, step=1)
+    with pytest.raises(DyngsError, match="one rate per column"):
+        adam_step_(param, grad, exp_avg, exp_avg_sq, lr=torch.ones(6), step=1)
+    with pytest.raises(DyngsError, match="must be contiguous"):
+        adam_step_(param.T, grad.T, exp_avg.T, exp_avg_sq.T, lr=0.1, step=1)
+    with pytest.raises(DyngsError, match="rows must be"):
+        adam_step_(param, grad, exp_avg, exp_avg_sq, lr=0.1, step=1, rows=torch.ones(6))
+    with pytest.raises(DyngsError, match="counts from 1"):
+        adam_step_(param, grad, exp_avg, exp_avg_sq, lr=0.1, step=0)

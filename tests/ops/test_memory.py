@@ -1,0 +1,33 @@
+"""That freed memory is kept, seen from outside: no page faults when blocks are allocated again."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import sys
+
+import pytest
+
+# In a process of its own, as the setting cannot be taken back.
+PROGRAM = """
+import resource
+import torch
+from dyngs.ops.memory import keep_freed_memory
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(4):
+        torch.ones(12_000_000)  # 48 MB, beyond what glibc keeps by itself
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+faults()
+print(faults(), keep_freed_memory(), faults() and faults())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc has the setting")
+def test_blocks_are_reused_without_page_faults() -> None:
+    output = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True).stdout
+    before, taken, after = output.split()
+    assert taken == "True"
+    assert int(after) < int(before) / 10

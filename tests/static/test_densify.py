@@ -1,0 +1,200 @@
+"""Clone, split, prune and reset: the published rules on hand-made sets, and invariants on random ones."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dyngs.config import DefaultStrategy
+from dyngs.gaussians import Gaussians
+from dyngs.static.densify import DefaultDensifier, DensifySchedule, plan_edit, rotate
+
+EXTENT = 10.0
+SMALL, LARGE = 0.05, 0.5  # either side of dense_fraction * extent = 0.1
+SCHEDULE = DensifySchedule(start=100, stop=1000, every=100, resets=(300, 600), prune_scale_after=300)
+
+
+def _gaussians(scales: list[float], opacities: list[float]) -> Gaussians:
+    n = len(scales)
+    return Gaussians(
+        means=torch.arange(n).float()[:, None].repeat(1, 3),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        log_scales=torch.tensor(scales).log()[:, None].repeat(1, 3),
+        logit_opacities=torch.logit(torch.tensor(opacities)),
+        sh=torch.arange(n).float()[:, None, None].repeat(1, 4, 3),
+    )
+
+
+def _signal(densifier: DefaultDensifier, scores: list[float]) -> None:
+    """Feed one view of 200 x 100 pixels whose NDC gradient norms are ``scores``."""
+    grad = torch.zeros(1, len(scores), 4)
+    grad[0, :, 0] = torch.tensor(scores) / 100
+    densifier.after_backward(1, grad, torch.ones(1, len(scores), 2, dtype=torch.int32), (200, 100))
+
+
+def _densifier(options: DefaultStrategy | None = None) -> DefaultDensifier:
+    return DefaultDensifier(options or DefaultStrategy(), SCHEDULE, EXTENT)
+
+
+def test_signal_is_the_mean_norm_in_ndc_units_over_the_views_that_see_it() -> None:
+    densifier = _densifier()
+    grad = torch.tensor([[[3e-4, 8e-4, 9.0, 9.0], [1.0, 1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]]])
+    radii = torch.tensor([[[1, 2], [0, 0], [3, 3]]], dtype=torch.int32)
+    densifier.after_backward(1, grad, radii, (200, 100))
+    densifier.after_backward(2, grad * 0, radii * torch.tensor([1, 1, 0])[None, :, None], (200, 100))
+    assert densifier.seen.tolist() == [2, 0, 1]
+    # hypot(3e-4 * 100, 8e-4 * 50); the second Gaussian was not seen, whatever its gradient
+    torch.testing.assert_close(densifier.grad_sum, torch.tensor([0.05, 0.0, 0.0]))
+
+
+def test_absgrad_takes_the_other_two_columns() -> None:
+    densifier = _densifier(DefaultStrategy(absgrad=True))
+    grad = torch.tensor([[[0.0, 0.0, 3.0, 4.0]]])
+    densifier.after_backward(1, grad, torch.ones(1, 1, 2, dtype=torch.int32), (2, 2))
+    assert densifier.grad_sum.tolist() == [5.0]
+
+
+def test_each_kind_of_gaussian_meets_its_fate() -> None:
+    #             calm    clone  split  faint   faint and wanted
+    gaussians = _gaussians([SMALL, SMALL, LARGE, SMALL, LARGE], [0.5, 0.5, 0.5, 0.001, 0.001])
+    densifier = _densifier()
+    _signal(densifier, [1e-4, 3e-4, 3e-4, 1e-4, 3e-4])
+    result = densifier.edit(200, gaussians, torch.Generator().manual_seed(0))
+    assert result is not None
+    assert result.edit is not None
+    assert result.edit.source.tolist() == [0, 1, 1, 2, 2]
+    assert result.edit.is_new.tolist() == [False, False, True, True, True]
+    means, log_scales = result.changes["means"], result.changes["log_scales"]
+    assert torch.equal(means[:3], gaussians.means[[0, 1, 1]])
+    assert not torch.equal(means[3], means[4])
+    torch.testing.assert_close(log_scales[3:].exp(), torch.full((2, 3), LARGE / 1.6))
+    assert "logit_opacities" not in result.changes
+
+
+def test_huge_ones_go_only_after_the_first_reset() -> None:
+    gaussians = _gaussians([1.1, 0.9], [0.5, 0.5])  # limit: 0.1 * extent = 1
+    for step, left in ((200, [0, 1]), (400, [1])):
+        densifier = _densifier()
+        _signal(densifier, [0.0, 0.0])
+        result = densifier.edit(step, gaussians, torch.Generator())
+        assert result is not None
+        assert result.edit is not None
+        assert result.edit.source.tolist() == left
+
+
+def test_nothing_happens_between_and_outside() -> None:
+    for step in (100, 150, 1000, 1100):
+        densifier = _densifier()
+        _signal(densifier, [1.0, 1.0])
+        assert densifier.edit(step, _gaussians([SMALL] * 2, [0.5] * 2), torch.Generator()) is None
+    assert not densifier.wants_signal(1000)
+
+
+def test_reset_lowers_opacities_and_clears_their_moments() -> None:
+    densifier = DefaultDensifier(DefaultStrategy(), DensifySchedule(100, 1000, 100, resets=(350,)), EXTENT)
+    result = densifier.edit(350, _gaussians([SMALL] * 2, [0.5, 0.006]), torch.Generator())
+    assert result is not None
+    assert result.edit is None
+    assert result.zero_moments == {"logit_opacities"}
+    torch.testing.assert_close(result.changes["logit_opacities"].sigmoid(), torch.tensor([0.01, 0.006]))
+
+
+def test_a_reset_with_a_densification_covers_the_new_rows() -> None:
+    densifier = _densifier()
+    _signal(densifier, [1.0, 0.0])
+    result = densifier.edit(300, _gaussians([SMALL] * 2, [0.5, 0.5]), torch.Generator())
+    assert result is not None
+    torch.testing.assert_close(result.changes["logit_opacities"].sigmoid(), torch.full((3,), 0.01))
+    assert len(result.changes["means"]) == 3
+
+
+def test_one_gaussian_always_stays() -> None:
+    densifier = _densifier()
+    _signal(densifier, [1.0, 1.0, 1.0])
+    result = densifier.edit(400, _gaussians([5.0, LARGE, 5.0], [0.002, 0.001, 0.004]), torch.Generator())
+    assert result is not None
+    assert result.edit is not None
+    assert result.edit.source.tolist() == [2]
+
+
+def test_children_follow_the_distribution_of_their_parent() -> None:
+    count = 20_000
+    quat = torch.tensor([0.6, 0.8, 0.0, 0.0])
+    sizes = torch.tensor([2.0, 0.5, 0.2])
+    one = _gaussians([LARGE], [0.5])
+    many = Gaussians(
+        torch.tensor([[1.0, -2.0, 3.0]]).repeat(count, 1), (2 * quat).repeat(count, 1), sizes.log().repeat(count, 1),
+        one.logit_opacities.repeat(count), one.sh.repeat(count, 1, 1),
+    )  # fmt: skip
+    densifier = _densifier()
+    _signal(densifier, [1.0] * count)
+    result = densifier.edit(200, many, torch.Generator().manual_seed(1))
+    assert result is not None
+    offset = result.changes["means"] - many.means[0]
+    axes = rotate(quat.repeat(3, 1), torch.eye(3))  # rows: images of the axes
+    expected = axes.T @ torch.diag(sizes**2) @ axes
+    torch.testing.assert_close(offset.T @ offset / len(offset), expected, rtol=0.05, atol=0.03)
+    torch.testing.assert_close(offset.mean(0), torch.zeros(3), rtol=0, atol=0.04)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31), cap=st.integers(1, 60), n=st.integers(1, 40))
+def test_the_cap_holds_and_the_best_come_first(seed: int, cap: int, n: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(low: float, high: float) -> list[float]:
+        return (torch.rand(n, generator=generator) * (high - low) + low).tolist()
+
+    gaussians = _gaussians(draw(0.01, 2.0), draw(0.001, 0.9))
+    score = torch.tensor(draw(0.0, 4e-4))
+    free = plan_edit(gaussians, score, DefaultStrategy(), EXTENT, 1.0)
+    plan = plan_edit(gaussians, score, DefaultStrategy(max_gaussians=cap), EXTENT, 1.0)
+    total = int(plan.kept.sum() + plan.cloned.sum() + 2 * plan.split.sum())
+    survivors = int(((gaussians.opacities >= 0.005) & (gaussians.log_scales.amax(1).exp() <= 1.0)).sum())
+    assert total <= max(cap, survivors, 1)
+    assert total >= 1
+    chosen, wanted = plan.cloned | plan.split, free.cloned | free.split
+    assert not (chosen & ~wanted).any()
+    if chosen.any() and (wanted & ~chosen).any():
+        assert score[chosen].min() >= score[wanted & ~chosen].max()
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_bad_values_are_never_multiplied(bad: float) -> None:
+    gaussians = _gaussians([SMALL, SMALL], [0.5, 0.5])
+    logits = gaussians.logit_opacities.clone()
+    logits[0] = math.nan
+    plan = plan_edit(gaussians.replace(logit_opacities=logits), torch.tensor([1.0, bad]), DefaultStrategy(), 10.0, 1.0)
+    assert plan.kept.tolist() == [False, True]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31))
+def test_rotate_equals_the_matrix(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    quats = torch.randn((5, 4), generator=generator, dtype=torch.float64)
+    vectors = torch.randn((5, 3), generator=generator, dtype=torch.float64)
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    rows: list[Tensor] = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
+    ]
+    expected = (torch.stack(rows, 1) @ vectors[..., None])[..., 0]
+    torch.testing.assert_close(rotate(quats, vectors), expected)
+    torch.testing.assert_close(rotate(quats * 0, vectors), vectors)
+
+
+def test_state_goes_round() -> None:
+    densifier, other = _densifier(), _densifier()
+    _signal(densifier, [1.0, 2.0])
+    other.load_state({name: x.clone() for name, x in densifier.state().items()})
+    for d in (densifier, other):
+        _signal(d, [3.0, 0.0])
+    assert torch.equal(densifier.grad_sum, other.grad_sum)
+    assert torch.equal(densifier.seen, other.seen)

@@ -1,0 +1,111 @@
+"""Where training starts: sizes from neighbours, published constants, cubes, caps, seeds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dyngs.config import DefaultStrategy, McmcStrategy, PointsInit, RandomInit
+from dyngs.static.init import StartValues, Surroundings, initial_gaussians, mean_squared_neighbour_distance
+
+CENTERS = np.array([[4.0, 0.0, 1.0], [0.0, 4.0, 1.0], [-4.0, 0.0, 1.0], [0.0, -4.0, 1.0]])
+
+
+def _generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def _with_points(xyz: np.ndarray) -> Surroundings:
+    return Surroundings(CENTERS, xyz, np.full((len(xyz), 3), 255, np.uint8))
+
+
+def test_extent_is_the_published_one() -> None:
+    assert Surroundings(CENTERS).extent == pytest.approx(1.1 * 4.0)
+    assert Surroundings(CENTERS[:1]).extent == 1.0
+
+
+def test_points_give_their_published_start() -> None:
+    grid = np.stack(np.meshgrid(*[np.arange(3.0)] * 3, indexing="ij"), -1).reshape(-1, 3) * 0.5
+    gaussians = initial_gaussians(_with_points(grid), PointsInit(), StartValues(), 3, _generator())
+    # Every point of a grid of pitch 0.5 has three neighbours at 0.5.
+    torch.testing.assert_close(gaussians.scales, torch.full((27, 3), 0.5))
+    torch.testing.assert_close(gaussians.opacities, torch.full((27,), 0.1))
+    torch.testing.assert_close(gaussians.base_rgb, torch.ones(27, 3))
+    torch.testing.assert_close(gaussians.means, torch.from_numpy(grid).float())
+    assert gaussians.sh.shape == (27, 16, 3)
+    assert gaussians.sh[:, 1:].count_nonzero() == 0
+    assert gaussians.quats.unique(dim=0).tolist() == [[1.0, 0.0, 0.0, 0.0]]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 12), st.integers(0, 2**31))
+def test_neighbour_distance_equals_brute_force(count: int, seed: int) -> None:
+    xyz = torch.rand((count, 3), generator=_generator(seed), dtype=torch.float64)
+    found = mean_squared_neighbour_distance(xyz)
+    if count == 1:
+        assert found.tolist() == [1e-2]
+        return
+    squared = torch.cdist(xyz, xyz).square().fill_diagonal_(math.inf).sort(1).values[:, : min(3, count - 1)]
+    torch.testing.assert_close(found, squared.mean(1).clamp_min(1e-7), rtol=1e-6, atol=1e-12)
+
+
+def test_coincident_points_have_the_floor_as_size() -> None:
+    gaussians = initial_gaussians(_with_points(np.zeros((9, 3))), PointsInit(), StartValues(), 0, _generator())
+    torch.testing.assert_close(gaussians.scales, torch.full((9, 3), 1e-7**0.5))
+
+
+def test_points_that_are_not_finite_are_left_out() -> None:
+    xyz = np.random.default_rng(0).random((8, 3))
+    xyz[3, 1] = np.nan
+    assert len(initial_gaussians(_with_points(xyz), PointsInit(), StartValues(), 0, _generator())) == 7
+    nothing = initial_gaussians(
+        _with_points(xyz[3:4]), PointsInit(num_random=5), StartValues(), 0, _generator()
+    )
+    assert len(nothing) == 5
+
+
+@pytest.mark.parametrize(
+    ("scene", "options", "center", "half"),
+    [
+        (_with_points(np.ones((9, 3))), RandomInit(num_random=4000, half_extent=2.0), [0.0, 0.0, 0.0], 2.0),
+        (Surroundings(CENTERS, around_origin=True), PointsInit(num_random=4000), [0.0, 0.0, 0.0], 1.3),
+        (Surroundings(CENTERS), PointsInit(num_random=4000), [0.0, 0.0, 1.0], 3 * 4.4),
+    ],
+)
+def test_random_points_fill_their_cube(
+    scene: Surroundings, options: PointsInit | RandomInit, center: list[float], half: float
+) -> None:
+    gaussians = initial_gaussians(scene, options, StartValues(), 1, _generator())
+    offset = gaussians.means - torch.tensor(center)
+    assert len(gaussians) == 4000
+    assert half * 0.99 < float(offset.abs().max()) <= half * 1.000001
+    assert float(offset.mean(0).abs().max()) < 0.05 * half
+    assert float((gaussians.base_rgb - 0.5).abs().max()) < 0.28209479177387814 / 255 + 1e-6
+
+
+def test_mcmc_starts_smaller_and_more_opaque_and_keeps_its_cap() -> None:
+    xyz = np.random.default_rng(0).random((50, 3))
+    plain = initial_gaussians(_with_points(xyz), PointsInit(), StartValues(), 0, _generator())
+    start = StartValues.for_strategy(McmcStrategy(max_gaussians=50))
+    mcmc = initial_gaussians(_with_points(xyz), PointsInit(), start, 0, _generator())
+    torch.testing.assert_close(mcmc.scales, plain.scales * 0.1)
+    torch.testing.assert_close(mcmc.opacities, torch.full((50,), 0.5))
+    capped = StartValues.for_strategy(DefaultStrategy(max_gaussians=20))
+    few = initial_gaussians(_with_points(xyz), PointsInit(), capped, 0, _generator())
+    assert len(few) == 20
+    assert {tuple(row) for row in few.means.tolist()} <= {tuple(row) for row in plain.means.tolist()}
+
+
+def test_the_seed_decides() -> None:
+    def draw(seed: int) -> torch.Tensor:
+        return initial_gaussians(
+            Surroundings(CENTERS), PointsInit(num_random=10), StartValues(), 0, _generator(seed)
+        ).means
+
+    assert torch.equal(draw(1), draw(1))
+    assert not torch.equal(draw(1), draw(2))

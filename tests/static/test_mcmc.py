@@ -1,0 +1,164 @@
+"""Relocation keeps the picture, the set grows to its cap, noise moves only what is nearly transparent."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from dyngs.config import McmcStrategy
+from dyngs.gaussians import Gaussians
+from dyngs.static.densify import DensifySchedule, rotate
+from dyngs.static.mcmc import McmcDensifier, relocated
+
+SCHEDULE = DensifySchedule(start=100, stop=1000, every=100)
+
+
+def _gaussians(opacities: list[float]) -> Gaussians:
+    n = len(opacities)
+    generator = torch.Generator().manual_seed(3)
+    return Gaussians(
+        means=torch.arange(n).float()[:, None].repeat(1, 3),
+        quats=torch.randn((n, 4), generator=generator),
+        log_scales=torch.randn((n, 3), generator=generator),
+        logit_opacities=torch.logit(torch.tensor(opacities)),
+        sh=torch.zeros(n, 1, 3),
+    )
+
+
+def _profile_integral(opacity: Tensor, scale: Tensor, copies: int) -> Tensor:
+    """Numeric integral over x of 1 - (1 - o exp(-x^2 / 2 s^2))^N."""
+    x = torch.linspace(-12, 12, 200_001, dtype=torch.float64)
+    alpha = opacity * torch.exp(-0.5 * (x / scale) ** 2)
+    return torch.trapezoid(1 - (1 - alpha) ** copies, x)
+
+
+@pytest.mark.parametrize(("opacity", "copies"), [(0.5, 2), (0.9, 3), (0.3, 5), (0.99, 10), (0.999, 50)])
+def test_relocation_keeps_the_integral_of_the_profile(opacity: float, copies: int) -> None:
+    o = torch.tensor([opacity], dtype=torch.float64)
+    thinner, factor = relocated(o, torch.tensor([copies]), min_opacity=0.0)
+    before = _profile_integral(o, torch.tensor(1.0), 1)
+    after = _profile_integral(thinner, factor, copies)
+    torch.testing.assert_close(after, before, rtol=1e-12, atol=0)  # quadrature of an analytic function
+    # On the axis the composite has the old opacity.
+    torch.testing.assert_close(1 - (1 - thinner) ** copies, o, rtol=1e-12, atol=0)
+
+
+def test_relocation_equals_the_published_double_sum() -> None:
+    from math import comb
+
+    o, n = 0.7, 6
+    thin = 1 - (1 - o) ** (1 / n)
+    total = sum(
+        comb(i - 1, k) * (-1) ** k * thin ** (k + 1) / (k + 1) ** 0.5 for i in range(1, n + 1) for k in range(i)
+    )
+    thinner, factor = relocated(torch.tensor([o], dtype=torch.float64), torch.tensor([n]))
+    assert float(thinner) == pytest.approx(thin, rel=1e-12)
+    assert float(factor) == pytest.approx(o / total, rel=1e-12)
+
+
+def test_relocation_is_finite_at_the_ends() -> None:
+    opacities = torch.tensor([1.0, 1.0, 0.005, 0.5], dtype=torch.float64)
+    thinner, factor = relocated(opacities, torch.tensor([2, 500, 50, 1]))
+    assert torch.isfinite(thinner).all()
+    assert torch.isfinite(factor).all()
+    assert (factor > 0).all()
+    assert thinner[2] == 0.005
+    torch.testing.assert_close(torch.stack([thinner[3], factor[3]]), torch.tensor([0.5, 1.0], dtype=torch.float64))
+
+
+def test_dead_ones_move_onto_living_ones() -> None:
+    gaussians = _gaussians([0.001, 0.8, 0.002, 0.004, 0.3])
+    densifier = McmcDensifier(McmcStrategy(max_gaussians=5), SCHEDULE, 0.05)
+    result = densifier.edit(200, gaussians, torch.Generator().manual_seed(0))
+    assert result is not None
+    assert result.edit is not None
+    source = result.edit.source.tolist()
+    assert len(source) == 5
+    assert source[1] == 1
+    assert source[4] == 4
+    assert set(source) == set(source) & {1, 4}
+    logits, log_scales = result.changes["logit_opacities"], result.changes["log_scales"]
+    for alive in (1, 4):
+        rows = [i for i, s in enumerate(source) if s == alive]
+        same = logits[rows].sigmoid()
+        assert same.unique().numel() == 1
+        assert log_scales[rows].unique(dim=0).shape[0] == 1
+        composite = 1 - (1 - same[0]) ** len(rows)
+        torch.testing.assert_close(composite, gaussians.opacities[alive])
+        assert result.edit.is_new[rows].all() == (len(rows) > 1)
+
+
+def test_the_set_grows_to_its_cap_and_no_further() -> None:
+    for cap, expected in ((1000, 110), (104, 104), (50, 100)):
+        densifier = McmcDensifier(McmcStrategy(max_gaussians=cap), SCHEDULE, 0.1)
+        result = densifier.edit(200, _gaussians([0.4] * 100), torch.Generator().manual_seed(0))
+        assert result is not None
+        assert result.edit is not None
+        assert len(result.edit.source) == expected
+        assert result.edit.source[:100].tolist() == list(range(100))
+        untouched = ~result.edit.is_new[:100]
+        assert torch.equal(result.changes["log_scales"][:100][untouched], _gaussians([0.4] * 100).log_scales[untouched])
+
+
+def test_nothing_outside_the_schedule_or_without_survivors() -> None:
+    densifier = McmcDensifier(McmcStrategy(), SCHEDULE, 0.05)
+    assert densifier.edit(250, _gaussians([0.5]), torch.Generator()) is None
+    assert densifier.edit(1000, _gaussians([0.5]), torch.Generator()) is None
+    assert densifier.edit(200, _gaussians([0.001] * 3), torch.Generator()) is None
+
+
+def test_noise_has_the_published_size_and_direction() -> None:
+    count, lr = 4000, 1e-4
+    one = _gaussians([0.004])
+    gaussians = Gaussians(**{name: x.repeat(count, *[1] * (x.ndim - 1)) for name, x in one.tensors().items()})
+    densifier = McmcDensifier(McmcStrategy(), SCHEDULE, 0.05)
+    before = gaussians.means.clone()
+    densifier.perturb(gaussians, lr, torch.Generator().manual_seed(0))
+    moved = (gaussians.means - before) / (5e5 * lr * torch.sigmoid(torch.tensor(100 * (0.005 - 0.004))))
+    axes = rotate(one.quats.repeat(3, 1), torch.eye(3))
+    sigma = axes.T @ torch.diag(one.scales[0] ** 2) @ axes
+    expected = sigma @ sigma
+    torch.testing.assert_close(moved.T @ moved / count, expected, rtol=0.1, atol=0.05 * float(expected.abs().max()))
+
+
+def test_opaque_ones_stay_put_and_no_noise_means_none() -> None:
+    gaussians = _gaussians([0.001, 0.9])
+    before = gaussians.means.clone()
+    McmcDensifier(McmcStrategy(noise=0), SCHEDULE, 0.05).perturb(gaussians, 1e-4, torch.Generator())
+    assert torch.equal(gaussians.means, before)
+    McmcDensifier(McmcStrategy(), SCHEDULE, 0.05).perturb(gaussians, 1e-4, torch.Generator())
+    assert not torch.equal(gaussians.means[0], before[0])
+    assert torch.equal(gaussians.means[1], before[1])
+
+
+def test_regularizers_are_weighted_means() -> None:
+    gaussians = _gaussians([0.2, 0.4])
+    terms = McmcDensifier(McmcStrategy(opacity_reg=0.5, scale_reg=0.25), SCHEDULE, 0.05).regularizers(gaussians)
+    assert float(terms["opacity"]) == pytest.approx(0.5 * 0.3, rel=1e-6)
+    assert float(terms["scale"]) == pytest.approx(0.25 * float(gaussians.scales.mean()), rel=1e-6)
+
+
+def test_the_result_does_not_depend_on_threads() -> None:
+    n = 70_001  # above torch's grain of 32,768, so that two threads do share the work
+    opacities = torch.rand(n, generator=torch.Generator().manual_seed(1)).clamp(0.001, 0.999).tolist()
+    gaussians = _gaussians(opacities)
+    threads, results = torch.get_num_threads(), []
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            generator = torch.Generator().manual_seed(0)
+            mine = gaussians.replace(means=gaussians.means.clone())
+            densifier = McmcDensifier(McmcStrategy(), SCHEDULE, 0.05)
+            densifier.perturb(mine, 1e-4, generator)
+            results.append((densifier.edit(200, mine, generator), mine.means))
+    finally:
+        torch.set_num_threads(threads)
+    (a, means_a), (b, means_b) = results
+    assert a is not None
+    assert b is not None
+    assert a.edit is not None
+    assert b.edit is not None
+    assert torch.equal(means_a, means_b)
+    assert torch.equal(a.edit.source, b.edit.source)
+    assert all(torch.equal(a.changes[name], b.changes[name]) for name in a.changes)

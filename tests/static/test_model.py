@@ -1,0 +1,48 @@
+"""The static model: parameters pass through, or filtered with what the cameras can resolve."""
+
+from __future__ import annotations
+
+import torch
+
+from dyngs.camera import Cameras
+from dyngs.gaussians import Gaussians
+from dyngs.static.filters import filter_std, fuse_filter
+from dyngs.static.model import StaticScene
+
+INTRINSICS = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
+
+
+def _gaussians(z: float, n: int = 3) -> Gaussians:
+    means = torch.zeros(n, 3)
+    means[:, 2] = z
+    return Gaussians(means, torch.ones(n, 4), torch.full((n, 3), -3.0), torch.zeros(n), torch.zeros(n, 1, 3))
+
+
+def _camera() -> Cameras:
+    return Cameras(torch.eye(4)[None], INTRINSICS[None], 100, 100)
+
+
+def test_without_filter_parameters_pass_through() -> None:
+    model, gaussians = StaticScene(), _gaussians(2.0)
+    assert model.gaussians_at(gaussians, None) is gaussians
+    assert model.state() == {}
+
+
+def test_the_filter_is_kept_until_it_is_due() -> None:
+    model = StaticScene([_camera()], range(100, 200, 100))
+    near, far = _gaussians(2.0), _gaussians(4.0)
+    with_near, with_far = (fuse_filter(far, filter_std(x.means, [_camera()])) for x in (near, far))
+    model.gaussians_at(near, None)
+    model.after_step(far, 50, edited=False)
+    assert torch.equal(model.gaussians_at(far, None).log_scales, with_near.log_scales)
+    model.after_step(far, 100, edited=False)
+    assert torch.equal(model.gaussians_at(far, None).log_scales, with_far.log_scales)
+    model.after_step(near, 101, edited=True)
+    assert torch.equal(model.gaussians_at(far, None).log_scales, with_near.log_scales)
+
+
+def test_state_goes_round() -> None:
+    first, second = StaticScene([_camera()]), StaticScene([_camera()])
+    drawn = first.gaussians_at(_gaussians(2.0), None)
+    second.load_state(first.state())
+    assert torch.equal(second.gaussians_at(_gaussians(2.0), None).log_scales, drawn.log_scales)

@@ -1,0 +1,123 @@
+"""Adam per Gaussian: equal to torch's, following edits, skipping what is not seen."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from dyngs.config import OptimConfig
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.static.densify import EditResult
+from dyngs.static.optimizer import GaussianOptimizer
+
+
+def _gaussians(n: int, seed: int = 0) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=generator)
+
+    return Gaussians(draw(n, 3), draw(n, 4), draw(n, 3), draw(n), draw(n, 4, 3))
+
+
+def _set_gradients(optimizer: GaussianOptimizer, seed: int, unseen: list[int] | None = None) -> dict[str, torch.Tensor]:
+    gradients = _gaussians(len(optimizer.parameters), seed).tensors()
+    for name, x in optimizer.parameters.tensors().items():
+        gradients[name][unseen or []] = 0
+        x.grad = gradients[name].clone()
+    return gradients
+
+
+def test_equals_torch_adam_with_a_rate_per_group() -> None:
+    start, options = _gaussians(7), OptimConfig(sparse=False)
+    optimizer = GaussianOptimizer(start, options)
+    theirs = {name: x.clone().requires_grad_() for name, x in start.tensors().items() if name != "sh"}
+    theirs |= {"dc": start.sh[:, :1].clone().requires_grad_(), "rest": start.sh[:, 1:].clone().requires_grad_()}
+    rates = {
+        "means": 0.3, "quats": options.lr_quats, "log_scales": options.lr_scales,
+        "logit_opacities": options.lr_opacities, "dc": options.lr_sh_dc, "rest": options.lr_sh_rest,
+    }  # fmt: skip
+    adam = torch.optim.Adam([{"params": [theirs[n]], "lr": lr} for n, lr in rates.items()], eps=options.eps)
+    for step in range(1, 6):
+        gradients = _set_gradients(optimizer, step)
+        gradients |= {"dc": gradients["sh"][:, :1], "rest": gradients["sh"][:, 1:]}
+        for name, x in theirs.items():
+            x.grad = gradients[name].clone()
+        optimizer.step(step, 0.3, dense=True)
+        adam.step()
+    for name, x in optimizer.parameters.tensors().items():
+        expected = torch.cat([theirs["dc"], theirs["rest"]], 1) if name == "sh" else theirs[name]
+        # A few float32 roundings of values of order one.
+        torch.testing.assert_close(x.detach(), expected.detach(), rtol=2e-6, atol=2e-6)
+        assert x.grad is None
+
+
+def test_unseen_gaussians_are_left_alone_unless_dense() -> None:
+    start = _gaussians(5)
+    for sparse, dense, moves in ((True, False, False), (True, True, True), (False, False, True)):
+        optimizer = GaussianOptimizer(start, OptimConfig(sparse=sparse))
+        _set_gradients(optimizer, 1)
+        optimizer.step(1, 0.1, dense=dense)
+        before = {name: x.clone() for name, x in optimizer.state().items()}
+        _set_gradients(optimizer, 2, unseen=[1, 3])
+        optimizer.step(2, 0.1, dense=dense)
+        for name, x in optimizer.state().items():
+            changed = (x != before[name]).reshape(5, -1).any(1).tolist()
+            assert changed == [True, moves, True, moves, True], name
+
+
+def test_a_row_with_nan_gradients_is_counted_and_left_alone() -> None:
+    optimizer = GaussianOptimizer(_gaussians(4), OptimConfig())
+    before = optimizer.parameters.means.detach().clone()
+    _set_gradients(optimizer, 1)
+    assert optimizer.parameters.means.grad is not None
+    optimizer.parameters.means.grad[2, 1] = float("nan")
+    assert optimizer.step(1, 0.1, dense=False) == 1
+    moved = (optimizer.parameters.means.detach() != before).any(1)
+    assert moved.tolist() == [True, True, False, True]
+
+
+def test_an_edit_moves_parameters_and_moments() -> None:
+    optimizer = GaussianOptimizer(_gaussians(4), OptimConfig())
+    _set_gradients(optimizer, 1)
+    optimizer.step(1, 0.1, dense=True)
+    before = {name: x.clone() for name, x in optimizer.state().items()}
+    source, is_new = torch.tensor([0, 2, 2, 3]), torch.tensor([False, False, True, True])
+    changes = {"means": torch.full((4, 3), 7.0)}
+    edit = EditResult(TopologyEdit(source, is_new), changes, frozenset({"logit_opacities"}))
+    optimizer.apply(edit)
+    after = optimizer.state()
+    assert torch.equal(after["gaussians.means"], changes["means"])
+    for name in ("quats", "log_scales", "logit_opacities", "sh"):
+        assert torch.equal(after[f"gaussians.{name}"], before[f"gaussians.{name}"][source])
+    for kind in ("exp_avg", "exp_avg_sq"):
+        assert torch.equal(after[f"{kind}.sh"][:2], before[f"{kind}.sh"][source[:2]])
+        assert after[f"{kind}.sh"][2:].count_nonzero() == 0
+        assert after[f"{kind}.logit_opacities"].count_nonzero() == 0
+    assert all(x.is_leaf and x.requires_grad and x.grad is None for x in optimizer.parameters.tensors().values())
+
+
+def test_a_reset_without_an_edit_keeps_all_else() -> None:
+    optimizer = GaussianOptimizer(_gaussians(3), OptimConfig())
+    _set_gradients(optimizer, 1)
+    optimizer.step(1, 0.1, dense=True)
+    before = {name: x.clone() for name, x in optimizer.state().items()}
+    lowered = torch.full((3,), -4.0)
+    optimizer.apply(EditResult(None, {"logit_opacities": lowered}, frozenset({"logit_opacities"})))
+    changed = {name for name, x in optimizer.state().items() if not torch.equal(x, before[name])}
+    assert changed == {"gaussians.logit_opacities", "exp_avg.logit_opacities", "exp_avg_sq.logit_opacities"}
+    assert torch.equal(optimizer.parameters.logit_opacities.detach(), lowered)
+
+
+def test_state_goes_round_to_the_bit() -> None:
+    first = GaussianOptimizer(_gaussians(6), OptimConfig())
+    _set_gradients(first, 1)
+    first.step(1, 0.1, dense=True)
+    second = GaussianOptimizer(_gaussians(2, seed=9), OptimConfig())
+    second.load_state({name: x.clone() for name, x in first.state().items()})
+    for optimizer in (first, second):
+        _set_gradients(optimizer, 2)
+        optimizer.step(2, 0.05, dense=False)
+    assert all(torch.equal(x, second.state()[name]) for name, x in first.state().items())
+    with pytest.raises(KeyError):
+        second.load_state({})

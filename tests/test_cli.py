@@ -1,0 +1,299 @@
+"""The command line: exit codes, one-line errors, instant help, and every verb once on a tiny capture."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import dyngs
+from dyngs.cli import doctor, main
+from dyngs.cli.train import parse_config
+from dyngs.config_io import load_config, save_config
+from dyngs.errors import DyngsError
+
+VERBS = ("demo", "train", "eval", "render", "export", "data", "bench", "doctor")
+ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"} | {
+    "PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])
+}
+Capture = pytest.CaptureFixture[str]
+
+
+def error_line(capsys: Capture, *arguments: object) -> str:
+    """What stderr says about a command line that must be refused: one line, nothing else."""
+    assert main([str(a) for a in arguments]) == 2
+    output = capsys.readouterr()
+    assert output.err.startswith("dyngs: error: ") and output.err.count("\n") == 1, output.err
+    assert output.out == ""
+    return output.err
+
+
+def make_doctor(monkeypatch: pytest.MonkeyPatch, action: Callable[[], None]) -> None:
+    """Let `dyngs doctor` do ``action``."""
+
+    def run(arguments: argparse.Namespace) -> int:
+        action()
+        return 0
+
+    monkeypatch.setattr(doctor, "run", run)
+
+
+def raising(error: BaseException) -> Callable[[], None]:
+    def action() -> None:
+        raise error
+
+    return action
+
+
+# ---------------------------------------------------------------------------------------------------- help
+
+
+def test_help_names_every_command(capsys: Capture) -> None:
+    for arguments in ([], ["--help"]):
+        assert main(arguments) == 0
+        text = capsys.readouterr().out
+        assert all(re.search(rf"^\s+{verb}\s", text, re.M) for verb in VERBS)
+
+
+def test_version(capsys: Capture) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.strip() == f"dyngs {dyngs.__version__}"
+
+
+@pytest.mark.parametrize("verb", [["data", "sfm"], ["data", "inspect"], ["data", "synth"], *([v] for v in VERBS[:5])])
+def test_every_command_explains_itself(verb: list[str], capsys: Capture) -> None:
+    assert main([*verb, "--help"]) == 0
+    assert f"usage: dyngs {' '.join(verb)}" in capsys.readouterr().out
+
+
+def test_help_is_instant_because_torch_is_not_imported() -> None:
+    code = "import sys; from dyngs.cli import main; main(['--help']); print([m for m in ('torch', 'numpy', 'pydantic') if m in sys.modules])"
+    seconds = []
+    for _ in range(3):  # the best counts: a busy machine only ever makes it slower
+        start = time.perf_counter()
+        done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+        seconds.append(time.perf_counter() - start)
+        assert done.stdout.splitlines()[-1] == "[]"
+    assert min(seconds) < 0.5  # 0.1 s on an idle machine; the promise is 0.3 s
+
+
+def test_module_and_command_are_the_same() -> None:
+    done = subprocess.run([sys.executable, "-m", "dyngs", "--version"], env=ENVIRONMENT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout.strip()) == (0, f"dyngs {dyngs.__version__}")
+
+
+# ---------------------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        ("trian", "invalid choice: 'trian'"),
+        ("train", "give a config"),
+        ("train nowhere.yaml data.root=x", "nowhere.yaml: no such preset"),
+        ("train static", "data.root is missing"),
+        ("train static data.rot=x", "did you mean 'data.root'"),
+        ("train static data.root=nowhere train.steps=0", "train.steps must be an integer >= 1"),
+        ("train static data.root=nowhere", "nowhere"),
+        ("train --resume nowhere", "nowhere: not a run folder"),
+        ("eval", "RUN"),
+        ("eval nowhere", "nowhere: not a run folder"),
+        ("eval nowhere --split tset", "invalid choice: 'tset'"),
+        ("render nowhere", "--out DIR"),
+        ("render nowhere --out x", "nowhere: no such run or file"),
+        ("render nowhere --out x --size big", "1280x720"),
+        ("render nowhere --out x --size 0x5", "1280x720"),
+        ("render nowhere --out x --frames 0", "whole number above 0"),
+        ("render nowhere --out x --split test --path orbit", "not allowed with"),
+        ("export nowhere", "nowhere: not a run folder"),
+        ("export nowhere --format spz", "invalid choice: 'spz'"),
+        ("data", "COMMAND"),
+        ("data inspect nowhere", "nowhere"),
+        ("data sfm nowhere out", "nowhere"),
+        ("data synth still out --size 0", "--size"),
+        ("demo --steps 0", "--steps"),
+        ("demo --steps few", "invalid int value: 'few'"),
+    ],
+)
+def test_wrong_usage_and_missing_input_end_in_one_line(
+    arguments: str, part: str, capsys: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert part in error_line(capsys, *arguments.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "part"),
+    [
+        (DyngsError("two\nlines"), "two lines"),
+        (OSError(errno.ENOSPC, "No space left on device", "a.png"), "a.png: No space left on device; free some space"),
+        (PermissionError(errno.EACCES, "Permission denied", "b"), "b: Permission denied; choose another folder"),
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), "Broken pipe"),
+        (MemoryError(), "out of memory"),
+    ],
+)
+def test_errors_of_the_world_end_in_one_line(
+    error: Exception, part: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_doctor(monkeypatch, raising(error))
+    assert part in error_line(capsys, "doctor")
+
+
+def test_bugs_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    make_doctor(monkeypatch, raising(ZeroDivisionError("a bug")))
+    with pytest.raises(ZeroDivisionError):
+        main(["doctor"])
+
+
+def test_interruption_says_how_to_go_on(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_doctor(monkeypatch, raising(KeyboardInterrupt("go on with: dyngs train --resume runs/a")))
+    assert main(["doctor"]) == 130
+    assert capsys.readouterr().err.strip() == "dyngs: interrupted: go on with: dyngs train --resume runs/a"
+
+
+TALKATIVE = """
+import sys
+from dyngs.cli import doctor, main
+doctor.run = lambda arguments: print("x" * 10_000_000) or 0
+sys.exit(main(["doctor"]))
+"""
+
+
+def test_a_reader_that_leaves_gets_no_traceback() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", TALKATIVE], env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read().splitlines() == [
+        "dyngs: error: Broken pipe; the program that read our output has gone"
+    ]
+    assert process.wait(timeout=60) == 2
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_gets_no_traceback() -> None:
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-c", TALKATIVE]
+        done = subprocess.run(command, env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("dyngs: error: No space left on device") and done.stderr.count("\n") == 1
+
+
+# ---------------------------------------------------------------------------------------------------- train's words
+
+
+def test_words_after_train() -> None:
+    config = parse_config(["static", "data.root=x", "train.steps=5", "run.threads=2"], None)
+    assert (config.train.steps, config.run.threads, config.data.root) == (5, 2, Path("x").absolute())
+    assert parse_config(["data.root=x"], None) == load_config(None, ["data.root=x"])
+
+
+def test_a_resumed_run_keeps_its_config_but_for_threads(tmp_path: Path) -> None:
+    stored = load_config(None, ["data.root=x", "train.steps=5", "strategy.kind=mcmc"])
+    save_config(stored, tmp_path / "config.yaml")
+    resumed = parse_config(["run.threads=3"], tmp_path)
+    assert resumed.run.threads == 3 and resumed.run.dir == tmp_path
+    assert resumed.model_copy(update={"run": stored.run}) == stored
+    with pytest.raises(DyngsError, match=r"only run\.threads=N"):
+        parse_config(["train.steps=9"], tmp_path)
+
+
+# ---------------------------------------------------------------------------------------------------- every verb
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("still") / "capture"
+    assert main(["data", "synth", "still", str(out), "--size", "24", "--views", "6"]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def run_dir(capture: Path) -> Path:
+    folder = capture.parent / "run"
+    words = [f"data.root={capture}", f"run.dir={folder}", "train.steps=20", "init.num_random=200", "run.threads=1"]
+    assert main(["train", "static", *words]) == 0
+    return folder
+
+
+def test_train_writes_a_run_folder_and_never_overwrites_it(run_dir: Path, capture: Path, capsys: Capture) -> None:
+    assert {"config.yaml", "checkpoints", "log.jsonl"} <= {f.name for f in run_dir.iterdir()}
+    before = {f: f.read_bytes() for f in run_dir.rglob("*") if f.is_file()}
+    assert str(run_dir) in error_line(capsys, "train", "static", f"data.root={capture}", f"run.dir={run_dir}")
+    assert {f: f.read_bytes() for f in run_dir.rglob("*") if f.is_file()} == before
+    assert main(["train", "--resume", str(run_dir)]) == 0
+
+
+def test_eval_prints_and_writes_the_metrics(run_dir: Path, capsys: Capture) -> None:
+    assert main(["eval", str(run_dir)]) == 0
+    metrics = json.loads((run_dir / "metrics.json").read_text())
+    text = capsys.readouterr().out
+    assert f"{metrics['psnr']:.2f} dB" in text and "metrics.json" in text
+    assert main(["eval", str(run_dir), "--split", "train", "--threads", "1"]) == 0
+    assert json.loads((run_dir / "metrics_train.json").read_text())["num_views"] == 6
+    assert "test" in error_line(capsys, "eval", run_dir, "--split", "val")
+
+
+def test_render_of_a_split(run_dir: Path, tmp_path: Path, capsys: Capture) -> None:
+    assert main(["render", str(run_dir), "--out", str(tmp_path / "test"), "--alpha", "--depth"]) == 0
+    names = {f.name for f in (tmp_path / "test").iterdir()}
+    assert "sheet.png" in names and any(n.endswith("_alpha.png") for n in names)
+    assert any(n.endswith("_depth.exr") for n in names)
+    assert "sheet.png" in capsys.readouterr().out
+    assert "--size goes with --path" in error_line(capsys, "render", run_dir, "--out", tmp_path, "--size", "8x8")
+
+
+def test_render_of_a_path_with_a_video(run_dir: Path, tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    video = tmp_path / "orbit.mp4"
+    words = ["--path", "orbit", "--frames", "3", "--size", "32x16", "--background", "black", "--video", str(video)]
+    assert main(["render", str(run_dir), "--out", str(tmp_path / "frames"), *words]) == 0
+    assert len(list((tmp_path / "frames").glob("*.png"))) == 3 and video.stat().st_size > 0
+
+
+def test_export_and_render_of_the_file(run_dir: Path, tmp_path: Path, capsys: Capture) -> None:
+    ply = tmp_path / "splats.ply"
+    assert main(["export", str(run_dir), "--out", str(ply)]) == 0
+    assert ply.read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\n")
+    for path in ("orbit", "spiral"):
+        out = tmp_path / path
+        words = ["--path", path, "--frames", "2", "--size", "24x24", "--up", "-y"]
+        assert main(["render", str(ply), "--out", str(out), *words]) == 0
+        assert len(list(out.glob("*.png"))) == 2
+    capsys.readouterr()
+    assert "has no splits" in error_line(capsys, "render", ply, "--out", tmp_path, "--split", "test")
+    assert "no camera path 'circle'" in error_line(capsys, "render", ply, "--out", tmp_path, "--path", "circle")
+
+
+def test_inspect(capture: Path, tmp_path: Path, capsys: Capture) -> None:
+    picture = tmp_path / "cameras.png"
+    assert main(["data", "inspect", str(capture), "--picture", str(picture), "--deep"]) == 0
+    assert "blender" in capsys.readouterr().out and picture.stat().st_size > 0
+
+
+def test_synth_leaves_a_used_folder_alone(capture: Path, capsys: Capture) -> None:
+    assert "exists already" in error_line(capsys, "data", "synth", "still", capture)
+
+
+def test_doctor(capsys: Capture) -> None:
+    assert main(["doctor"]) == 0
+    text = capsys.readouterr().out
+    assert "instruction set v" in text and "broken" not in text
+
+
+def test_one_openmp_runtime() -> None:
+    """torch and the native core share one pool of threads."""
+    code = "import dyngs.ops.native\nfrom dyngs.cli.doctor import openmp_runtimes\nprint(len(openmp_runtimes() or [1]))"
+    done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "1"

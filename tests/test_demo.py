@@ -1,0 +1,50 @@
+"""The demo: everything that it promises lies there, and earlier results stay."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from dyngs.cli import main
+from dyngs.demo import DemoOptions, demo_config, run_demo, unused_folder
+
+TINY = DemoOptions(steps=30, threads=1, size=24, num_points=300, num_frames=3)
+
+
+def test_everything_that_is_promised_lies_there(tmp_path: Path) -> None:
+    result = run_demo(tmp_path / "demo", TINY)
+    for path in (result.capture, result.run_dir, result.pictures, result.sheet, result.video, result.ply):
+        assert path.exists() and (tmp_path / "demo") in path.parents
+    assert json.loads((result.run_dir / "metrics.json").read_text())["psnr"] == result.report.psnr
+    assert result.report.step == 30
+
+
+def test_a_second_demo_leaves_the_first_alone(tmp_path: Path) -> None:
+    wanted = tmp_path / "demo"
+    assert unused_folder(wanted) == wanted
+    wanted.mkdir()
+    assert unused_folder(wanted) == wanted
+    (wanted / "mine").touch()
+    assert unused_folder(wanted) == tmp_path / "demo-2"
+    (tmp_path / "demo-2").touch()
+    assert unused_folder(wanted) == tmp_path / "demo-3"
+
+
+def test_the_demo_trains_the_packaged_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "static.yaml").write_text("train: {ssim_weight: 0.9}")
+    config = demo_config(tmp_path / "a: b", tmp_path / "run", TINY)
+    assert config.data.root == tmp_path / "a: b"
+    assert (config.run.dir, config.train.steps, config.train.ssim_weight) == (tmp_path / "run", 30, 0.2)
+
+
+def test_the_command_prints_the_table_and_the_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dyngs.demo.DemoOptions", lambda steps, threads: TINY)
+    assert main(["demo", "--out", str(tmp_path / "demo"), "--steps", "30", "--threads", "1"]) == 0
+    text = capsys.readouterr().out
+    assert "PSNR" in text and "sheet.png" in text and "orbit.mp4" in text and "splats.ply" in text

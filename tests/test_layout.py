@@ -1,0 +1,164 @@
+"""The habits of this repository, checked: sizes of files and functions, names, layers, what an import costs."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import dyngs
+
+ROOT = Path(__file__).resolve().parents[1]
+PYTHON_FILES = sorted((ROOT / "dyngs").rglob("*.py"))
+CPP_FILES = sorted(f for suffix in ("hpp", "cpp", "h", "inl") for f in (ROOT / "csrc").rglob(f"*.{suffix}"))
+TEST_FILES = sorted((ROOT / "tests").rglob("test_*.py"))
+
+MAX_FILE_LINES = 500
+MAX_FUNCTION_LINES = 60
+MAX_PARAMETERS = 8
+
+LONG_FUNCTIONS: dict[str, str] = {}
+"""``file:function`` that may be longer, each with its reason."""
+
+MANY_PARAMETERS = {
+    "dyngs/ops/rasterization.py:rasterization": "has the signature of gsplat 1.5, so that users can switch",
+}
+"""``file:function`` that may take more parameters, each with its reason."""
+
+HEAVY = ("pycolmap", "trimesh", "kornia", "OpenImageIO", "skimage", "av", "rich", "tensorboard", "lpips")
+WITHOUT_MIRROR = {"test_layout.py": "about the repository, not one module"}
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def relative(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def functions() -> Iterator[tuple[str, Function]]:
+    for path in PYTHON_FILES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, Function):
+                yield f"{relative(path)}:{node.name}", node
+
+
+def num_parameters(function: Function) -> int:
+    given = function.args
+    names = [a.arg for a in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+    return len([name for name in names if name not in ("self", "cls")])
+
+
+def test_files_are_short() -> None:
+    lengths = {relative(f): len(f.read_text(encoding="utf-8").splitlines()) for f in (*PYTHON_FILES, *CPP_FILES)}
+    assert {name: n for name, n in lengths.items() if n > MAX_FILE_LINES} == {}
+
+
+def test_functions_are_short() -> None:
+    lengths = {name: (node.end_lineno or 0) - node.lineno + 1 for name, node in functions()}
+    long = {name: n for name, n in lengths.items() if n > MAX_FUNCTION_LINES and name not in LONG_FUNCTIONS}
+    assert long == {}
+
+
+def test_functions_take_few_parameters() -> None:
+    counts = {name: num_parameters(node) for name, node in functions()}
+    assert {n: c for n, c in counts.items() if c > MAX_PARAMETERS and n not in MANY_PARAMETERS} == {}
+
+
+def test_exceptions_to_the_rules_still_exist() -> None:
+    names = {name for name, _ in functions()}
+    assert (LONG_FUNCTIONS.keys() | MANY_PARAMETERS.keys()) - names == set()
+
+
+def test_every_parameter_and_result_is_annotated() -> None:
+    bare = []
+    for name, node in functions():
+        given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+        given += [a for a in (node.args.vararg, node.args.kwarg) if a is not None]
+        if node.returns is None or any(a.annotation is None for a in given if a.arg not in ("self", "cls")):
+            bare.append(name)
+    assert bare == []
+
+
+def test_every_module_says_what_it_is() -> None:
+    silent = [relative(f) for f in PYTHON_FILES if not ast.get_docstring(ast.parse(f.read_text(encoding="utf-8")))]
+    assert silent == []
+
+
+def test_no_drawer_for_odds_and_ends() -> None:
+    names = {"utils.py", "util.py", "helpers.py", "misc.py", "common.py"}
+    assert [relative(f) for f in (*PYTHON_FILES, *TEST_FILES) if f.name in names] == []
+
+
+def test_no_paths_of_one_machine() -> None:
+    pattern = re.compile(r"[\"'(\s=](/work/|/home/|/root/|/opt/|/mnt/|/Users/|[A-Z]:\\Users)")
+    folders = [f for f in ("dyngs", "csrc", "tests", "configs", "docs", "benchmarks", ".ci") if (ROOT / f).is_dir()]
+    files = [f for folder in folders for f in (ROOT / folder).rglob("*") if f.is_file() and f.stat().st_size < 2**20]
+    files += [ROOT / f for f in ("README.md", "pyproject.toml", "CMakeLists.txt") if (ROOT / f).is_file()]
+    found = [relative(f) for f in files if f != Path(__file__) and pattern.search(f.read_text("utf-8", "ignore"))]
+    assert [name for name in found if "__pycache__" not in name] == []
+
+
+def test_no_code_from_data() -> None:
+    """Untrusted files never run code: no pickle, no eval, no unsafe YAML, no shell."""
+    forbidden_modules = {"pickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"}
+    found = []
+    for path in PYTHON_FILES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names = {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                names = {(node.module or "").split(".")[0]}
+            elif isinstance(node, ast.Call):
+                called = ast.unparse(node.func)
+                names = {"pickle"} if called in ("eval", "exec", "yaml.load", "torch.load", "os.system") else set()
+            else:
+                continue
+            if names & forbidden_modules:
+                found.append(f"{relative(path)}:{node.lineno}")
+    assert found == []
+
+
+def test_only_ops_imports_the_native_core() -> None:
+    pattern = re.compile(r"\bdyngs\.(ops\.)?_core|^\s*from \S+ import .*\b_core\b", re.M)
+    importers = [relative(f) for f in PYTHON_FILES if pattern.search(f.read_text(encoding="utf-8"))]
+    assert [name for name in importers if not name.startswith("dyngs/ops/")] == []
+
+
+@pytest.mark.parametrize("path", TEST_FILES, ids=relative)
+def test_every_test_file_mirrors_a_source_file(path: Path) -> None:
+    if path.name in WITHOUT_MIRROR:
+        return
+    below = path.relative_to(ROOT / "tests")
+    name = path.stem.removeprefix("test_")
+    folder = ROOT / "dyngs" / below.parent
+    candidates = [folder / f"{name}.py", folder / name / "__init__.py"]
+    assert any(f.is_file() for f in candidates), f"no {candidates[0].relative_to(ROOT)} beside {below}"
+
+
+def run_python(code: str) -> str:
+    """What ``code`` prints in a process of its own, with the dyngs that these tests import."""
+    environment = os.environ | {"PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_import_is_cheap() -> None:
+    """The best of three processes, because a busy machine only ever makes it slower."""
+    code = "import time, torch, numpy; t = time.perf_counter(); import dyngs; print(time.perf_counter() - t)"
+    assert min(float(run_python(code)) for _ in range(3)) < 1.0
+
+
+def test_import_leaves_heavy_packages_alone() -> None:
+    code = (
+        "import sys, torch; before = set(sys.modules); import dyngs; dyngs.render\n"
+        f"print([m for m in {HEAVY!r} if m in sys.modules and m not in before])"
+    )
+    assert run_python(code).strip() == "[]"

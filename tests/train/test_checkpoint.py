@@ -1,0 +1,167 @@
+"""Checkpoints: equal bytes for equal runs, whole or not at all, and damage is told in one line."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from dyngs.config import Config, DataConfig, RunConfig, StaticModel
+from dyngs.config_io import RESOLVED_NAME, save_config
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.static.filters import fuse_filter
+from dyngs.train.checkpoint import (
+    Checkpoint,
+    CheckpointInfo,
+    checkpoint_paths,
+    latest_checkpoint,
+    load_checkpoint,
+    load_run,
+    save_checkpoint,
+    seconds_at,
+)
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+def _checkpoint(step: int) -> Checkpoint:
+    generator = torch.Generator().manual_seed(step)
+    tensors = {
+        "gaussians.means": torch.randn((4, 3), generator=generator),
+        "gaussians.quats": torch.randn((4, 4), generator=generator),
+        "gaussians.log_scales": torch.randn((4, 3), generator=generator),
+        "gaussians.logit_opacities": torch.randn(4, generator=generator),
+        "gaussians.sh": torch.randn((4, 4, 3), generator=generator),
+        "model.filter_std": torch.rand(4, generator=generator),
+        "strategy.seen": torch.zeros(0),
+        "sampler.order": torch.arange(5),
+        "rng": generator.get_state(),
+    }
+    return Checkpoint(CheckpointInfo(step, 2.5, (1e6 + 0.25, 0.0, -3.0), "white", "classic"), tensors)
+
+
+def _config(root: Path, **model: bool) -> Config:
+    return Config(data=DataConfig(root=root), model=StaticModel(**model), run=RunConfig(name="x"))  # type: ignore[arg-type]
+
+
+def test_what_is_saved_is_what_is_loaded(tmp_path: Path) -> None:
+    saved = _checkpoint(7)
+    loaded = load_checkpoint(save_checkpoint(tmp_path, saved, 1.5))
+    assert loaded.info == saved.info
+    assert loaded.tensors.keys() == saved.tensors.keys()
+    for name, x in saved.tensors.items():
+        assert x.dtype == loaded.tensors[name].dtype
+        assert torch.equal(x, loaded.tensors[name])
+    assert loaded.part("sampler").keys() == {"order"}
+
+
+def test_equal_checkpoints_have_equal_bytes_in_any_process(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; sys.path.insert(0, str(Path('tests/train')))\n"
+        "from test_checkpoint import _checkpoint; from dyngs.train.checkpoint import save_checkpoint\n"
+        "save_checkpoint(Path(sys.argv[1]), _checkpoint(7), 99.0)"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "other")]
+    subprocess.run(command, check=True, cwd=REPOSITORY, env={"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"})
+    mine = save_checkpoint(tmp_path / "mine", _checkpoint(7), 1.0)
+    assert mine.read_bytes() == checkpoint_paths(tmp_path / "other")[0].read_bytes()
+
+
+def test_only_the_last_two_are_kept_with_their_times(tmp_path: Path) -> None:
+    for step, seconds in ((5, 1.0), (10, 2.0), (15, 3.0)):
+        save_checkpoint(tmp_path, _checkpoint(step), seconds)
+    assert [path.name for path in checkpoint_paths(tmp_path)] == [
+        "step_0000010.safetensors",
+        "step_0000015.safetensors",
+    ]
+    assert latest_checkpoint(tmp_path).info.step == 15
+    assert (seconds_at(tmp_path, 10), seconds_at(tmp_path, 15), seconds_at(tmp_path, 99)) == (2.0, 3.0, 0.0)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "altered", "header", "empty", "no safetensors", "foreign"])
+def test_damage_is_named_with_the_file_and_the_previous_one(tmp_path: Path, damage: str) -> None:
+    save_checkpoint(tmp_path, _checkpoint(5), 1.0)
+    path = save_checkpoint(tmp_path, _checkpoint(10), 2.0)
+    data = path.read_bytes()
+    if damage == "truncated":
+        path.write_bytes(data[: len(data) // 2])
+    elif damage == "altered":
+        path.write_bytes(data[:-3] + bytes([data[-3] ^ 1]) + data[-2:])
+    elif damage == "header":
+        path.write_bytes(data.replace(b'\\"step\\": 10', b'\\"step\\": 11'))
+        assert path.read_bytes() != data
+    elif damage == "empty":
+        path.write_bytes(b"")
+    elif damage == "no safetensors":
+        path.write_bytes(b"hello" * 100)
+    else:
+        from safetensors.torch import save_file
+
+        save_file({"x": torch.zeros(3)}, path)
+    with pytest.raises(DyngsError) as caught:
+        latest_checkpoint(tmp_path)
+    assert str(path) in str(caught.value)
+    assert "step_0000005.safetensors" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_model_that_is_not_finite_is_not_saved(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, _checkpoint(5), 1.0)
+    bad = _checkpoint(10)
+    bad.tensors["gaussians.means"][1, 2] = math.nan
+    with pytest.raises(DyngsError, match=r"means is not finite after step 10.*step_0000005"):
+        save_checkpoint(tmp_path, bad, 2.0)
+    assert latest_checkpoint(tmp_path).info.step == 5
+
+
+def test_a_failed_write_leaves_the_earlier_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_checkpoint(tmp_path, _checkpoint(5), 1.0)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("dyngs.train.checkpoint.save_file", full)
+    with pytest.raises(DyngsError, match=r"step_0000010.safetensors.*No space left"):
+        save_checkpoint(tmp_path, _checkpoint(10), 2.0)
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["step_0000005.safetensors"]
+
+
+def test_load_run_gives_the_newest_model(tmp_path: Path) -> None:
+    save_config(_config(tmp_path), tmp_path / RESOLVED_NAME)
+    save_checkpoint(tmp_path, _checkpoint(5), 1.0)
+    save_checkpoint(tmp_path, _checkpoint(10), 2.5)
+    run = load_run(tmp_path)
+    assert (run.step, run.seconds_train, run.config) == (10, 2.5, _config(tmp_path))
+    assert run.info.world_offset == (1e6 + 0.25, 0.0, -3.0)
+    assert torch.equal(run.gaussians.sh, _checkpoint(10).tensors["gaussians.sh"])
+    assert torch.equal(run.gaussians.log_scales, _checkpoint(10).tensors["gaussians.log_scales"])
+
+
+def test_load_run_fuses_the_filter_of_a_filtered_model(tmp_path: Path) -> None:
+    save_config(_config(tmp_path, filter_3d=True), tmp_path / RESOLVED_NAME)
+    checkpoint = _checkpoint(5)
+    save_checkpoint(tmp_path, checkpoint, 1.0)
+    expected = fuse_filter(Gaussians(**checkpoint.part("gaussians")), checkpoint.tensors["model.filter_std"])
+    assert torch.equal(load_run(tmp_path).gaussians.log_scales, expected.log_scales)
+    assert torch.equal(load_run(tmp_path).gaussians.logit_opacities, expected.logit_opacities)
+
+
+def test_missing_things_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="not a run folder"):
+        load_run(tmp_path)
+    save_config(_config(tmp_path), tmp_path / RESOLVED_NAME)
+    with pytest.raises(DyngsError, match="no checkpoints"):
+        load_run(tmp_path)
+    checkpoint = _checkpoint(5)
+    without = {name: x for name, x in checkpoint.tensors.items() if name != "gaussians.sh"}
+    save_checkpoint(tmp_path, replace(checkpoint, tensors=without), 1.0)
+    with pytest.raises(DyngsError, match="lacks sh"):
+        load_run(tmp_path)
+    assert json.loads((tmp_path / "timing.json").read_text()) == {"seconds_train": {"5": 1.0}}

@@ -1,0 +1,77 @@
+"""Schedules: exactly the published numbers at 30,000 steps, and sensible ones at any other length."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dyngs.config import DefaultStrategy, McmcStrategy, OptimConfig, TrainConfig
+from dyngs.train.schedule import (
+    MIN_RESET_GAP,
+    active_sh_degree,
+    densify_schedule,
+    filter_steps,
+    growth_per_change,
+    means_rate,
+)
+
+
+def test_at_30000_steps_it_is_the_published_one() -> None:
+    schedule = densify_schedule(DefaultStrategy(), 30_000, white_background=False)
+    changes = [step for step in range(30_001) if schedule.densifies_at(step)]
+    assert changes == list(range(600, 15_000, 100))
+    assert schedule.resets == (3000, 6000, 9000, 12_000)
+    assert schedule.prune_scale_after == 3000
+    assert densify_schedule(DefaultStrategy(), 30_000, white_background=True).resets == (500, 3000, 6000, 9000, 12_000)
+    mcmc = densify_schedule(McmcStrategy(), 30_000, white_background=True)
+    assert [step for step in range(30_001) if mcmc.densifies_at(step)] == list(range(600, 25_000, 100))
+    assert mcmc.resets == ()
+    assert growth_per_change(McmcStrategy(), 30_000) == 0.05
+    assert filter_steps(DefaultStrategy(), 30_000) == range(15_000, 29_901, 100)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 60_000), st.booleans())
+def test_resets_leave_time_to_recover(steps: int, white: bool) -> None:
+    schedule = densify_schedule(DefaultStrategy(), steps, white)
+    resets = (*schedule.resets, schedule.stop)
+    gaps = [b - a for a, b in zip(resets, resets[1:], strict=False)]
+    assert all(gap >= MIN_RESET_GAP for gap in gaps)
+    assert schedule.start >= 100
+    assert schedule.stop <= max(1, steps // 2 + 1)
+
+
+def test_short_runs() -> None:
+    schedule = densify_schedule(DefaultStrategy(), 2000, white_background=False)
+    assert (schedule.start, schedule.stop, schedule.resets) == (100, 1000, (400,))
+    assert densify_schedule(DefaultStrategy(), 7000, white_background=True).resets == (117, 700, 1400, 2100, 2800)
+    assert densify_schedule(DefaultStrategy(), 10, white_background=True).resets == ()
+
+
+def test_means_rate_is_log_linear_times_the_extent() -> None:
+    options = OptimConfig()
+    assert means_rate(options, 0, 7000, 2.0) == pytest.approx(3.2e-4)
+    assert means_rate(options, 3500, 7000, 2.0) == pytest.approx(2 * 1.6e-5)
+    assert means_rate(options, 7000, 7000, 2.0) == pytest.approx(3.2e-6)
+
+
+@pytest.mark.parametrize(("steps", "every"), [(30_000, 1000), (7000, 233), (2000, 67), (10, 1)])
+def test_sh_degree_rises_at_the_scaled_steps(steps: int, every: int) -> None:
+    options = TrainConfig(steps=steps)
+    degrees = [active_sh_degree(options, step, 3) for step in (1, every, 2 * every, 3 * every, 9 * every)]
+    assert degrees == ([0, 1, 2, 3, 3] if every > 1 else [1, 1, 2, 3, 3])
+    assert active_sh_degree(options, steps, 0) == 0
+
+
+@pytest.mark.parametrize("steps", [2000, 7000, 15_000, 30_000])
+def test_mcmc_can_reach_its_cap_at_any_length(steps: int) -> None:
+    schedule = densify_schedule(McmcStrategy(), steps, white_background=False)
+    changes = sum(schedule.densifies_at(step) for step in range(steps))
+    assert (1 + growth_per_change(McmcStrategy(), steps)) ** changes > 15
+
+
+def test_the_filter_is_refreshed_after_densification_only() -> None:
+    steps = filter_steps(DefaultStrategy(), 7000)
+    assert (steps[0], steps[-1], steps.step) == (3500, 6900, 100)
+    assert len(filter_steps(DefaultStrategy(), 50)) == 0
