@@ -27,20 +27,22 @@ class DataConfig(Section):
 
     root: Path = Field(description="capture folder")
     format: Literal["auto", "blender", "nerfstudio", "colmap"] = "auto"
-    downscale: float = Field(1.0, ge=1.0, description="divide width and height by this")
-    longest_side: int | None = Field(None, ge=1, description="shrink so that the longer side has at most this many px")
-    test_every: int = Field(8, ge=0, description="every n-th picture by name is held out; 0 = none")
-    background: Literal["auto", "white", "black", "random"] = Field(
-        "auto", description="auto: white where the pictures have alpha, black otherwise"
+    downscale: float = Field(default=1.0, ge=1.0, description="divide width and height by this")
+    longest_side: int | None = Field(
+        default=None, ge=1, description="shrink so that the longer side has at most this many px"
     )
-    cache_mb: float = Field(4096, ge=0, description="memory for decoded pictures")
+    test_every: int = Field(default=8, ge=0, description="every n-th picture by name is held out; 0 = none")
+    background: Literal["auto", "white", "black", "random"] = Field(
+        default="auto", description="auto: white where the pictures have alpha, black otherwise"
+    )
+    cache_mb: float = Field(default=4096, ge=0, description="memory for decoded pictures")
 
 
 class PointsInit(Section):
     """Start from the capture's sparse points (random ones where it has none)."""
 
     kind: Literal["auto", "points"] = "auto"
-    num_random: int = Field(100_000, ge=1, description="used where the capture has no points")
+    num_random: int = Field(default=100_000, ge=1, description="used where the capture has no points")
     half_extent: Positive = 1.3
 
 
@@ -48,19 +50,21 @@ class RandomInit(Section):
     """Start from uniformly random points in a cube around the origin (Blender scenes of 3DGS)."""
 
     kind: Literal["random"] = "random"
-    num_random: int = Field(100_000, ge=1)
-    half_extent: Positive = Field(1.3, description="half the cube's side, world units")
+    num_random: int = Field(default=100_000, ge=1)
+    half_extent: Positive = Field(default=1.3, description="half the cube's side, world units")
 
 
 class StaticModel(Section):
     """3D Gaussian splatting, Mip-Splatting's filters as options."""
 
     kind: Literal["static"] = "static"
-    sh_degree: int = Field(3, ge=0, le=4)
+    sh_degree: int = Field(default=3, ge=0, le=4)
     rasterize_mode: RasterizeMode = RasterizeMode.CLASSIC
-    eps2d: float = Field(0.3, ge=0, description="2D low-pass variance, px^2 (Mip-Splatting: 0.1 with antialiased)")
-    filter_3d: bool = Field(False, description="Mip-Splatting's 3D smoothing filter")
-    near: Positive = Field(0.2, description="near plane, world units")
+    eps2d: float = Field(
+        default=0.3, ge=0, description="2D low-pass variance, px^2 (Mip-Splatting: 0.1 with antialiased)"
+    )
+    filter_3d: bool = Field(default=False, description="Mip-Splatting's 3D smoothing filter")
+    near: Positive = Field(default=0.2, description="near plane, world units")
 
 
 class DefaultStrategy(Section):
@@ -72,29 +76,31 @@ class DefaultStrategy(Section):
     kind: Literal["default"] = "default"
     absgrad: bool = False
     grad_threshold: Positive = Field(2e-4, description="mean over visible views, NDC units (8e-4 suits absgrad)")
-    dense_fraction: Positive = Field(0.01, description="of the extent: smaller ones are cloned, larger ones split")
+    dense_fraction: Positive = Field(
+        default=0.01, description="of the extent: smaller ones are cloned, larger ones split"
+    )
     start: int = 500
     stop: int = 15_000
-    every: int = Field(100, ge=1, description="not scaled")
+    every: int = Field(default=100, ge=1, description="not scaled")
     prune_opacity: Fraction = 0.005
-    prune_scale: Positive = Field(0.1, description="of the extent, after the first opacity reset")
-    reset_every: int = Field(3000, ge=1)
-    max_gaussians: int = Field(3_000_000, ge=1)
+    prune_scale: Positive = Field(default=0.1, description="of the extent, after the first opacity reset")
+    reset_every: int = Field(default=3000, ge=1)
+    max_gaussians: int = Field(default=3_000_000, ge=1)
 
 
 class McmcStrategy(Section):
     """3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024): a cap, relocation, noise."""
 
     kind: Literal["mcmc"] = "mcmc"
-    max_gaussians: int = Field(300_000, ge=1)
+    max_gaussians: int = Field(default=300_000, ge=1)
     start: int = 500
     stop: int = 25_000
-    every: int = Field(100, ge=1)
+    every: int = Field(default=100, ge=1)
     growth: Positive = 0.05
     min_opacity: Fraction = 0.005
-    noise: float = Field(5e5, ge=0)
-    opacity_reg: float = Field(0.01, ge=0)
-    scale_reg: float = Field(0.01, ge=0)
+    noise: float = Field(default=5e5, ge=0)
+    opacity_reg: float = Field(default=0.01, ge=0)
+    scale_reg: float = Field(default=0.01, ge=0)
     init_opacity: Fraction = 0.5
     init_scale: Positive = 0.1
 
@@ -110,18 +116,20 @@ class OptimConfig(Section):
     lr_scales: Positive = 5e-3
     lr_quats: Positive = 1e-3
     eps: Positive = 1e-15
-    sparse: bool = Field(True, description="skip Gaussians that received no gradient in the step")
+    sparse: bool = Field(default=True, description="skip Gaussians that received no gradient in the step")
 
 
 class TrainConfig(Section):
     """Length, loss and logging of a run."""
 
-    steps: int = Field(7000, ge=1)
+    steps: int = Field(default=7000, ge=1)
     ssim_weight: Fraction = 0.2
-    sh_every: int = Field(1000, ge=1, description="steps (of 30,000) between SH degree increments")
-    log_every: int = Field(10, ge=1)
-    save_every: int = Field(0, ge=0, description="steps between checkpoints; 0 = only the last")
-    eval_every: int = Field(0, ge=0, description="steps between evaluations; 0 = only when `dyngs eval` is called")
+    sh_every: int = Field(default=1000, ge=1, description="steps (of 30,000) between SH degree increments")
+    log_every: int = Field(default=10, ge=1)
+    save_every: int = Field(default=0, ge=0, description="steps between checkpoints; 0 = only the last")
+    eval_every: int = Field(
+        default=0, ge=0, description="steps between evaluations; 0 = only when `dyngs eval` is called"
+    )
     tensorboard: bool = False
 
 
@@ -129,9 +137,9 @@ class RunConfig(Section):
     """Where the run goes and how it is executed."""
 
     name: str = "static"
-    dir: Path | None = Field(None, description="run folder; default runs/NAME")
-    seed: int = Field(42, ge=0)
-    threads: int = Field(0, ge=0, description="0 = all cores")
+    dir: Path | None = Field(default=None, description="run folder; default runs/NAME")
+    seed: int = Field(default=42, ge=0)
+    threads: int = Field(default=0, ge=0, description="0 = all cores")
 
 
 class Config(Section):

@@ -13,7 +13,8 @@ DOCS = Path(__file__).resolve().parents[1] / "docs" / "cli.md"
 def test_every_key_of_every_section_is_there() -> None:
     names = {(key.name, key.kind) for key in config_keys()}
     assert {name.split(".")[0] for name, _ in names} == set(Config.model_fields)
-    assert ("strategy.max_gaussians", "default") in names and ("strategy.max_gaussians", "mcmc") in names
+    assert ("strategy.max_gaussians", "default") in names
+    assert ("strategy.max_gaussians", "mcmc") in names
     assert ("train.steps", "") in names
     for key in Config.model_fields["strategy"].get_default().model_dump():
         assert any(name == f"strategy.{key}" for name, _ in names)
@@ -21,7 +22,8 @@ def test_every_key_of_every_section_is_there() -> None:
 
 def test_known_rows() -> None:
     rows = {(key.name, key.kind): key for key in config_keys()}
-    assert rows["data.root", ""].default == "" and rows["data.root", ""].allowed == "a path"
+    assert rows["data.root", ""].default == ""
+    assert rows["data.root", ""].allowed == "a path"
     assert rows["strategy.kind", ""].allowed == "one of default, mcmc"
     assert rows["train.ssim_weight", ""].allowed == "a number >= 0 and <= 1"
     assert rows["data.longest_side", ""].allowed == "an integer >= 1 or null"

@@ -63,10 +63,12 @@ void seen_rows_arrays(Array<const float, nb::ndim<2>> grads, Array<bool, nb::ndi
   seen_rows(from, num_rows, row_size, to, num_threads);
 }
 
-// Returns whether the allocator took the settings.
-bool keep_freed_memory(int bytes) {
+// Returns whether the allocator took the settings. A large M_MMAP_THRESHOLD would say it more directly, but glibc refuses
+// more than 32 MiB; no mapped blocks at all is what it does accept.
+bool keep_freed_memory() {
 #if defined(__GLIBC__)
-  return mallopt(M_MMAP_THRESHOLD, bytes) == 1 && mallopt(M_TRIM_THRESHOLD, bytes) == 1;
+  constexpr int kNever = -1;
+  return mallopt(M_MMAP_MAX, 0) == 1 && mallopt(M_TRIM_THRESHOLD, kNever) == 1;
 #else
   return false;
 #endif
@@ -84,8 +86,8 @@ void bind_train(nb::module_& module) {
              "Adam step on (N, C) arrays in place; the number of rows skipped for a non-finite gradient.");
   module.def("seen_rows", seen_rows_arrays, nb::arg("grads").noconvert(), nb::arg("seen").noconvert(),
              nb::arg("num_threads"), "Writes which rows of (N, C) gradients have an element other than zero.");
-  module.def("keep_freed_memory", keep_freed_memory, nb::arg("bytes"),
-             "Lets the allocator reuse freed blocks up to `bytes` instead of returning them to the system.");
+  module.def("keep_freed_memory", keep_freed_memory,
+             "Lets the allocator reuse freed blocks of any size instead of returning them to the system.");
 }
 
 }  // namespace dyngs

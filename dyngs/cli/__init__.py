@@ -59,7 +59,7 @@ def _dispatch(arguments: list[str]) -> int:
     return parsed.run(parsed)
 
 
-class _Parser(argparse.ArgumentParser):
+class Parser(argparse.ArgumentParser):
     """A parser whose complaints are one line."""
 
     def error(self, message: str) -> NoReturn:
@@ -68,7 +68,9 @@ class _Parser(argparse.ArgumentParser):
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    parser = _Parser(prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU.")
+    parser: argparse.ArgumentParser = Parser(
+        prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU."
+    )
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for module in (demo, train, evaluate, render, export, data):

@@ -16,7 +16,7 @@ _EPILOG = """\
 examples:
   dyngs render runs/bench --out pictures                          the test views and a contact sheet
   dyngs render runs/bench --out frames --path orbit --video orbit.mp4
-  dyngs render splats.ply --path spiral --video spiral.mp4 --up -y --size 1280x720
+  dyngs render splats.ply --path spiral --video spiral.mp4 --up=-y --size 1280x720
 """
 
 
@@ -41,7 +41,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--alpha", action="store_true", help="write opacity too")
     parser.add_argument("--size", type=_size, metavar="WxH", help="of the frames of a path, in pixels")
     parser.add_argument("--background", choices=("white", "black"), help="of a path (default: that of training)")
-    parser.add_argument("--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="z", help="of a .ply (default z)")
+    parser.add_argument(
+        "--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="z", help="of a .ply; --up=-y suits many COLMAP ones"
+    )
     parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
     parser.set_defaults(run=run)
 

@@ -72,6 +72,7 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
     with whole_file(path) as temporary:
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:
+            oiio.geterror()  # fetched, or it would be printed when the program ends
             raise DyngsError(f"cannot write {path}: no format has the suffix '{path.suffix}' (use .png or .exr)")
         written = output.open(str(temporary), spec) and output.write_image(np.ascontiguousarray(pixels))
         problem = output.geterror()

@@ -102,9 +102,7 @@ def _column_rates(lr: float | Tensor, row_size: int, param: Tensor) -> Tensor:
     return rates.contiguous()
 
 
-def _check(
-    param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rows: Tensor | None, step: int
-) -> None:
+def _check(param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rows: Tensor | None, step: int) -> None:
     if param.ndim == 0:
         raise DyngsError("Adam: the parameter must have at least one dimension, got a scalar")
     for name, x in (("grad", grad), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):

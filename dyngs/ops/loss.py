@@ -22,12 +22,12 @@ SSIM_SIGMA = 1.5
 
 
 def l1_ssim_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
-    """The training loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)`` as a scalar, differentiable in ``rendered``.
+    """The training loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)``, a scalar, differentiable in ``rendered``.
 
     L1 is the mean of ``|x - y|``; SSIM is the mean over pixels and channels of the SSIM map with an 11x11 Gaussian
-    window of sigma 1.5, zero padding and data range 1, as in 3DGS. With a mask both pictures are multiplied by it first,
-    and both means are weighted by it: ``sum(m |x - y|) / (3 sum m)`` and ``sum(m SSIM(m x, m y)) / (3 sum m)``. A mask that
-    is zero everywhere gives a loss of 0.
+    window of sigma 1.5, zero padding and data range 1, as in 3DGS. With a mask both pictures are multiplied by it, and
+    both means are weighted by it: ``sum(m |x - y|) / (3 sum m)`` and ``sum(m SSIM(m x, m y)) / (3 sum m)``; a mask that is
+    zero everywhere gives a loss of 0. Only first derivatives exist in float32 on the CPU.
 
     Args:
         rendered: (H, W, 3) picture x, any strides. Half precision is computed in float32.
@@ -51,9 +51,7 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     return 1 - l1_ssim_loss(a, b, ssim_weight=1.0)
 
 
-def reference_l1_ssim(
-    rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None
-) -> Tensor:
+def reference_l1_ssim(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
     """The value of `l1_ssim_loss` in plain torch: any floating dtype and device, differentiable in every tensor."""
     weight = torch.ones_like(rendered[..., 0]) if mask is None else mask
     total = 3 * weight.sum()
@@ -124,13 +122,13 @@ def _(
     return rendered.new_empty(()), gradient
 
 
-def _save_gradient(ctx, inputs, output) -> None:  # noqa: ANN001 (torch's untyped hooks)
+def _save_gradient(ctx, inputs, output) -> None:
     _, gradient = output
     ctx.mark_non_differentiable(gradient)
     ctx.save_for_backward(gradient)
 
 
-def _scale_gradient(ctx, grad_loss: Tensor, _: Tensor | None):  # noqa: ANN001, ANN202
+def _scale_gradient(ctx, grad_loss: Tensor, _: Tensor | None):
     (gradient,) = ctx.saved_tensors
     if gradient.numel() == 0:
         raise RuntimeError("dyngs::l1_ssim was called without with_gradient, so it has no gradient")

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from dyngs.ops.native import core
 
-LARGEST_KEPT_BYTES = 1 << 30
-SMALLER_LIMIT_BYTES = 32 << 20
-"""What older versions of glibc accept at most."""
-
 
 def keep_freed_memory() -> bool:
-    """Whether freed blocks are now kept for reuse; call it once, before training.
+    """Whether freed blocks are from now on kept for reuse; call it once, before training.
 
-    Why: by default glibc takes a large block (32 MiB and up, in a fresh process 128 KiB and up) from the system on each
-    allocation and gives it back on each release, and the kernel clears every page of it again at first touch. A training
-    step allocates and frees pictures and gradients of that size, so that part of its time goes into page faults.
+    Why: by default glibc takes a block of 32 MiB or more (in a fresh process 128 KiB or more) from the system at each
+    allocation and gives it back at each release, and the kernel clears all its pages again at first touch. A training
+    step allocates and frees pictures and gradients of such sizes, so that much of its time goes into page faults.
 
-    What it costs: memory once used stays with the process, so its resident size remains at the peak, and blocks of very
-    different sizes may leave gaps that count too. Programs that embed dyngs and care may leave it out: results do not
-    change. Without glibc (macOS, musl) nothing happens and the answer is False.
+    What it costs: memory once used stays with the process until it ends, so that its resident size remains at the peak,
+    and gaps between blocks of different sizes add to it. Results do not change, so programs that embed dyngs and have
+    other plans for their memory may leave it out. Without glibc (macOS, musl) nothing happens and the answer is False.
     """
-    return core.keep_freed_memory(LARGEST_KEPT_BYTES) or core.keep_freed_memory(SMALLER_LIMIT_BYTES)
+    return core.keep_freed_memory()

@@ -17,6 +17,8 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 
 SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
+MAX_LOG_VARIANCE = 60.0
+"""Random offsets stay finite whatever the scales."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,8 @@ class DefaultDensifier:
         is_new[: len(kept)] = False
         means, log_scales = parameters.means[source], parameters.log_scales[source]
         children = slice(len(kept) + len(cloned), None)
-        noise = torch.randn((2 * len(split), 3), generator=generator) * log_scales[children].exp()
+        sizes = log_scales[children].clamp_max(MAX_LOG_VARIANCE / 2).exp()
+        noise = torch.randn((2 * len(split), 3), generator=generator) * sizes
         means[children] += rotate(parameters.quats[source[children]], noise)
         log_scales[children] -= math.log(SPLIT_SHRINK)
         return EditResult(TopologyEdit(source, is_new), {"means": means, "log_scales": log_scales})

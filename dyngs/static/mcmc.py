@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dyngs.config import McmcStrategy
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.static.densify import DensifySchedule, EditResult, rotate
+from dyngs.static.densify import MAX_LOG_VARIANCE, DensifySchedule, EditResult, rotate
 
 MAX_COPIES = 50
 NOISE_STEEPNESS = 100.0
@@ -84,7 +84,9 @@ class McmcDensifier:
             x.detach()[rows] for x in (parameters.quats, parameters.log_scales, parameters.logit_opacities)
         )
         eta = torch.randn((len(rows), 3), generator=generator)
-        shake = rotate(quats, rotate(quats * torch.tensor([1.0, -1.0, -1.0, -1.0]), eta) * (2 * log_scales).exp())
+        variances = (2 * log_scales).clamp_max(MAX_LOG_VARIANCE).exp()
+        inverse = quats * torch.tensor([1.0, -1.0, -1.0, -1.0])
+        shake = rotate(quats, rotate(inverse, eta) * variances)
         opacities = torch.nn.functional.logsigmoid(logits).exp()  # unlike sigmoid, the same on any number of threads
         weight = 1 / (1 + (NOISE_STEEPNESS * (opacities - NOISE_OPACITY)).exp())
         parameters.means.detach().index_add_(0, rows, shake * (weight * (self.options.noise * lr_means))[:, None])

@@ -104,4 +104,6 @@ def _densifier(config: Config, background: str, extent: float) -> Densifier:
 def _render_options(config: Config) -> RenderOptions:
     strategy, model = config.strategy, config.model
     absgrad = not isinstance(strategy, McmcStrategy) and strategy.absgrad
-    return RenderOptions(near=model.near, eps2d=model.eps2d, mode=model.rasterize_mode, absgrad=absgrad)
+    return RenderOptions(
+        near=model.near, eps2d=model.eps2d, mode=model.rasterize_mode, absgrad=absgrad, nonfinite="trust"
+    )

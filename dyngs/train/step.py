@@ -86,7 +86,7 @@ class Trainer:
         """Train on one picture.
 
         Raises:
-            DyngsError: the loss is not finite; says which term, and changes nothing.
+            DyngsError: the loss is not finite; says which term, and leaves the parameters as they were.
         """
         config, step = self.config, self.done + 1
         picture = self.pictures[self.sampler.next(self.generator)]

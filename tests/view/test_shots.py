@@ -36,7 +36,8 @@ def test_resizing_keeps_corners_inside_and_pixels_square(old: tuple[int, int], n
     seen = (cameras.intrinsics[0] @ torch.linalg.inv(intrinsics[0]) @ corners.T).T[:, :2]
     slack = 1e-3 * max(*old, *new)  # float32
     assert (cameras.width, cameras.height) == new
-    assert (seen >= -slack).all() and (seen <= torch.tensor(new) + slack).all()
+    assert (seen >= -slack).all()
+    assert (seen <= torch.tensor(new) + slack).all()
     assert cameras.intrinsics[0, 0, 0] == pytest.approx(float(cameras.intrinsics[0, 1, 1]))
     middle = seen.mean(dim=0)
     assert torch.allclose(middle, torch.tensor(new) / 2, atol=slack)
@@ -58,7 +59,8 @@ def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) 
         assert inside.float().mean() > 0.9
         picture_up = -shot.cameras.cam_from_world[i, 1, :3].numpy()
         assert picture_up @ axis > 0.5
-    assert shot.options.mode is RasterizeMode.ANTIALIASED and shot.options.eps2d == 0.1
+    assert shot.options.mode is RasterizeMode.ANTIALIASED
+    assert shot.options.eps2d == 0.1
     assert torch.equal(shot.background, torch.zeros(3))
 
 

@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_captures import opengl_pose
+
+from dyngs.data.capture import Capture, PointCloud, View
+from dyngs.data.poses import cam_from_opengl, camera_center, checked_pose, inverse_rigid
+from dyngs.data.rebase import rebase, shifted
+from dyngs.errors import DyngsError
+
+
+def capture_at(offset: np.ndarray, radius: float = 4.0, count: int = 6) -> Capture:
+    poses = [opengl_pose(0.5 * i, radius) for i in range(count)]
+    for pose in poses:
+        pose[:3, 3] += offset
+    views = tuple(
+        View(str(i), Path(f"{i}.png"), cam_from_opengl(pose), np.eye(3), 1, 1) for i, pose in enumerate(poses)
+    )
+    points = PointCloud(offset + np.arange(6.0).reshape(2, 3), np.zeros((2, 3), np.uint8))
+    return Capture(Path(), "colmap", {"train": views[:-1], "test": views[-1:]}, points)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.floats(-5e6, 5e6), min_size=3, max_size=3).filter(lambda xs: np.linalg.norm(xs) > 2e5))
+def test_far_world_comes_to_the_origin_and_back(offset: list[float]) -> None:
+    """The scene keeps its shape to 1e-8 units (float64 at 1e6 has 1e-10), and adding the offset restores it."""
+    before = capture_at(np.array(offset))
+    after = rebase(before)
+    assert np.linalg.norm(after.world_offset - offset) < 10
+    near = capture_at(np.zeros(3))
+    for split in ("train", "test"):
+        for moved, view in zip(after.splits[split], near.splits[split], strict=True):
+            center = camera_center(moved.cam_from_world) + after.world_offset - offset
+            np.testing.assert_allclose(center, camera_center(view.cam_from_world), atol=1e-8)
+            np.testing.assert_array_equal(moved.cam_from_world[:3, :3], view.cam_from_world[:3, :3])
+    assert after.points is not None
+    assert before.points is not None
+    np.testing.assert_allclose(after.points.xyz + after.world_offset, before.points.xyz, rtol=0, atol=1e-8)
+
+
+def test_projection_does_not_change() -> None:
+    before = capture_at(np.array([1e6, -2e6, 3e5]))
+    after = rebase(before)
+    assert before.points is not None
+    assert after.points is not None
+    for old, new in zip(before.splits["train"], after.splits["train"], strict=True):
+        wanted = before.points.xyz @ old.cam_from_world[:3, :3].T + old.cam_from_world[:3, 3]
+        found = after.points.xyz @ new.cam_from_world[:3, :3].T + new.cam_from_world[:3, 3]
+        np.testing.assert_allclose(found, wanted, atol=1e-8)
+
+
+@pytest.mark.parametrize(("distance", "radius", "moves"), [(5.0, 4.0, False), (9e4, 40, False), (9e4, 4.0, True)])
+def test_only_far_scenes_move(distance: float, radius: float, moves: bool) -> None:
+    capture = capture_at(np.array([distance, 0, 0]), radius)
+    assert (rebase(capture) is not capture) == moves
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-9])
+def test_fixed_camera_stays_where_it_is(jitter: float) -> None:
+    """All centres coincide, so the spread is no measure; random points around the origin must stay in its view."""
+    capture = capture_at(np.array([3.0, 0, 0]), jitter)
+    assert rebase(capture) is capture
+
+
+def test_offsets_add_up() -> None:
+    twice = shifted(shifted(capture_at(np.zeros(3)), np.array([1.0, 2, 3])), np.array([10.0, 0, 0]))
+    np.testing.assert_array_equal(twice.world_offset, [11, 2, 3])
+
+
+def test_inverse_of_a_pose() -> None:
+    pose = opengl_pose(1.1)
+    np.testing.assert_allclose(inverse_rigid(pose) @ pose, np.eye(4), atol=1e-14)
+
+
+def test_checked_pose_reports_how_far_off_it_was() -> None:
+    pose = opengl_pose(1.1)
+    pose[:3, :3] *= 1 + 1e-4
+    repaired, error = checked_pose(pose[:3], "here")
+    assert error == pytest.approx(2e-4, rel=1e-3)
+    np.testing.assert_allclose(repaired, opengl_pose(1.1), atol=1e-12)
+
+
+def test_infinite_position_is_an_error() -> None:
+    pose = opengl_pose(0.0)
+    pose[1, 3] = np.inf
+    with pytest.raises(DyngsError, match="here: the pose holds NaN"):
+        checked_pose(pose, "here")
