@@ -75,7 +75,9 @@ class DefaultStrategy(Section):
 
     kind: Literal["default"] = "default"
     absgrad: bool = False
-    grad_threshold: Positive = Field(2e-4, description="mean over visible views, NDC units (8e-4 suits absgrad)")
+    grad_threshold: Positive = Field(
+        default=2e-4, description="mean over visible views, NDC units (8e-4 suits absgrad)"
+    )
     dense_fraction: Positive = Field(
         default=0.01, description="of the extent: smaller ones are cloned, larger ones split"
     )
@@ -108,7 +110,7 @@ class McmcStrategy(Section):
 class OptimConfig(Section):
     """Adam and its learning rates (methods: 3DGS)."""
 
-    lr_means: Positive = Field(1.6e-4, description="times the scene extent")
+    lr_means: Positive = Field(default=1.6e-4, description="times the scene extent")
     lr_means_final: Positive = 1.6e-6
     lr_sh_dc: Positive = 2.5e-3
     lr_sh_rest: Positive = 1.25e-4

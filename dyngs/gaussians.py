@@ -48,8 +48,7 @@ class Gaussians:
     @property
     def opacities(self) -> Tensor:
         """(N,) in [0, 1]."""
-        # Not torch.sigmoid: its last bit depends on the number of threads.
-        return torch.nn.functional.logsigmoid(self.logit_opacities).exp()
+        return self.logit_opacities.sigmoid()
 
     @property
     def base_rgb(self) -> Tensor:

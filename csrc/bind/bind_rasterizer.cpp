@@ -183,17 +183,17 @@ nb::ndarray<nb::numpy, T, nb::ndim<1>> release_vector(std::vector<T>&& vector) {
 }
 
 using EntryArrays =
-    std::tuple<Array<const int64_t>, Array<const int64_t>, Array<const int32_t>, Array<const int32_t>>;
+    std::tuple<Array<const int64_t>, Array<const int32_t>, Array<const int32_t>, Array<const int32_t>>;
 
 template <class S>
 Entries checked_entries(const EntryArrays& arrays, const Splats<S>& s) {
-  const auto& [tile_offsets, slot_offsets, gaussians, slots] = arrays;
+  const auto& [tile_offsets, slot_ranges, gaussians, slots] = arrays;
   const int64_t tiles = int64_t{(s.width + kTile - 1) / kTile} * ((s.height + kTile - 1) / kTile);
   expect(tile_offsets, s.num_views * tiles + 1, "tile_offsets");
-  expect(slot_offsets, s.num_views * s.num_gaussians + 1, "slot_offsets");
+  expect(slot_ranges, 2 * s.num_views * s.num_gaussians, "slot_ranges");
   const int64_t count = static_cast<int64_t>(gaussians.size());
   expect(slots, count, "slots");
-  return {tile_offsets.data(), slot_offsets.data(), gaussians.data(), slots.data(), count};
+  return {tile_offsets.data(), slot_ranges.data(), gaussians.data(), slots.data(), count};
 }
 
 template <class S>
@@ -213,7 +213,7 @@ void bind_binning(nb::module_& module, const char* arrays_name) {
                  binning = bin_tiles(s, max_entries);
                }
                return std::make_tuple(release_vector(std::move(binning.tile_offsets)),
-                                      release_vector(std::move(binning.slot_offsets)),
+                                      release_vector(std::move(binning.slot_ranges)),
                                       release_vector(std::move(binning.gaussians)),
                                       release_vector(std::move(binning.slots)));
              });

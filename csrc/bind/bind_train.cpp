@@ -63,8 +63,8 @@ void seen_rows_arrays(Array<const float, nb::ndim<2>> grads, Array<bool, nb::ndi
   seen_rows(from, num_rows, row_size, to, num_threads);
 }
 
-// Returns whether the allocator took the settings. A large M_MMAP_THRESHOLD would say it more directly, but glibc refuses
-// more than 32 MiB; no mapped blocks at all is what it does accept.
+// Returns whether the allocator took the settings. No mapped blocks at all, because M_MMAP_THRESHOLD has a documented limit
+// of 32 MiB.
 bool keep_freed_memory() {
 #if defined(__GLIBC__)
   constexpr int kNever = -1;

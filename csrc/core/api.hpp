@@ -69,9 +69,9 @@ struct Harmonics {
 // Where each Gaussian meets each tile, sorted by (view, tile, depth, index).
 struct Binning {
   std::vector<int64_t> tile_offsets;   // (V * tiles + 1)
-  std::vector<int64_t> slot_offsets;   // (V * N + 1): slots of one Gaussian are contiguous
+  std::vector<int32_t> slot_ranges;    // (V * N, 2) begin and end: the slots of one Gaussian are contiguous
   std::vector<int32_t> gaussians;      // (E,) view * N + gaussian
-  std::vector<int32_t> slots;          // (E,) place of the entry in Gaussian order
+  std::vector<int32_t> slots;          // (E,) the entry's own place in a buffer ordered by Gaussian
 };
 
 template <class S>
@@ -91,7 +91,7 @@ struct Splats {
 
 struct Entries {
   const int64_t* tile_offsets;
-  const int64_t* slot_offsets;
+  const int32_t* slot_ranges;
   const int32_t* gaussians;
   const int32_t* slots;
   int64_t count;

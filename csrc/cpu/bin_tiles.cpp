@@ -1,6 +1,7 @@
 // Which Gaussian meets which 16x16 tile, front to back. Exact: a tile is listed only if some pixel row of it is crossed
-// by the ellipse where alpha >= alpha_min. One span of tile columns per Gaussian and tile row is computed once; counting
-// and emitting both read the spans, so they cannot disagree.
+// by the ellipse where alpha >= alpha_min. The visible Gaussians are sorted by depth first; then everything streams in that
+// order. One span of tile columns per Gaussian and tile row is computed once; counting and emitting both read the spans,
+// so they cannot disagree.
 #include <bit>
 #include <cmath>
 #include <stdexcept>
@@ -13,8 +14,9 @@
 namespace dyngs {
 namespace {
 
-constexpr int64_t kBlock = 2048;  // Gaussians per work item
 constexpr int kRadixBits = 11, kBuckets = 1 << kRadixBits;
+// Below these sizes starting threads costs more than they save.
+constexpr int64_t kParallelSort = 1 << 18, kParallelSpans = 1 << 11;
 
 struct Span {
   int32_t begin, end;  // tile columns [begin, end)
@@ -57,7 +59,7 @@ Ellipse<S> make_ellipse(const Splats<S>& s, int64_t row) {
   e.t = S(2) * std::log(s.opacities[row] / s.alpha_min);
   const S root = std::sqrt(e.t);
   e.half_height = root / e.v;
-  e.tip = -e.w * root / (e.v * std::hypot(e.w, e.v));
+  e.tip = -e.w * root / (e.v * std::sqrt(e.w * e.w + e.v * e.v));
   return e;
 }
 
@@ -81,51 +83,10 @@ Span row_span(const Ellipse<S>& e, int tile_row, const Grid& grid) {
 
 template <class S>
 Rows tile_rows(const Splats<S>& s, int64_t row, const Grid& grid) {
-  if (s.radii[2 * row] <= 0 || !(s.opacities[row] > s.alpha_min)) return {0, 0};
+  if (!(s.opacities[row] > s.alpha_min)) return {0, 0};
   const S y = s.means2d[2 * row + 1], r = static_cast<S>(s.radii[2 * row + 1]);
   const Span span = tiles_between(y - r, y + r, grid.height, grid.rows);
   return {span.begin, span.end};
-}
-
-struct Spans {
-  std::vector<int64_t> offsets;  // (V N + 1) into spans
-  std::vector<int32_t> first_row;
-  std::vector<Span> spans;
-};
-
-int64_t prefix_sum(std::vector<int64_t>& counts) {
-  int64_t total = 0;
-  for (auto& c : counts) total += std::exchange(c, total);
-  return total;
-}
-
-template <class S>
-Spans find_spans(const Splats<S>& s, const Grid& grid, std::vector<int64_t>& tile_counts) {
-  const int64_t total = s.num_views * s.num_gaussians;
-  Spans out;
-  out.offsets.assign(total + 1, 0);
-  out.first_row.resize(total);
-  parallel_for(total, kBlock, s.threads, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      const Rows rows = tile_rows(s, i, grid);
-      out.first_row[i] = rows.begin;
-      out.offsets[i] = rows.end - rows.begin;
-    }
-  });
-  out.spans.resize(prefix_sum(out.offsets));
-  parallel_for(total, kBlock, s.threads, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      const int64_t rows = out.offsets[i + 1] - out.offsets[i];
-      if (rows == 0) continue;
-      const Ellipse<S> e = make_ellipse(s, i);
-      for (int64_t r = 0; r < rows; ++r) {
-        const Span span = row_span(e, static_cast<int>(out.first_row[i] + r), grid);
-        out.spans[out.offsets[i] + r] = span;
-        tile_counts[i] += span.end - span.begin;
-      }
-    }
-  });
-  return out;
 }
 
 template <class S>
@@ -139,22 +100,22 @@ struct DepthKey<double> {
   using Bits = uint64_t;
 };
 
-// Indices of the visible Gaussians of one view, nearest first, ties by index: a stable radix sort on the bits of the
-// (positive) depth.
+// Rows (view * N + index) of the visible Gaussians of one view, nearest first, ties by index: a stable radix sort on the
+// bits of the (positive) depth.
 template <class S>
-std::vector<int32_t> sort_by_depth(const Splats<S>& s, int64_t first, const std::vector<int64_t>& slot_offsets) {
+std::vector<int32_t> sort_by_depth(const Splats<S>& s, int64_t first) {
   using Bits = typename DepthKey<S>::Bits;
   struct Item {
     Bits key;
-    int32_t index;
+    int32_t row;
   };
   std::vector<Item> items, other;
-  for (int64_t i = 0; i < s.num_gaussians; ++i)
-    if (slot_offsets[first + i + 1] > slot_offsets[first + i])
-      items.push_back({std::bit_cast<Bits>(s.depths[first + i]), static_cast<int32_t>(i)});
+  items.reserve(s.num_gaussians);
+  for (int64_t row = first; row < first + s.num_gaussians; ++row)
+    if (s.radii[2 * row] > 0) items.push_back({std::bit_cast<Bits>(s.depths[row]), static_cast<int32_t>(row)});
   other.resize(items.size());
   const int64_t n = static_cast<int64_t>(items.size());
-  const int parts = n > 1 << 14 ? s.threads : 1;
+  const int parts = n > kParallelSort ? s.threads : 1;
   std::vector<int64_t> histogram(static_cast<size_t>(parts) * kBuckets);
   for (int shift = 0; shift < static_cast<int>(8 * sizeof(Bits)); shift += kRadixBits) {
     std::fill(histogram.begin(), histogram.end(), 0);
@@ -172,47 +133,89 @@ std::vector<int32_t> sort_by_depth(const Splats<S>& s, int64_t first, const std:
     items.swap(other);
   }
   std::vector<int32_t> order(items.size());
-  for (int64_t i = 0; i < n; ++i) order[i] = items[i].index;
+  for (int64_t i = 0; i < n; ++i) order[i] = items[i].row;
   return order;
 }
 
-// Visits every (tile, slot) of the Gaussian at `row`, in slot order.
-template <class F>
-void for_each_tile(const Spans& spans, const Grid& grid, int64_t row, int64_t slot, F&& f) {
-  for (int64_t r = spans.offsets[row]; r < spans.offsets[row + 1]; ++r) {
-    const int64_t tile_row = spans.first_row[row] + (r - spans.offsets[row]);
-    for (int32_t c = spans.spans[r].begin; c < spans.spans[r].end; ++c) f(tile_row * grid.columns + c, slot++);
+// The spans of one contiguous part of a view's depth order, and how many entries they make per tile.
+struct Part {
+  struct Splat {
+    int32_t row, first_row, num_rows;
+  };
+  std::vector<Splat> splats;
+  std::vector<Span> spans;
+  std::vector<int64_t> per_tile;  // counts, then the places where this part writes next
+  int64_t entries = 0;
+};
+
+template <class S>
+Part find_spans(const Splats<S>& s, const Grid& grid, const int32_t* order, int64_t count) {
+  constexpr int64_t kAhead = 8;
+  Part part;
+  part.splats.reserve(count);
+  part.spans.reserve(2 * count);
+  part.per_tile.assign(int64_t{grid.columns} * grid.rows, 0);
+  for (int64_t k = 0; k < count; ++k) {
+    if (k + kAhead < count) {  // depth order jumps through memory
+      __builtin_prefetch(s.means2d + 2 * order[k + kAhead]);
+      __builtin_prefetch(s.factors + 3 * order[k + kAhead]);
+      __builtin_prefetch(s.opacities + order[k + kAhead]);
+      __builtin_prefetch(s.radii + 2 * order[k + kAhead]);
+    }
+    const int64_t row = order[k];
+    const Rows rows = tile_rows(s, row, grid);
+    if (rows.begin >= rows.end) continue;
+    part.splats.push_back({order[k], rows.begin, rows.end - rows.begin});
+    const Ellipse<S> e = make_ellipse(s, row);
+    for (int32_t r = rows.begin; r < rows.end; ++r) {
+      const Span span = row_span(e, r, grid);
+      part.spans.push_back(span);
+      part.entries += span.end - span.begin;
+      for (int32_t c = span.begin; c < span.end; ++c) ++part.per_tile[int64_t{r} * grid.columns + c];
+    }
+  }
+  return part;
+}
+
+// Turns the parts' counts into the places where each part writes in each tile's list: parts in depth order.
+void assign_places(std::vector<Part>& parts, int64_t* tile_offsets, int64_t start) {
+  const size_t tiles = parts[0].per_tile.size();
+  for (size_t t = 0; t < tiles; ++t) {
+    tile_offsets[t] = start;
+    for (Part& part : parts) start += std::exchange(part.per_tile[t], start);
+  }
+  tile_offsets[tiles] = start;
+}
+
+void emit(Part& part, const Grid& grid, int64_t slot, Binning& out) {
+  const Span* span = part.spans.data();
+  for (const Part::Splat& splat : part.splats) {
+    out.slot_ranges[2 * int64_t{splat.row}] = static_cast<int32_t>(slot);
+    for (int32_t r = splat.first_row; r < splat.first_row + splat.num_rows; ++r, ++span)
+      for (int32_t c = span->begin; c < span->end; ++c) {
+        const int64_t place = part.per_tile[int64_t{r} * grid.columns + c]++;
+        out.gaussians[place] = splat.row;
+        out.slots[place] = static_cast<int32_t>(slot++);
+      }
+    out.slot_ranges[2 * int64_t{splat.row} + 1] = static_cast<int32_t>(slot);
   }
 }
 
-// Appends the Gaussians in depth order to their tiles' lists: a counting sort by tile, parallel over depth ranges.
-void fill_view(const Spans& spans, const Grid& grid, int64_t first, const std::vector<int32_t>& order, int threads,
-               int64_t first_tile, Binning& out) {
-  const int64_t tiles = int64_t{grid.columns} * grid.rows, n = static_cast<int64_t>(order.size());
-  const int parts = n > 1 << 12 ? threads : 1;
-  std::vector<int64_t> cursor(static_cast<size_t>(parts) * tiles, 0);
-  parallel_parts(n, parts, [&](int part, int64_t begin, int64_t end) {
-    int64_t* c = cursor.data() + part * tiles;
-    for (int64_t i = begin; i < end; ++i)
-      for_each_tile(spans, grid, first + order[i], 0, [&](int64_t tile, int64_t) { ++c[tile]; });
+template <class S>
+std::vector<Part> bin_view(const Splats<S>& s, const Grid& grid, int64_t view) {
+  const std::vector<int32_t> order = sort_by_depth(s, view * s.num_gaussians);
+  const int64_t n = static_cast<int64_t>(order.size());
+  std::vector<Part> parts(n > kParallelSpans ? s.threads : 1);
+  parallel_parts(n, static_cast<int>(parts.size()), [&](int p, int64_t begin, int64_t end) {
+    parts[p] = find_spans(s, grid, order.data() + begin, end - begin);
   });
-  int64_t sum = out.tile_offsets[first_tile];
-  for (int64_t t = 0; t < tiles; ++t) {
-    out.tile_offsets[first_tile + t] = sum;
-    for (int p = 0; p < parts; ++p) sum += std::exchange(cursor[p * tiles + t], sum);
-  }
-  out.tile_offsets[first_tile + tiles] = sum;
-  parallel_parts(n, parts, [&](int part, int64_t begin, int64_t end) {
-    int64_t* c = cursor.data() + part * tiles;
-    for (int64_t i = begin; i < end; ++i) {
-      const int64_t row = first + order[i];
-      for_each_tile(spans, grid, row, out.slot_offsets[row], [&](int64_t tile, int64_t slot) {
-        const int64_t place = c[tile]++;
-        out.gaussians[place] = static_cast<int32_t>(row);
-        out.slots[place] = static_cast<int32_t>(slot);
-      });
-    }
-  });
+  return parts;
+}
+
+[[noreturn]] void refuse(int64_t gaussians, int64_t views, const Grid& grid, int64_t entries, int64_t limit) {
+  throw std::length_error(std::to_string(gaussians) + " Gaussians in " + std::to_string(views) + " view(s) of " +
+                          std::to_string(grid.width) + "x" + std::to_string(grid.height) + " px meet " +
+                          std::to_string(entries) + " tiles, more than the limit of " + std::to_string(limit));
 }
 
 }  // namespace
@@ -220,21 +223,27 @@ void fill_view(const Spans& spans, const Grid& grid, int64_t first, const std::v
 template <class S>
 Binning bin_tiles(const Splats<S>& s, int64_t max_entries) {
   const Grid grid{s.width, s.height, (s.width + kTile - 1) / kTile, (s.height + kTile - 1) / kTile};
+  const int64_t tiles = int64_t{grid.columns} * grid.rows;
+  std::vector<std::vector<Part>> views;
+  int64_t total = 0;
+  for (int64_t v = 0; v < s.num_views; ++v) {
+    views.push_back(bin_view(s, grid, v));
+    for (const Part& part : views.back()) total += part.entries;
+  }
+  if (total > max_entries) refuse(s.num_gaussians, s.num_views, grid, total, max_entries);
   Binning out;
-  out.slot_offsets.assign(s.num_views * s.num_gaussians + 1, 0);
-  const Spans spans = find_spans(s, grid, out.slot_offsets);
-  const int64_t total = prefix_sum(out.slot_offsets);
-  if (total > max_entries)
-    throw std::length_error(std::to_string(s.num_gaussians) + " Gaussians in " + std::to_string(s.num_views) +
-                            " view(s) of " + std::to_string(s.width) + "x" + std::to_string(s.height) + " px meet " +
-                            std::to_string(total) + " tiles, more than the limit of " + std::to_string(max_entries));
   out.gaussians.resize(total);
   out.slots.resize(total);
-  const int64_t tiles = int64_t{grid.columns} * grid.rows;
+  out.slot_ranges.assign(2 * s.num_views * s.num_gaussians, 0);
   out.tile_offsets.assign(s.num_views * tiles + 1, 0);
+  int64_t slot = 0;
   for (int64_t v = 0; v < s.num_views; ++v) {
-    const int64_t first = v * s.num_gaussians;
-    fill_view(spans, grid, first, sort_by_depth(s, first, out.slot_offsets), s.threads, v * tiles, out);
+    std::vector<Part>& parts = views[v];
+    assign_places(parts, out.tile_offsets.data() + v * tiles, slot);
+    std::vector<int64_t> first_slots;
+    for (const Part& part : parts) first_slots.push_back(std::exchange(slot, slot + part.entries));
+    const int count = static_cast<int>(parts.size());
+    parallel_parts(count, count, [&](int p, int64_t, int64_t) { emit(parts[p], grid, first_slots[p], out); });
   }
   return out;
 }

@@ -166,7 +166,7 @@ template <class S, int D>
 void block_backward(const Splats<S>& s, const Layout& layout, S px, S py, int32_t chunk_begin, int listed,
                     BlockPixels<S>& pixels, Scratch<S>& scratch) {
   using P = Packet<S>;
-  const int channels = D == 0 ? layout.channels : D;
+  const int channels = D == kDynamic ? layout.channels : D;
   const LaneOffsets<S> lane;
   const P alpha_max(s.alpha_max), one(S(1)), zero(S(0));
   const P stop = relative_stop(pixels, chunk_begin);
@@ -180,8 +180,9 @@ void block_backward(const Splats<S>& s, const Layout& layout, S px, S py, int32_
     const Mask<S> drawn = (x >= pixels.threshold) & (P(static_cast<S>(i)) < stop);
     const P raw = exp2_of(x);
     const P alpha = select(drawn, min_of(raw, alpha_max), zero);
-    transmittance = transmittance / (one - alpha);  // alpha <= alpha_max < 1
-    const S* color = scratch.chunk.colors[i];
+    const P restore = one / (one - alpha);  // alpha <= alpha_max < 1; outside the chain of dependences
+    transmittance *= restore;
+    const S* color = scratch.chunk.template color<D>(i);
     P shade(S(0));
     for (int c = 0; c < channels; ++c) shade += P(color[c]) * pixels.grad[c];
     const P gap = shade - behind;
@@ -201,8 +202,11 @@ void block_backward(const Splats<S>& s, const Layout& layout, S px, S py, int32_
 template <class S>
 void store_chunk(const Layout& layout, const Entries& entries, int64_t begin, const Scratch<S>& scratch, S* slots) {
   const int fields = layout.fields(), packets = layout.packets();
-  for (int i = 0; i < scratch.chunk.count; ++i)
-    std::memcpy(slots + int64_t{entries.slots[begin + i]} * fields, scratch.sums + i * packets, fields * sizeof(S));
+  for (int i = 0; i < scratch.chunk.count; ++i) {
+    S* to = slots + int64_t{entries.slots[begin + i]} * fields;
+    const S* from = reinterpret_cast<const S*>(scratch.sums + i * packets);
+    for (int f = 0; f < fields; ++f) to[f] = from[f];
+  }
 }
 
 template <class S, int D>
@@ -218,7 +222,7 @@ void tile_backward(const Splats<S>& s, const Layout& layout, const Entries& entr
   for (int64_t at = begin + (end - begin - 1) / kChunk * kChunk; at >= begin; at -= kChunk) {
     const int count = static_cast<int>(std::min<int64_t>(kChunk, end - at));
     const int32_t chunk_begin = static_cast<int32_t>(at - begin);
-    load_chunk(s, entries, frame, at, count, scratch.chunk);
+    load_chunk<D>(s, entries, frame, at, count, scratch.chunk);
     std::fill(scratch.sums, scratch.sums + count * layout.packets(), Packet<S>(S(0)));
     for (int b = 0; b < kBlocks; ++b) {
       if (!(frame.inside >> b & 1) || pixels[b].last <= chunk_begin) continue;
@@ -263,7 +267,7 @@ void sum_slots(const Splats<S>& s, const Layout& layout, const Entries& entries,
   parallel_for(s.num_views * s.num_gaussians, 1024, s.threads, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       S sum[kMaxFields] = {};
-      for (int64_t k = entries.slot_offsets[i]; k < entries.slot_offsets[i + 1]; ++k)
+      for (int64_t k = entries.slot_ranges[2 * i]; k < entries.slot_ranges[2 * i + 1]; ++k)
         for (int f = 0; f < fields; ++f) sum[f] += slots[k * fields + f];
       write_gaussian(s, i, sum, layout, out);
     }
@@ -281,7 +285,7 @@ void rasterize_backward(const Splats<S>& s, const Entries& entries, const ImageG
     case 1: all_tiles_backward<S, 1>(s, layout, entries, image, slots.get()); break;
     case 3: all_tiles_backward<S, 3>(s, layout, entries, image, slots.get()); break;
     case 4: all_tiles_backward<S, 4>(s, layout, entries, image, slots.get()); break;
-    default: all_tiles_backward<S, 0>(s, layout, entries, image, slots.get());
+    default: all_tiles_backward<S, kDynamic>(s, layout, entries, image, slots.get());
   }
   sum_slots(s, layout, entries, slots.get(), out);
 }

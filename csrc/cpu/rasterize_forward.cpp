@@ -6,8 +6,6 @@
 namespace dyngs {
 namespace {
 
-constexpr int kDynamic = 0;  // number of channels known only at run time
-
 template <class S, int D>
 struct BlockState {
   Packet<S> transmittance, threshold;
@@ -53,7 +51,7 @@ void blend_block(const Splats<S>& s, const TileFrame<S>& frame, int block, int32
       next = select(full, state.transmittance, next);
     }
     state.transmittance = next;
-    const S* color = scratch.chunk.colors[i];
+    const S* color = scratch.chunk.template color<D>(i);
     for (int c = 0; c < channels; ++c) state.color[c] += weight * P(color[c]);
     if constexpr (kContributions) scratch.sums[i] += horizontal_sum(weight);
   }
@@ -93,7 +91,7 @@ void blend_tile(const Splats<S>& s, const Entries& entries, const Image<S>& imag
   Scratch<S> scratch;
   uint32_t open = frame.inside;
   for (int64_t at = begin; at < end && open != 0; at += kChunk) {
-    load_chunk(s, entries, frame, at, static_cast<int>(std::min<int64_t>(kChunk, end - at)), scratch.chunk);
+    load_chunk<D>(s, entries, frame, at, static_cast<int>(std::min<int64_t>(kChunk, end - at)), scratch.chunk);
     if constexpr (kContributions) std::fill(scratch.sums, scratch.sums + kChunk, S(0));
     for (int b = 0; b < kBlocks; ++b) {
       if (!(open >> b & 1)) continue;
@@ -123,7 +121,7 @@ void blend_with_contributions(const Splats<S>& s, const Entries& entries, const 
   blend_all<S, kDynamic, true>(s, entries, image, slot_sums.data());
   for (int64_t i = 0; i < s.num_views * s.num_gaussians; ++i) {
     S sum = 0;
-    for (int64_t k = entries.slot_offsets[i]; k < entries.slot_offsets[i + 1]; ++k) sum += slot_sums[k];
+    for (int64_t k = entries.slot_ranges[2 * i]; k < entries.slot_ranges[2 * i + 1]; ++k) sum += slot_sums[k];
     image.contributions[i] = sum;
   }
 }

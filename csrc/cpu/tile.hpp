@@ -21,12 +21,23 @@ struct Record {
   S x, y, u, w, v, log2_opacity;
 };
 
+inline constexpr int kDynamic = 0;        // number of channels known only at run time
+inline constexpr int kInlineChannels = 4;  // colours of up to this many channels are copied beside the records
+
 template <class S>
 struct Chunk {
   int count;
   Record<S> records[kChunk];
-  const S* colors[kChunk];
-  uint16_t masks[kChunk];  // bit b: block b may be touched
+  S inline_colors[kChunk][kInlineChannels];
+  const S* color_rows[kChunk];  // where D is dynamic
+  uint16_t masks[kChunk];       // bit b: block b may be touched
+
+  // The D channels of entry `i`.
+  template <int D>
+  const S* color(int i) const {
+    static_assert(D <= kInlineChannels);
+    return D == kDynamic ? color_rows[i] : inline_colors[i];
+  }
 
   // Positions within the chunk of the Gaussians that touch block `b`, in order. Branch free.
   int list_block(int b, uint16_t* list) const {
@@ -101,19 +112,31 @@ uint16_t touched_blocks(const TileFrame<S>& f, const Record<S>& g) {
   return static_cast<uint16_t>(to_bits(least <= P(g.log2_opacity - f.log2_alpha_min + slack)) & f.inside);
 }
 
-// Copies entries [begin, begin + count) of a tile.
+inline constexpr int kPrefetch = 12;  // entries ahead: their Gaussians lie anywhere in memory
+
 template <class S>
+void prefetch(const Splats<S>& s, int64_t row) {
+  __builtin_prefetch(s.means2d + 2 * row);
+  __builtin_prefetch(s.factors + 3 * row);
+  __builtin_prefetch(s.opacities + row);
+  __builtin_prefetch(s.colors + row * s.channels);
+}
+
+// Copies entries [begin, begin + count) of a tile.
+template <int D, class S>
 void load_chunk(const Splats<S>& s, const Entries& entries, const TileFrame<S>& frame, int64_t begin, int count,
                 Chunk<S>& chunk) {
   const S scale = std::sqrt(S(0.5) * S(1.4426950408889634));
   chunk.count = count;
   for (int i = 0; i < count; ++i) {
+    if (i + kPrefetch < count) prefetch(s, entries.gaussians[begin + i + kPrefetch]);
     const int64_t row = entries.gaussians[begin + i];
     Record<S>& r = chunk.records[i];
     r.x = s.means2d[2 * row], r.y = s.means2d[2 * row + 1];
     r.u = s.factors[3 * row] * scale, r.w = s.factors[3 * row + 1] * scale, r.v = s.factors[3 * row + 2] * scale;
     r.log2_opacity = std::log2(s.opacities[row]);
-    chunk.colors[i] = s.colors + row * s.channels;
+    chunk.color_rows[i] = s.colors + row * s.channels;
+    for (int c = 0; c < D; ++c) chunk.inline_colors[i][c] = chunk.color_rows[i][c];
     chunk.masks[i] = touched_blocks(frame, r);
   }
   for (int i = count; i < std::min(kChunk, count + 16); ++i) chunk.masks[i] = 0;

@@ -174,7 +174,7 @@ inline Packet<double> exp2_of(Packet<double> x) {
   return r;
 }
 
-// 2^x for x <= 0, relative error below 1.5e-7; results under 2^-126 are flushed to about 2^-126.
+// 2^x for x <= 0, relative error below 2.5e-7; results under 2^-126 are flushed to about 2^-126.
 inline Packet<float> exp2_of(Packet<float> x) {
   using P = Packet<float>;
   x = max_of(x, P(-126.0f));

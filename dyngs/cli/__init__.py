@@ -59,7 +59,7 @@ def _dispatch(arguments: list[str]) -> int:
     return parsed.run(parsed)
 
 
-class Parser(argparse.ArgumentParser):
+class _Parser(argparse.ArgumentParser):
     """A parser whose complaints are one line."""
 
     def error(self, message: str) -> NoReturn:
@@ -68,9 +68,12 @@ class Parser(argparse.ArgumentParser):
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    parser: argparse.ArgumentParser = Parser(
-        prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU."
+    return _add_commands(
+        _Parser(prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU.")
     )
+
+
+def _add_commands(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for module in (demo, train, evaluate, render, export, data):

@@ -29,9 +29,9 @@ _REQUIRED = {
     "av": "av",
 }
 _OPTIONAL = {
-    "flip-evaluator": ("flip_evaluator", "the FLIP metric: pip install flip-evaluator"),
-    "lpips": ("lpips", "the LPIPS metric: pip install lpips"),
-    "tensorboard": ("tensorboard", "train.tensorboard=true: pip install tensorboard"),
+    "flip-evaluator": ("flip_evaluator", "the FLIP metric: pip install 'dyngs[metrics]'"),
+    "lpips": ("lpips", "the LPIPS metric: pip install 'dyngs[metrics]'"),
+    "tensorboard": ("tensorboard", "train.tensorboard=true: pip install 'dyngs[tensorboard]'"),
 }
 
 
@@ -53,13 +53,14 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def run(arguments: argparse.Namespace) -> int:
     """Print the report."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     findings = list(examine())
     table = Table(show_header=False, box=None, pad_edge=False)
     colours = {"ok": "green", "absent": "yellow", "broken": "red"}
     for finding in findings:
-        table.add_row(finding.name, f"[{colours[finding.verdict]}]{finding.verdict}", finding.value)
+        table.add_row(finding.name, f"[{colours[finding.verdict]}]{finding.verdict}", escape(finding.value))
     Console().print(table)
     broken = [finding.name for finding in findings if finding.verdict == "broken"]
     if broken:

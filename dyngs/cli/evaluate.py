@@ -33,16 +33,16 @@ def run(arguments: argparse.Namespace) -> int:
     from dyngs.train.evaluate import evaluate_run, report_path
 
     report = evaluate_run(arguments.run_dir, arguments.split, lpips_net=arguments.lpips_net, threads=arguments.threads)
-    console = Console()
-    console.print(report_table(report))
+    Console().print(report_table(report))
     for note in report.notes:
-        console.print(f"note: {note}", markup=False)
-    console.print(f"written: {report_path(arguments.run_dir, report.split)}", markup=False)
+        print(f"note: {note}")
+    print(f"written: {report_path(arguments.run_dir, report.split)}")
     return 0
 
 
 def report_table(report: EvalReport) -> Table:
     """The means of a report as a table of two columns, with the reason where a value is missing."""
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table("metric", "value", title=f"{report.num_views} views of the {report.split} split")
@@ -52,7 +52,8 @@ def report_table(report: EvalReport) -> Table:
         ("FLIP", "flip", report.flip),
         (f"LPIPS ({report.lpips_net})", "lpips", report.lpips),
     ):
-        table.add_row(label, report.reasons.get(name, "not measured") if value is None else f"{value:.4f}")
+        reason = escape(report.reasons.get(name, "not measured"))
+        table.add_row(label, reason if value is None else f"{value:.4f}")
     table.add_row("picture size", f"{report.width}x{report.height} on {report.background}")
     table.add_row("Gaussians", f"{report.num_gaussians:,}")
     table.add_row("model", f"{report.model_mb:.1f} MB")

@@ -28,6 +28,8 @@ _LENSES: dict[str, tuple[int, Literal["none", "opencv", "fisheye"]]] = {
     "RADIAL": (1, "opencv"),
     "OPENCV": (2, "opencv"),
     "FULL_OPENCV": (2, "opencv"),
+    "SIMPLE_FISHEYE": (1, "fisheye"),
+    "FISHEYE": (2, "fisheye"),
     "SIMPLE_RADIAL_FISHEYE": (1, "fisheye"),
     "RADIAL_FISHEYE": (1, "fisheye"),
     "OPENCV_FISHEYE": (2, "fisheye"),

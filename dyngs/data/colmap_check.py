@@ -11,8 +11,8 @@ from pathlib import Path
 
 from dyngs.errors import DyngsError
 
-# Parameters per camera model id, in COLMAP's numbering; later ids are unknown to us and refused.
-_PARAMS_PER_MODEL = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
+# Number of parameters by camera model id, in COLMAP's numbering.
+_NUM_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
 _TEXT_FIELDS = {"cameras": 5, "images": 10, "points3D": 8}
 
 
@@ -74,9 +74,9 @@ _POSE_BYTES = 7 * 8
 def _cameras(source: _Bytes) -> None:
     for _ in range(source.take(_COUNT)[0]):
         camera, model, _, _ = source.take(_CAMERA)
-        if model not in _PARAMS_PER_MODEL:
+        if not 0 <= model < len(_NUM_PARAMS):
             raise DyngsError(f"{source.path}: camera {camera} has the unknown model id {model}; undistort with COLMAP")
-        source.skip(8 * _PARAMS_PER_MODEL[model])
+        source.skip(8 * _NUM_PARAMS[model])
 
 
 def _images(source: _Bytes) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,10 +85,12 @@ def _finished(capture: Capture, options: DataConfig) -> Capture:
 
 
 def _check_names(root: Path, splits: Splits) -> list[str]:
-    for views in splits.values():
-        twice = [name for name, count in Counter(view.name for view in views).items() if count > 1]
-        if twice:
-            raise DyngsError(f"{root}: two pictures are called {twice[0]}; give them different names")
+    named: dict[str, Path] = {}
+    for view in (view for views in splits.values() for view in views):
+        if named.setdefault(view.name, view.image_path) != view.image_path:
+            raise DyngsError(
+                f"{root}: the pictures {named[view.name]} and {view.image_path} share the name {view.name}; rename one"
+            )
     train = {view.image_path for view in splits["train"]}
     leaked = [view.name for view in splits["test"] if view.image_path in train]
     return [f"{len(leaked)} test pictures are also training pictures, first {leaked[0]}"] if leaked else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -31,5 +32,5 @@ def finite_rows(tensors: Sequence[Tensor]) -> Tensor:
     """(N,) bool: rows that are finite in all of the tensors (N, ...)."""
     keep = torch.ones(len(tensors[0]), dtype=torch.bool)
     for x in tensors:
-        keep &= torch.isfinite(x.detach()).reshape(len(x), -1).all(dim=1)
+        keep &= torch.isfinite(x.detach()).reshape(len(x), math.prod(x.shape[1:])).all(dim=1)
     return keep

@@ -51,9 +51,7 @@ def _setup_context(ctx, inputs, output) -> None:
 def _backward(ctx, grad):
     means, centers, sh, radii, colors = ctx.saved_tensors
     with_centers = ctx.needs_input_grad[1]
-    g_means, g_sh, g_centers = _harmonics_backward(
-        [means, centers, sh, radii], colors, grad, ctx.degree, with_centers
-    )
+    g_means, g_sh, g_centers = _harmonics_backward([means, centers, sh, radii], colors, grad, ctx.degree, with_centers)
     return g_means, g_centers if with_centers else None, g_sh, None, None
 
 

@@ -22,12 +22,12 @@ SSIM_SIGMA = 1.5
 
 
 def l1_ssim_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
-    """The training loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)``, a scalar, differentiable in ``rendered``.
+    """Training loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)``: a scalar, differentiable in ``rendered``.
 
     L1 is the mean of ``|x - y|``; SSIM is the mean over pixels and channels of the SSIM map with an 11x11 Gaussian
     window of sigma 1.5, zero padding and data range 1, as in 3DGS. With a mask both pictures are multiplied by it, and
-    both means are weighted by it: ``sum(m |x - y|) / (3 sum m)`` and ``sum(m SSIM(m x, m y)) / (3 sum m)``; a mask that is
-    zero everywhere gives a loss of 0. Only first derivatives exist in float32 on the CPU.
+    both means are weighted by it: ``sum(m |x - y|) / (3 sum m)`` and ``sum(m SSIM(m x, m y)) / (3 sum m)``; a mask of
+    zeros gives a loss of 0. In float32 on the CPU only first derivatives exist.
 
     Args:
         rendered: (H, W, 3) picture x, any strides. Half precision is computed in float32.

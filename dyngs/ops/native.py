@@ -7,6 +7,9 @@ an older one, for tests.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from importlib import import_module
 from types import ModuleType
 
@@ -24,7 +27,9 @@ def _load_core() -> tuple[ModuleType, str]:
     best = baseline.best_isa()
     isa = os.environ.get("DYNGS_ISA", best)
     if isa not in ("v2", "v3", "v4") or isa > best:
-        raise DyngsError(f"DYNGS_ISA={isa}: this processor runs v2 to {best}; unset the variable or choose one of these")
+        raise DyngsError(
+            f"DYNGS_ISA={isa}: this processor runs v2 to {best}; unset the variable or choose one of these"
+        )
     return (baseline if isa == "v2" else import_module(f"dyngs.ops._core_{isa}")), isa
 
 
@@ -36,9 +41,29 @@ def active_isa() -> str:
     return _ISA
 
 
+_kernel_threads: ContextVar[int | None] = ContextVar("kernel_threads", default=None)
+
+
 def num_threads() -> int:
-    """Threads that the kernels use: torch's setting, so that one number rules both."""
-    return torch.get_num_threads()
+    """Threads that the kernels use: those of ``kernel_threads``, else torch's setting."""
+    return _kernel_threads.get() or torch.get_num_threads()
+
+
+@contextmanager
+def kernel_threads(count: int) -> Iterator[None]:
+    """Within it the kernels run on ``count`` threads and torch's own operators on one.
+
+    Why: around the kernels torch only does small element-wise work, where its threads cost more than they save, most of
+    all on a machine that does other things too; and its sums then do not depend on the number of threads.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    token = _kernel_threads.set(count)
+    try:
+        yield
+    finally:
+        _kernel_threads.reset(token)
+        torch.set_num_threads(before)
 
 
 def contiguous(x: Tensor) -> Tensor:

@@ -67,8 +67,8 @@ def _bin_tiles(
         )
     except ValueError as error:  # std::length_error
         raise DyngsError(f"render refused: {error}; lower the resolution, the scales or the number of views") from None
-    tile_offsets, slot_offsets, gaussians, slots = (torch.from_numpy(x) for x in entries)
-    return tile_offsets, slot_offsets, gaussians, slots
+    tile_offsets, slot_ranges, gaussians, slots = (torch.from_numpy(x) for x in entries)
+    return tile_offsets, slot_ranges, gaussians, slots
 
 
 @_bin_tiles.register_fake
@@ -78,7 +78,7 @@ def _(splats, depths, size, thresholds, max_entries):
     views, n = depths.shape
     return (
         depths.new_empty(views * tiles + 1, dtype=torch.int64),
-        depths.new_empty(views * n + 1, dtype=torch.int64),
+        depths.new_empty(2 * views * n, dtype=torch.int32),
         depths.new_empty(entries, dtype=torch.int32),
         depths.new_empty(entries, dtype=torch.int32),
     )
@@ -258,7 +258,5 @@ def contribution_sums(
     sums = torch.empty_like(opacities, memory_format=torch.contiguous_format)
     image = (colors.new_empty(*shape, 1), colors.new_empty(shape), torch.empty(shape, dtype=torch.int32), sums)
     splats = _arrays(projection.means2d, projection.factors, opacities, projection.radii)
-    core.rasterize_forward(
-        splats, contiguous(colors), None, tuple(entries), _settings(list(size), thresholds), image
-    )
+    core.rasterize_forward(splats, contiguous(colors), None, tuple(entries), _settings(list(size), thresholds), image)
     return sums

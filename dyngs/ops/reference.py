@@ -165,5 +165,3 @@ def rasterize(
         pictures.append(picture)
         remains.append(transmittance)
     return Blended(torch.stack(pictures), torch.stack(remains))
-
-

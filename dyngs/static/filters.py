@@ -42,9 +42,9 @@ def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
 
 def _visible_depth(means: Tensor, pose: Tensor, intrinsics: Tensor, width: int, height: int) -> Tensor:
     """(N,) depth in one camera, infinite where it does not see the point."""
-    # Written out instead of a matrix product, whose sums depend on the number of threads.
+    # Not a matrix product, whose sums may depend on the number of threads.
     rotation, translation = pose[:3, :3], pose[:3, 3]
-    x, y, z = (means[:, 0] * r[0] + means[:, 1] * r[1] + means[:, 2] * r[2] + t for r, t in zip(rotation, translation))
+    x, y, z = ((means * row).sum(1) + shift for row, shift in zip(rotation, translation, strict=True))
     u = (intrinsics[0, 0] * x + intrinsics[0, 1] * y) / z + intrinsics[0, 2]
     v = intrinsics[1, 1] * y / z + intrinsics[1, 2]
     inside = (

@@ -79,8 +79,8 @@ def initial_gaussians(
 ) -> Gaussians:
     """The first Gaussians of a run: isotropic, as large as the distance to the three nearest neighbours.
 
-    ``RandomInit`` draws a cube around the origin. ``PointsInit`` takes the finite ones of the scene's points; where there
-    are none it draws a cube, around the origin or else around the cameras' mean and as large as their extent asks.
+    ``RandomInit`` draws a cube around the origin. ``PointsInit`` takes the finite ones of the scene's points; where
+    there are none it draws a cube, around the origin or else around the cameras' mean and as large as their extent.
 
     Args:
         generator: a CPU generator; the only source of randomness.
@@ -131,12 +131,12 @@ def mean_squared_neighbour_distance(xyz: Tensor) -> Tensor:
 
     With fewer than four points the mean is over those there are; a single point gets 1e-2.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     neighbours = min(3, len(xyz) - 1)
     if neighbours < 1:
         return torch.full((len(xyz),), 1e-2, dtype=torch.float64)
     points = xyz.double().numpy()
-    distances, _ = cKDTree(points).query(points, k=neighbours + 1)
+    distances, _ = KDTree(points).query(points, k=neighbours + 1)
     squared = torch.from_numpy(np.square(distances[:, 1:]).mean(axis=1))
     return squared.clamp_min(MIN_SQUARED_DISTANCE)

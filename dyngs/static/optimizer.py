@@ -28,7 +28,7 @@ class GaussianOptimizer:
         self._lr_sh = self._lr_sh.reshape(-1)
 
     def step(self, step: int, lr_means: float, *, dense: bool) -> int:
-        """How many rows were left out because their gradient is not finite; updates the parameters, drops the gradients.
+        """How many rows were left out for a gradient that is not finite; updates parameters and drops the gradients.
 
         Args:
             step: number of this step, from 1, for Adam's bias correction.

@@ -14,7 +14,7 @@ from dyngs.data.images import target_size
 from dyngs.data.intrinsics import scaled_intrinsics
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
-from dyngs.render import RenderOptions
+from dyngs.rendering import RenderOptions
 from dyngs.static.densify import DefaultDensifier, Densifier
 from dyngs.static.init import StartValues, Surroundings, initial_gaussians
 from dyngs.static.mcmc import McmcDensifier

@@ -1,7 +1,7 @@
 """Checkpoints and run folders.
 
-A run folder holds ``config.yaml`` (resolved), ``checkpoints/step_0007000.safetensors``, ``timing.json`` and ``log.jsonl``.
-Equal runs write equal checkpoint bytes: wall time is kept in ``timing.json``.
+A run folder holds ``config.yaml`` (resolved), ``checkpoints/step_0007000.safetensors``, ``timing.json`` and
+``log.jsonl``. Equal runs write equal checkpoint bytes: wall time is kept in ``timing.json``.
 """
 
 from __future__ import annotations
@@ -93,10 +93,8 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
     tensors = {name: x.detach().contiguous() for name, x in checkpoint.tensors.items()}
     for name, x in tensors.items():
         if name.startswith("gaussians.") and not bool(torch.isfinite(x).all()):
-            raise DyngsError(
-                f"{run_dir}: {name.removeprefix('gaussians.')} is not finite after step {checkpoint.info.step}; not saved. "
-                f"{last_good(run_dir)}"
-            )
+            field, step = name.removeprefix("gaussians."), checkpoint.info.step
+            raise DyngsError(f"{run_dir}: {field} is not finite after step {step}; not saved. {last_good(run_dir)}")
     header = {"format": FORMAT_VERSION, **asdict(checkpoint.info)}
     header["digest"] = _digest(tensors, header)
     path = run_dir / "checkpoints" / f"step_{checkpoint.info.step:07d}.safetensors"

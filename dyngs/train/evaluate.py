@@ -21,7 +21,7 @@ from dyngs.data.read import read_capture
 from dyngs.data.write import write_text
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.render import RenderOptions, render
+from dyngs.rendering import RenderOptions, render
 from dyngs.train.checkpoint import load_run
 from dyngs.train.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
 

@@ -36,8 +36,8 @@ def densify_schedule(strategy: DefaultStrategy | McmcStrategy, steps: int, white
     """When ``strategy`` changes the set of Gaussians in a run of ``steps``.
 
     Opacity resets keep at least ``MIN_RESET_GAP`` steps between each other and as long as one period before
-    densification stops (at 30,000: 3000, 6000, 9000, 12000). On a white background there is one more at the start, which
-    clears the white floaters, unless the next one follows within the gap.
+    densification stops (at 30,000: 3000, 6000, 9000, 12000). On a white background there is one more at the start,
+    which clears the white floaters, unless the next one follows within the gap.
     """
     start = max(scaled(strategy.start, steps), min(strategy.start, MIN_START))
     stop = scaled(strategy.stop, steps)

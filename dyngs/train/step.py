@@ -14,7 +14,7 @@ from dyngs.data.loader import Picture, PictureLoader
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.render import RenderOptions, render
+from dyngs.rendering import RenderOptions, render
 from dyngs.static.densify import Densifier
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo
@@ -155,6 +155,7 @@ def _finite_sum(terms: dict[str, Tensor], step: int, view: str) -> float:
     for name, value in values.items():
         if not math.isfinite(value):
             raise DyngsError(
-                f"step {step}, view {view!r}: the loss term {name!r} is {value}; lower the rates in optim, or look at that picture"
+                f"step {step}, view {view!r}: the loss term {name!r} is {value}; look at that picture, or "
+                "lower the rates in optim"
             )
     return sum(values.values())

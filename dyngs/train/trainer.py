@@ -8,12 +8,11 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
 from dyngs.config import Config
 from dyngs.config_io import RESOLVED_NAME, save_config
 from dyngs.errors import DyngsError
 from dyngs.ops.memory import keep_freed_memory
+from dyngs.ops.native import kernel_threads
 from dyngs.train.assemble import assemble
 from dyngs.train.checkpoint import (
     Checkpoint,
@@ -34,17 +33,21 @@ def train(config: Config, *, resume_from: Path | None = None) -> Path:
 
     Args:
         config: everything that decides the run; on resuming, that of the run folder.
-        resume_from: a run folder to go on with, from its newest checkpoint: the result has the same bytes as if the run had
-            never stopped.
+        resume_from: a run folder to go on with, from its newest checkpoint: the result has the same bytes as if the run
+            had never stopped.
 
     Raises:
         DyngsError: bad input, a run folder that already holds a run, a loss that is not finite, a full disk.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how to go on.
     """
-    watch = _Stopwatch()
     run_dir = resume_from or config.run.dir or Path("runs") / config.run.name
-    torch.set_num_threads(config.run.threads or _num_cores())
     keep_freed_memory()
+    with kernel_threads(config.run.threads or _num_cores()):
+        return _train(config, run_dir, resume_from)
+
+
+def _train(config: Config, run_dir: Path, resume_from: Path | None) -> Path:
+    watch = _Stopwatch()
     resumed = _start_of_run(run_dir, resuming=resume_from is not None)
     if resumed is not None and resumed.info.step >= config.train.steps:
         return run_dir

@@ -18,7 +18,7 @@ from dyngs.data.write import to_uint8, write_image
 from dyngs.errors import DyngsError
 from dyngs.export.ply import SplatFile
 from dyngs.gaussians import Gaussians
-from dyngs.render import RenderOptions, render
+from dyngs.rendering import RenderOptions, render
 from dyngs.train.checkpoint import load_run
 from dyngs.train.evaluate import evaluation_background, render_options, split_views
 from dyngs.train.metrics import psnr

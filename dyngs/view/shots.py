@@ -17,7 +17,7 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.export.ply import read_ply
 from dyngs.gaussians import Gaussians
-from dyngs.render import RenderOptions
+from dyngs.rendering import RenderOptions
 from dyngs.train.checkpoint import load_run
 from dyngs.train.evaluate import evaluation_background, render_options
 from dyngs.view.frames import splat_options

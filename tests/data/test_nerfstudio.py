@@ -116,7 +116,9 @@ def test_points_of_a_ply_in_double(nerfstudio_root: Path) -> None:
     np.testing.assert_array_equal(points.rgb, [[255, 0, 7], [1, 2, 3]])
 
 
-@pytest.mark.parametrize("content", [None, b"", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", b"\x00" * 99])
+@pytest.mark.parametrize(
+    "content", [None, b"", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", b"\x00" * 99]
+)
 def test_bad_point_files_are_named(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "points.ply"
     if content is not None:

@@ -63,7 +63,10 @@ def test_only_far_scenes_move(distance: float, radius: float, moves: bool) -> No
 @pytest.mark.parametrize("jitter", [0.0, 1e-9])
 def test_fixed_camera_stays_where_it_is(jitter: float) -> None:
     """All centres coincide, so the spread is no measure; random points around the origin must stay in its view."""
-    capture = capture_at(np.array([3.0, 0, 0]), jitter)
+    view = capture_at(np.zeros(3)).splits["train"][0]
+    moved = [view.cam_from_world + np.diag([jitter * i, 0, 0], 1) for i in range(5)]
+    views = tuple(View(str(i), view.image_path, pose, np.eye(3), 1, 1) for i, pose in enumerate(moved))
+    capture = Capture(Path(), "blender", {"train": views})
     assert rebase(capture) is capture
 
 

@@ -63,9 +63,7 @@ def test_points_that_are_not_finite_are_left_out() -> None:
     xyz = np.random.default_rng(0).random((8, 3))
     xyz[3, 1] = np.nan
     assert len(initial_gaussians(_with_points(xyz), PointsInit(), StartValues(), 0, _generator())) == 7
-    nothing = initial_gaussians(
-        _with_points(xyz[3:4]), PointsInit(num_random=5), StartValues(), 0, _generator()
-    )
+    nothing = initial_gaussians(_with_points(xyz[3:4]), PointsInit(num_random=5), StartValues(), 0, _generator())
     assert len(nothing) == 5
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from dyngs.render import RenderOptions, render
+from dyngs.rendering import RenderOptions, render
 
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, StaticModel

@@ -21,9 +21,11 @@ def test_a_signal_is_only_noted(which: signal.Signals) -> None:
 
 
 def test_a_second_ctrl_c_insists() -> None:
-    with Interrupts(), pytest.raises(KeyboardInterrupt):
+    with Interrupts() as interrupts:
         signal.raise_signal(signal.SIGINT)
-        signal.raise_signal(signal.SIGINT)
+        assert interrupts.requested
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
 
 
 def test_other_threads_may_train_too() -> None:

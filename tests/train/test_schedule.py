@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -36,7 +38,7 @@ def test_at_30000_steps_it_is_the_published_one() -> None:
 def test_resets_leave_time_to_recover(steps: int, white: bool) -> None:
     schedule = densify_schedule(DefaultStrategy(), steps, white)
     resets = (*schedule.resets, schedule.stop)
-    gaps = [b - a for a, b in zip(resets, resets[1:], strict=False)]
+    gaps = [b - a for a, b in pairwise(resets)]
     assert all(gap >= MIN_RESET_GAP for gap in gaps)
     assert schedule.start >= 100
     assert schedule.stop <= max(1, steps // 2 + 1)

@@ -87,7 +87,9 @@ def test_a_run_learns_and_leaves_its_folder(capture: Path, tmp_path: Path) -> No
     assert losses[-8:].mean() < 0.6 * losses[:8].mean()
 
 
-def test_the_default_folder_is_named_after_the_run(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_folder_has_the_name_of_the_run(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     config = _config(capture, tmp_path, steps=1, run=RunConfig(name="pond", threads=1))
     assert train(config) == Path("runs/pond")
@@ -108,6 +110,23 @@ def test_the_seed_decides_every_byte_and_threads_none(
     assert len(counts) > 2, "the set of Gaussians must change, or this test shows little"
 
 
+def test_threads_decide_nothing_above_the_grain_of_torch(capture: Path, tmp_path: Path) -> None:
+    """torch shares work among threads from 32,768 elements on; some of its functions then round otherwise."""
+    results = []
+    for threads in (1, 2):
+        config = _config(
+            capture,
+            tmp_path,
+            steps=7,
+            strategy=BUSY.model_copy(update={"max_gaussians": 150_000}),
+            model=StaticModel(sh_degree=1, filter_3d=True),
+            init=RandomInit(num_random=100_003),
+            run=RunConfig(dir=tmp_path / str(threads), threads=threads),
+        )
+        results.append(_final_bytes(train(config)))
+    assert results[0] == results[1]
+
+
 @pytest.mark.parametrize("stop_at", [2, 8])
 @pytest.mark.parametrize("kind", ["default", "mcmc", "filtered", "absgrad"])
 def test_resumed_equals_uninterrupted(
@@ -120,9 +139,10 @@ def test_resumed_equals_uninterrupted(
     }
     whole = train(_config(capture, tmp_path / "whole", strategy=strategy, **changes))
     config = _config(capture, tmp_path / "parts", strategy=strategy, **changes)
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt, match="--resume"):
+    with monkeypatch.context() as patch:
         _interrupt_after(stop_at, patch)
-        train(config)
+        with pytest.raises(KeyboardInterrupt, match="--resume"):
+            train(config)
     assert load_run(tmp_path / "parts").step == stop_at
     resumed = train(load_resolved(tmp_path / "parts"), resume_from=tmp_path / "parts")
     assert _final_bytes(resumed) == _final_bytes(whole)
@@ -139,9 +159,10 @@ def test_sigterm_saves_too(capture: Path, tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_time_adds_up_over_resumes(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_dir = tmp_path / "run"
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         _interrupt_after(3, patch)
-        train(_config(capture, run_dir))
+        with pytest.raises(KeyboardInterrupt):
+            train(_config(capture, run_dir))
     before = load_run(run_dir).seconds_train
     (run_dir / "timing.json").write_text(json.dumps({"seconds_train": {"3": before + 1000}}))
     train(load_resolved(run_dir), resume_from=run_dir)

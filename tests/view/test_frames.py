@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from dyngs.render import RenderOptions, render
+from dyngs.rendering import RenderOptions, render
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -126,9 +126,7 @@ def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions
 
 def _project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Projection, Tensor]:
     opacities = gaussians.opacities
-    projection = project(
-        gaussians.means, gaussians.quats, gaussians.scales, opacities, cameras, options.projection
-    )
+    projection = project(gaussians.means, gaussians.quats, gaussians.scales, opacities, cameras, options.projection)
     per_view = opacities.expand(len(cameras), -1)
     if options.mode == RasterizeMode.ANTIALIASED:
         per_view = per_view * projection.compensations

@@ -1,0 +1,165 @@
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_captures import random_pixels, write_picture
+
+from dyngs.config import DataConfig
+from dyngs.data.capture import Lens, View
+from dyngs.data.loader import PictureLoader
+from dyngs.errors import DyngsError
+
+
+def views_of(root: Path, count: int = 3, channels: int = 4, size: tuple[int, int] = (12, 8)) -> tuple[View, ...]:
+    width, height = size
+    intrinsics = np.array([[20.0, 0, 6.5], [0, 21.0, 3.5], [0, 0, 1]])
+    views = []
+    for i in range(count):
+        path = root / f"{i}.png"
+        write_picture(path, random_pixels(height, width, channels, seed=i))
+        views.append(View(str(i), path, np.eye(4), intrinsics, width, height))
+    return tuple(views)
+
+
+def loader(views: tuple[View, ...], **options: float) -> PictureLoader:
+    return PictureLoader(views, DataConfig.model_validate({"root": ".", **options}))
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.2, 0.7, 0.4)])
+def test_compositing_is_the_float_formula(tmp_path: Path, background: tuple[float, ...]) -> None:
+    picture = loader(views_of(tmp_path))[1]
+    pixels = random_pixels(8, 12, 4, seed=1) / 255
+    wanted = pixels[..., :3] * pixels[..., 3:] + (1 - pixels[..., 3:]) * background
+    np.testing.assert_allclose(picture.composite(torch.tensor(background)).numpy(), wanted, atol=1e-6)
+
+
+def test_pictures_without_alpha_are_opaque(tmp_path: Path) -> None:
+    picture = loader(views_of(tmp_path, channels=3))[0]
+    assert picture.alpha is None
+    assert picture.mask is None
+    np.testing.assert_allclose(picture.composite(torch.ones(3)), random_pixels(8, 12, 3) / 255, atol=1e-6)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(1.0, 6.0), st.one_of(st.none(), st.integers(1, 20)))
+def test_downscaled_compositing_and_intrinsics(
+    tmp_path_factory: pytest.TempPathFactory, downscale: float, longest: int | None
+) -> None:
+    """Downscaling and compositing commute to 1/255; a ray through the picture's corner stays the same ray."""
+    root = tmp_path_factory.mktemp("views")
+    view = views_of(root, 1)[0]
+    options = {"downscale": downscale} | ({} if longest is None else {"longest_side": longest})
+    small = loader((view,), **options)[0]
+    background = torch.tensor([0.3, 0.6, 0.9])
+    full = loader((view,))[0].composite(background)
+    width, height = small.cameras.width, small.cameras.height
+    rows = torch.nn.functional.interpolate(full.permute(2, 0, 1)[None], (8 * height, 12 * width), mode="nearest")
+    wanted = torch.nn.functional.avg_pool2d(rows, (8, 12))[0].permute(1, 2, 0)
+    torch.testing.assert_close(small.composite(background), wanted, rtol=0, atol=1 / 255)
+    corner = torch.tensor([float(width), float(height), 1.0])
+    ray = torch.linalg.solve(small.cameras.intrinsics[0], corner)
+    wanted_ray = np.linalg.solve(view.intrinsics, [12.0, 8.0, 1.0])
+    np.testing.assert_allclose(ray.numpy(), wanted_ray, rtol=1e-5)
+
+
+def test_same_bytes_cached_or_not_and_from_threads(tmp_path: Path) -> None:
+    views = views_of(tmp_path, 4)
+    views = tuple(replace(view, lens=Lens("opencv", (0.1, 0.0, 0.0, 0.0))) for view in views)
+    cached, uncached = loader(views, downscale=1.5), loader(views, downscale=1.5, cache_mb=0)
+    assert uncached.cached_bytes == 0
+    with ThreadPoolExecutor(4) as pool:
+        pictures = list(pool.map(lambda i: cached[i % 4], range(16)))
+    for i, picture in enumerate(pictures):
+        torch.testing.assert_close(picture.rgb_premultiplied, uncached[i % 4].rgb_premultiplied, rtol=0, atol=0)
+    assert uncached.cached_bytes == 0
+
+
+def test_cache_keeps_to_its_limit_and_drops_the_oldest(tmp_path: Path) -> None:
+    one = 8 * 12 * 4
+    pictures = loader(views_of(tmp_path, 4), cache_mb=2.5 * one / 1e6)
+    for i in (0, 1, 0, 2):
+        pictures[i]
+        assert pictures.cached_bytes <= 2.5 * one
+    for i in range(4):
+        (tmp_path / f"{i}.png").unlink()
+    pictures[0], pictures[2]
+    with pytest.raises(DyngsError, match=r"1\.png"):
+        pictures[1]
+
+
+def test_length_iteration_and_last(tmp_path: Path) -> None:
+    pictures = loader(views_of(tmp_path))
+    assert len(pictures) == 3
+    assert [picture.name for picture in pictures] == ["0", "1", "2"]  # type: ignore[attr-defined]
+    assert pictures[-1].name == "2"
+
+
+def test_camera_and_time_are_the_view_s(tmp_path: Path) -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = 1, 2, 3
+    picture = loader((replace(views_of(tmp_path, 1)[0], cam_from_world=pose, time=0.25),))[0]
+    assert picture.time == 0.25
+    assert picture.cameras.cam_from_world.dtype == torch.float32
+    assert picture.cameras.centers.tolist() == [[-1, -2, -3]]
+
+
+def test_mask_follows_the_picture(tmp_path: Path) -> None:
+    """A small pixel counts only if all that it covers counts."""
+    keep = np.full((8, 12, 1), 255, np.uint8)
+    keep[2, 5] = 0
+    write_picture(tmp_path / "mask.png", keep)
+    view = replace(views_of(tmp_path, 1)[0], mask_path=tmp_path / "mask.png")
+    mask = loader((view,))[0].mask
+    assert mask is not None
+    np.testing.assert_array_equal(mask.numpy(), keep[..., 0] / 255)
+    small = loader((view,), downscale=2)[0].mask
+    assert small is not None
+    assert torch.nonzero(small == 0).tolist() == [[1, 2]]
+    assert set(small.unique().tolist()) == {0.0, 1.0}
+
+
+def test_undistorted_picture_ignores_what_the_lens_did_not_see(tmp_path: Path) -> None:
+    view = replace(views_of(tmp_path, 1, 3)[0], lens=Lens("opencv", (3.0, 0.0, 0.0, 0.0)))
+    mask = loader((view,))[0].mask
+    assert mask is not None
+    assert (mask[0, 11], mask[4, 6]) == (0, 1)
+    gentle = replace(view, lens=Lens("opencv", (-0.01, 0.0, 0.0, 0.0)))
+    assert loader((gentle,))[0].mask is None
+
+
+def test_missing_pictures_are_counted_at_once(tmp_path: Path) -> None:
+    views = views_of(tmp_path, 5)
+    for i in (1, 3):
+        (tmp_path / f"{i}.png").unlink()
+    with pytest.raises(DyngsError, match=r"2 of 5 pictures are missing, the first is .*1\.png"):
+        loader(views)
+
+
+def test_missing_mask_counts_as_missing(tmp_path: Path) -> None:
+    view = replace(views_of(tmp_path, 1)[0], mask_path=tmp_path / "mask.png")
+    with pytest.raises(DyngsError, match=r"mask\.png"):
+        loader((view,))
+
+
+def test_truncated_picture_is_found_before_training(tmp_path: Path) -> None:
+    views = views_of(tmp_path, 3, size=(64, 48))
+    path = tmp_path / "2.png"
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(DyngsError, match=r"2\.png: the picture is truncated"):
+        loader(views)
+
+
+def test_sizes_that_disagree(tmp_path: Path) -> None:
+    views = views_of(tmp_path, 1)
+    with pytest.raises(DyngsError, match=r"0\.png: the picture is 12x8, but 12x9"):
+        loader((replace(views[0], height=9),))
+    write_picture(tmp_path / "mask.png", np.full((4, 4, 1), 255, np.uint8))
+    with pytest.raises(DyngsError, match=r"mask\.png: the mask is 4x4"):
+        loader((replace(views[0], mask_path=tmp_path / "mask.png"),))[0]

@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_captures import edit_json, write_colmap
+
+from dyngs.config import DataConfig
+from dyngs.data.capture import Capture
+from dyngs.data.loader import PictureLoader
+from dyngs.data.poses import camera_center
+from dyngs.data.read import read_capture
+from dyngs.errors import DyngsError
+
+
+def read(root: Path, **options: object) -> Capture:
+    return read_capture(DataConfig.model_validate({"root": root, **options}))
+
+
+def names(capture: Capture, split: str) -> list[str]:
+    return [view.name for view in capture.splits[split]]  # type: ignore[index]
+
+
+def test_formats_are_recognised(blender_root: Path) -> None:
+    capture = read(blender_root)
+    assert (capture.format, capture.has_alpha) == ("blender", True)
+    assert {name: len(views) for name, views in capture.splits.items()} == {"train": 16, "val": 0, "test": 2}
+    assert capture.world_offset.tolist() == [0, 0, 0]
+    assert capture.warnings == ()
+
+
+def test_nerfstudio_is_recognised(nerfstudio_root: Path) -> None:
+    capture = read(nerfstudio_root)
+    assert (capture.format, capture.has_alpha) == ("nerfstudio", False)
+    assert names(capture, "test") == ["images/00", "images/08"]
+
+
+def test_colmap_is_recognised(colmap_root: Path) -> None:
+    capture = read(colmap_root)
+    assert capture.format == "colmap"
+    assert names(capture, "test") == ["left/01", "right/08"]
+
+
+def test_two_formats_in_one_folder(nerfstudio_root: Path) -> None:
+    """Recognition says which it took; naming the format takes the other."""
+    for path in (nerfstudio_root / "images").iterdir():
+        path.rename(path.with_name("x" + path.name))
+    edit_json(
+        nerfstudio_root / "transforms.json",
+        lambda c: [f.update(file_path=f["file_path"].replace("/", "/x")) for f in c["frames"]],
+    )
+    write_colmap(nerfstudio_root)
+    both = read(nerfstudio_root)
+    assert both.format == "nerfstudio"
+    assert "also a colmap capture" in both.warnings[0]
+    assert read(nerfstudio_root, format="colmap").format == "colmap"
+
+
+@pytest.mark.parametrize(("every", "test"), [(8, [0, 8]), (3, [0, 3, 6, 9, 12, 15]), (0, [])])
+def test_every_nth_by_name_is_held_out(blender_root: Path, every: int, test: list[int]) -> None:
+    (blender_root / "transforms_test.json").unlink()
+    capture = read(blender_root, test_every=every)
+    everything = sorted(f"train/r_{i}" for i in range(16))
+    assert names(capture, "test") == [everything[i] for i in test]
+    assert names(capture, "train") == [name for i, name in enumerate(everything) if i not in test]
+
+
+def test_holding_out_all_is_an_error(nerfstudio_root: Path) -> None:
+    with pytest.raises(DyngsError, match="test_every=1 leaves no training views"):
+        read(nerfstudio_root, test_every=1)
+
+
+def test_no_such_folder(tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="nowhere: no such folder"):
+        read(tmp_path / "nowhere")
+    (tmp_path / "file.json").write_text("{}")
+    with pytest.raises(DyngsError, match=r"file\.json: is a file"):
+        read(tmp_path / "file.json")
+
+
+def test_nothing_recognised_lists_what_was_looked_for(tmp_path: Path) -> None:
+    with pytest.raises(DyngsError) as caught:
+        read(tmp_path)
+    for wanted in ("transforms_train.json", "transforms.json", "cameras.bin", "sparse/0"):
+        assert wanted in str(caught.value)
+
+
+def test_named_format_is_absent(blender_root: Path) -> None:
+    with pytest.raises(DyngsError, match=r"no colmap capture.*but there is a blender capture"):
+        read(blender_root, format="colmap")
+
+
+@pytest.mark.parametrize("frames", [[], None])
+def test_zero_views(nerfstudio_root: Path, frames: list | None) -> None:
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(frames=frames))
+    with pytest.raises(DyngsError, match=r"no training views|'frames' is missing"):
+        read(nerfstudio_root)
+
+
+def test_empty_test_file_is_a_warning(blender_root: Path) -> None:
+    edit_json(blender_root / "transforms_test.json", lambda c: c.update(frames=[]))
+    capture = read(blender_root)
+    assert names(capture, "test") == []
+    assert len(names(capture, "train")) == 16
+    assert "lists no frames" in capture.warnings[0]
+
+
+def test_missing_pictures_are_a_warning_and_then_an_error_of_the_loader(colmap_root: Path) -> None:
+    (colmap_root / "images/left/03.jpg").unlink()
+    capture = read(colmap_root)
+    assert "1 of 9 pictures are missing" in capture.warnings[0]
+    with pytest.raises(DyngsError, match=r"left/03\.jpg"):
+        PictureLoader(capture.splits["train"], DataConfig.model_validate({"root": colmap_root}))
+
+
+def test_two_pictures_of_one_name(nerfstudio_root: Path) -> None:
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c["frames"][1].update(file_path="images/00.png"))
+    with pytest.raises(DyngsError, match=r"00\.(png|jpg) share the name images/00"):
+        read(nerfstudio_root)
+
+
+def test_training_on_the_test_set_is_a_warning(blender_root: Path) -> None:
+    edit_json(blender_root / "transforms_test.json", lambda c: c["frames"][0].update(file_path="train/r_1"))
+    assert read(blender_root).warnings == ("1 test pictures are also training pictures, first train/r_1",)
+
+
+def set_times(root: Path, split: str, times: list[float]) -> None:
+    def change(content: dict) -> None:
+        for frame, time in zip(content["frames"], times, strict=False):
+            frame["time"] = time
+
+    edit_json(root / f"transforms_{split}.json", change)
+
+
+def test_times_in_frames_are_scaled_to_one(blender_root: Path) -> None:
+    set_times(blender_root, "train", [float(i) for i in range(16)])
+    set_times(blender_root, "test", [7.5, 20.0])
+    capture = read(blender_root)
+    times = {view.name: view.time for views in capture.splits.values() for view in views}
+    assert (times["train/r_0"], times["train/r_15"], times["test/r_0"], times["test/r_1"]) == (0, 0.75, 0.375, 1)
+    assert "times run from 0 to 20" in capture.warnings[0]
+
+
+def test_times_in_range_are_left_alone(blender_root: Path) -> None:
+    set_times(blender_root, "train", [0.25 + i / 100 for i in range(16)])
+    set_times(blender_root, "test", [0.5, 0.5])
+    capture = read(blender_root)
+    assert [view.time for view in capture.splits["test"]] == [0.5, 0.5]
+    assert capture.warnings == ()
+
+
+def test_time_for_some_is_an_error(blender_root: Path) -> None:
+    set_times(blender_root, "train", [0.5])
+    with pytest.raises(DyngsError, match="has no time"):
+        read(blender_root)
+
+
+def test_far_world_is_rebased(nerfstudio_root: Path) -> None:
+    """Georeferenced capture: the offset is kept, the cameras come to the origin."""
+
+    def change(content: dict) -> None:
+        for frame in content["frames"]:
+            frame["transform_matrix"][0][3] += 4.5e6
+
+    edit_json(nerfstudio_root / "transforms.json", change)
+    capture = read(nerfstudio_root)
+    assert capture.world_offset[0] == pytest.approx(4.5e6, abs=10)
+    centers = np.array([camera_center(view.cam_from_world) for view in capture.splits["train"]])
+    assert np.abs(centers).max() < 10
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "counts", "alpha", "times"),
+    [
+        ("lego400", "blender", (100, 0, 50), True, 0),
+        ("fox", "nerfstudio", (43, 0, 7), False, 0),
+        ("colmap_small", "colmap", (67, 0, 10), False, 0),
+        ("orbits", "blender", (100, 10, 20), True, 100),
+        ("stage", "blender", (192, 0, 24), False, 24),
+    ],
+)
+def test_real_captures(shared: Path, name: str, form: str, counts: tuple, alpha: bool, times: int) -> None:
+    capture = read(shared / name)
+    found = tuple(len(capture.splits[split]) for split in ("train", "val", "test"))
+    assert (capture.format, found, capture.has_alpha, capture.warnings) == (form, counts, alpha, ())
+    assert len({view.time for view in capture.splits["train"] if view.time is not None}) == times
+    for views in capture.splits.values():
+        assert [view.name for view in views] == sorted(view.name for view in views)
+        PictureLoader(views, DataConfig.model_validate({"root": shared / name}))

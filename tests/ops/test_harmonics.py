@@ -1,0 +1,127 @@
+"""The native spherical harmonics against the Legendre recursion of the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from scenes import Scene, random_scene, relative_error, weights
+from torch import Tensor
+
+from dyngs.ops import reference
+from dyngs.ops.harmonics import evaluate_harmonics
+
+
+def all_visible(scene: Scene) -> Tensor:
+    return torch.ones(len(scene.cam_from_world), len(scene.means), 2, dtype=torch.int32)
+
+
+def colours(scene: Scene, degree: int, function: Callable = evaluate_harmonics) -> Tensor:
+    return function(scene.means, scene.cameras.centers, scene.sh, all_visible(scene), degree)
+
+
+def slopes(scene: Scene, degree: int, function: Callable = evaluate_harmonics) -> tuple[Tensor, ...]:
+    """With respect to means, camera centres and coefficients."""
+    tensors = [x.detach().clone().requires_grad_() for x in (scene.means, scene.cameras.centers, scene.sh)]
+    means, centers, sh = tensors
+    colors = function(means, centers, sh, all_visible(scene), degree)
+    # terms of degree 0 have no direction: 0 * x keeps them in the graph of the reference
+    total = (colors * weights(colors)).sum() + 0 * (means.sum() + centers.sum())
+    return torch.autograd.grad(total, tensors)
+
+
+@pytest.mark.parametrize("degree", range(5))
+@pytest.mark.parametrize("stored", [4, None], ids=["all stored", "just enough stored"])
+def test_equals_the_reference(degree: int, stored: int | None) -> None:
+    """rtol 1e-9: both float64, polynomials against a recursion."""
+    scene = random_scene(n=35, views=3, seed=degree, degree=stored or degree)
+    ours, truth = colours(scene, degree), colours(scene, degree, reference.evaluate_harmonics)
+    torch.testing.assert_close(ours, truth, rtol=1e-9, atol=1e-13)
+    for x, y in zip(slopes(scene, degree), slopes(scene, degree, reference.evaluate_harmonics), strict=True):
+        torch.testing.assert_close(x, y, rtol=1e-9, atol=1e-12)
+
+
+def test_float_equals_double_on_every_isa(isa: str) -> None:
+    """1e-5: 25 terms, some with coefficients of 35 / 4, each rounded at 6e-8."""
+    scene = random_scene(n=200, degree=4).to(torch.float32)
+    truth = scene.to(torch.float64)
+    assert relative_error(colours(scene, 4), colours(truth, 4)) < 1e-5
+    for x, y in zip(slopes(scene, 4), slopes(truth, 4), strict=True):
+        assert relative_error(x, y) < 1e-5
+
+
+def test_clamped_colours_get_no_gradient() -> None:
+    scene = random_scene(n=4, views=1, degree=1)
+    scene.sh[:, 0] = -10
+    assert not colours(scene, 1).any()
+    assert not any(x.any() for x in slopes(scene, 1))
+
+
+def test_culled_gaussians_are_black_and_get_no_gradient() -> None:
+    scene = random_scene(n=4, views=1, degree=1)
+    radii = all_visible(scene)
+    radii[0, 2] = 0
+    sh = scene.sh.clone().requires_grad_()
+    colors = evaluate_harmonics(scene.means, scene.cameras.centers, sh, radii, 1)
+    colors.sum().backward()
+    assert not colors[0, 2].any()
+    assert sh.grad is not None
+    assert not sh.grad[2].any()
+    assert sh.grad[[0, 1, 3], 0].all()
+
+
+def test_higher_stored_terms_are_ignored() -> None:
+    scene = random_scene(degree=3)
+    other = scene.sh.clone()
+    other[:, 4:] = 1e6
+    centers, radii = scene.cameras.centers, all_visible(scene)
+    assert torch.equal(evaluate_harmonics(scene.means, centers, other, radii, 1), colours(scene, 1))
+    assert not slopes(scene, 1)[2][:, 4:].any()
+
+
+def test_camera_in_the_centre_of_a_gaussian_gives_finite_numbers() -> None:
+    scene = random_scene(n=1, views=1, degree=4)
+    scene.means[:] = scene.cameras.centers
+    assert colours(scene, 4).isfinite().all()
+    assert all(x.isfinite().all() for x in slopes(scene, 4))
+
+
+def test_threads_do_not_matter(set_threads: Callable[[int], None]) -> None:
+    scene = random_scene(n=3000, degree=3).to(torch.float32)
+    found = []
+    for n in (1, 2, 8):
+        set_threads(n)
+        found.append((colours(scene, 3), *slopes(scene, 3)))
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+
+
+def test_no_gaussians() -> None:
+    scene = random_scene(n=0, degree=2)
+    assert colours(scene, 2).shape == (2, 0, 3)
+    assert slopes(scene, 2)[2].shape == (0, 9, 3)
+
+
+def test_strided_inputs_equal_contiguous_ones() -> None:
+    scene = random_scene(degree=2)
+    strided = scene.map(lambda x: x.repeat_interleave(2, dim=-1)[..., ::2])
+    assert torch.equal(colours(strided, 2), colours(scene, 2))
+    assert torch.equal(slopes(strided, 2)[2], slopes(scene, 2)[2])
+
+
+@pytest.mark.parametrize("degree", [-1, 2, 5])
+def test_degree_must_be_stored(degree: int) -> None:
+    with pytest.raises(ValueError, match="degree"):
+        colours(random_scene(degree=1), degree)
+
+
+def test_opcheck(scene: Scene) -> None:
+    means, centers, sh = (x.requires_grad_() for x in (scene.means, scene.cameras.centers, scene.sh))
+    torch.library.opcheck(torch.ops.dyngs.harmonics.default, (means, centers, sh, all_visible(scene), 1))
+
+
+def test_opcheck_backward(scene: Scene) -> None:
+    colors = colours(scene, 1)
+    args = ([scene.means, scene.cameras.centers, scene.sh, all_visible(scene)], colors, weights(colors), 1, True)
+    torch.library.opcheck(torch.ops.dyngs.harmonics_backward.default, args)

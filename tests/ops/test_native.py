@@ -1,0 +1,98 @@
+"""Which kernels are loaded, on how many threads they run, and the C++ tests of their formulas."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from dyngs.ops.native import active_isa, contiguous, core, kernel_threads, num_threads
+
+ROOT = Path(__file__).parents[2]
+
+
+def import_with(isa: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"DYNGS_ISA": isa, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    code = (
+        "from dyngs.errors import DyngsError\n"
+        "try:\n"
+        "    from dyngs.ops.native import active_isa, core\n"
+        "    print(active_isa(), core.__name__.rsplit('_', 1)[1])\n"
+        "except DyngsError as error:\n"
+        "    print(error)\n"
+    )
+    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=100)
+
+
+def test_the_best_kernels_are_loaded() -> None:
+    assert active_isa() == os.environ.get("DYNGS_ISA", core.best_isa())
+
+
+def test_an_older_instruction_set_can_be_asked_for() -> None:
+    assert import_with("v2").stdout.split() == ["v2", "v2"]
+
+
+def test_an_unknown_instruction_set_is_refused() -> None:
+    assert import_with("v9").stdout.startswith(f"DYNGS_ISA=v9: this processor runs v2 to {core.best_isa()}")
+
+
+def test_kernels_follow_torch_unless_told_otherwise() -> None:
+    before = torch.get_num_threads()
+    assert num_threads() == before
+    with kernel_threads(3):
+        assert num_threads() == 3
+        assert torch.get_num_threads() == 1
+        with kernel_threads(2):
+            assert num_threads() == 2
+        assert num_threads() == 3
+    assert (num_threads(), torch.get_num_threads()) == (before, before)
+
+
+def test_thread_counts_come_back_after_an_error() -> None:
+    before = torch.get_num_threads()
+    with pytest.raises(RuntimeError), kernel_threads(3):
+        raise RuntimeError
+    assert (num_threads(), torch.get_num_threads()) == (before, before)
+
+
+def test_contiguous_detaches_and_copies_only_if_needed() -> None:
+    x = torch.zeros(4, 2, requires_grad=True)
+    assert contiguous(x).data_ptr() == x.data_ptr()
+    assert not contiguous(x).requires_grad
+    assert contiguous(x[:, 0]).stride() == (1,)
+
+
+def test_arrays_of_the_wrong_size_are_refused_before_they_are_read() -> None:
+    means, quats, scales, opacities = torch.zeros(4, 3), torch.zeros(4, 4), torch.zeros(3, 3), torch.zeros(4)
+    arrays = core.GaussianArraysF32(means, quats, scales, opacities, torch.zeros(1, 4, 4), torch.zeros(1, 3, 3))
+    sizes = core.ProjectSettings(8, 8, 0.3, 0.2, 1e10, 0.0, 0.0, False, 1)
+    outputs = (torch.zeros(1, 4, 2), torch.zeros(1, 4), torch.zeros(1, 4, 3), torch.zeros(1, 4))
+    with pytest.raises(ValueError, match="scales has 9 elements, expected 12"):
+        core.project_forward(arrays, sizes, *outputs, torch.zeros(1, 4, 2, dtype=torch.int32))
+
+
+def test_strided_arrays_are_refused_rather_than_filled_elsewhere() -> None:
+    means, quats, scales, opacities = torch.zeros(4, 3), torch.zeros(4, 4), torch.zeros(4, 3), torch.zeros(4)
+    with pytest.raises(TypeError):
+        core.GaussianArraysF32(
+            means.T.contiguous().T, quats, scales, opacities, torch.zeros(1, 4, 4), torch.zeros(1, 3, 3)
+        )
+
+
+def test_formulas_in_cpp(tmp_path: Path) -> None:
+    """csrc/tests/test_math.cpp, built without Python, as by the CMake option DYNGS_TESTS."""
+    compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        pytest.skip("no C++ compiler here")
+    program, source = tmp_path / "test_math", ROOT / "csrc/tests/test_math.cpp"
+    # GNU dialect and contraction as in CMakeLists.txt
+    flags = ["-std=gnu++20", "-O1", "-ffp-contract=fast", "-w", f"-I{ROOT / 'csrc'}"]
+    subprocess.run([compiler, *flags, str(source), "-o", str(program)], check=True, timeout=100)
+    done = subprocess.run([str(program)], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stdout
+    assert "all passed" in done.stdout

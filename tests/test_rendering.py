@@ -1,0 +1,231 @@
+"""The one verb: that it is the ops in a row, its options, and that torch can compile it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from scenes import REFERENCE, Limits, Scene, draw, look_around, random_scene, weights
+from torch import Tensor
+
+from dyngs.conventions import RasterizeMode
+from dyngs.gaussians import Gaussians
+from dyngs.ops.projection import ProjectionOptions
+from dyngs.ops.rasterization import BlendOptions
+from dyngs.rendering import Rendering, RenderOptions, contributions, render
+
+EXACT = RenderOptions(alpha_min=0.0, transmittance_min=0.0)
+
+
+def leaves(gaussians: Gaussians) -> Gaussians:
+    return Gaussians(**{name: x.detach().clone().requires_grad_() for name, x in gaussians.tensors().items()})
+
+
+def half_transparent_wall(z: float = 4.0) -> tuple[Gaussians, Scene]:
+    """One Gaussian so wide that alpha is 0.5 in every pixel, at depth z."""
+    scene = random_scene(n=1, views=1, degree=0)
+    gaussians = replace(
+        scene.gaussians,
+        means=torch.tensor([[0.0, 0.0, z]], dtype=torch.float64),
+        log_scales=torch.full((1, 3), 20.0, dtype=torch.float64),
+        logit_opacities=torch.zeros(1, dtype=torch.float64),
+    )
+    return gaussians, replace(scene, cam_from_world=torch.eye(4, dtype=torch.float64)[None])
+
+
+@pytest.mark.parametrize("mode", RasterizeMode)
+def test_is_the_three_ops_in_a_row(mode: RasterizeMode) -> None:
+    scene = random_scene(degree=2)
+    antialiased = mode == RasterizeMode.ANTIALIASED
+    limits = Limits(ProjectionOptions(eps2d=0.1, near=2.5, antialiased=antialiased), BlendOptions())
+    truth = draw(scene, REFERENCE, limits)
+    options = RenderOptions(near=2.5, eps2d=0.1, mode=mode)
+    ours = render(scene.gaussians, scene.cameras, options, background=scene.background)
+    torch.testing.assert_close(ours.rgb, truth.blended.color, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(ours.alpha, 1 - truth.blended.transmittance, rtol=1e-9, atol=1e-12)
+    assert ours.depth is None
+    assert torch.equal(ours.radii, truth.projection.radii)
+
+
+@pytest.mark.parametrize("depth", ["accumulated", "expected"])
+def test_gradcheck(depth: str) -> None:
+    """Through activations, cameras, colours, alpha, depth and background, without thresholds. Wide Gaussians: where alpha
+    is nearly zero, 1 - transmittance has no digits, and depth / alpha none either."""
+    scene = random_scene(n=3, views=2, size=(4, 3), degree=1)
+    scene = replace(scene, scales=5 * scene.scales)
+    options = replace(EXACT, depth=depth, mode=RasterizeMode.ANTIALIASED)
+
+    def run(poses: Tensor, background: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+        cameras = replace(scene, cam_from_world=poses).cameras
+        picture = render(Gaussians(*tensors), cameras, options, background=background)
+        assert picture.depth is not None
+        return picture.rgb, picture.alpha, picture.depth
+
+    tensors = (scene.cam_from_world, scene.background, *scene.gaussians.tensors().values())
+    assert torch.autograd.gradcheck(run, [x.detach().clone().requires_grad_() for x in tensors])
+
+
+def test_depth_of_a_half_transparent_wall() -> None:
+    gaussians, scene = half_transparent_wall(z=4.0)
+    found = {}
+    for kind in ("accumulated", "expected"):
+        found[kind] = render(gaussians, scene.cameras, RenderOptions(depth=kind), background=torch.ones(3)).depth
+    torch.testing.assert_close(found["accumulated"], torch.full((1, 29, 37), 2.0).double(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(found["expected"], torch.full((1, 29, 37), 4.0).double(), rtol=1e-6, atol=0)
+
+
+def test_depth_where_nothing_is_drawn_is_zero_with_a_finite_gradient() -> None:
+    scene = random_scene(n=1, views=1)
+    scene.means[:] = torch.tensor([-0.9, -0.9, 0.0])
+    gaussians = leaves(replace(scene, scales=0.1 * scene.scales).gaussians)
+    picture = render(gaussians, scene.cameras, RenderOptions(depth="expected"))
+    assert picture.depth is not None
+    assert picture.alpha[0, -1, -1] == picture.depth[0, -1, -1] == 0
+    picture.depth.sum().backward()
+    assert all(x.grad is not None and x.grad.isfinite().all() for x in gaussians.tensors().values() if x is not gaussians.sh)
+
+
+def test_alpha_of_a_half_transparent_wall() -> None:
+    gaussians, scene = half_transparent_wall()
+    alpha = render(gaussians, scene.cameras).alpha
+    torch.testing.assert_close(alpha, torch.full_like(alpha, 0.5), rtol=1e-6, atol=0)
+
+
+def test_one_background_serves_every_view() -> None:
+    scene = random_scene()
+    one, gaussians = scene.background[0], scene.gaussians
+    shared = render(gaussians, scene.cameras, background=one).rgb
+    each = render(gaussians, scene.cameras, background=torch.stack([one, one])).rgb
+    assert torch.equal(shared, each)
+    black = render(gaussians, scene.cameras).rgb
+    assert torch.equal(black, render(gaussians, scene.cameras, background=torch.zeros(3)).rgb)
+
+
+def test_background_of_another_precision() -> None:
+    scene = random_scene()
+    half = torch.tensor([0.25, 0.5, 1.0], dtype=torch.float16)
+    truth = render(scene.gaussians, scene.cameras, background=half.double()).rgb
+    assert torch.equal(render(scene.gaussians, scene.cameras, background=half).rgb, truth)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_sh_degree_limits_the_terms(degree: int) -> None:
+    scene = random_scene(degree=3)
+    cut = scene.gaussians.replace(sh=scene.sh[:, : (degree + 1) ** 2])
+    limited = render(scene.gaussians, scene.cameras, RenderOptions(sh_degree=degree)).rgb
+    assert torch.equal(limited, render(cut, scene.cameras).rgb)
+    assert torch.equal(render(cut, scene.cameras, RenderOptions(sh_degree=4)).rgb, limited)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
+    scene = random_scene()
+    halves = leaves(Gaussians(**{name: x.to(dtype) for name, x in scene.gaussians.tensors().items()}))
+    floats = Gaussians(**{name: x.detach().float() for name, x in halves.tensors().items()})
+    picture = render(halves, scene.cameras.to(dtype=torch.float32))
+    assert picture.rgb.dtype == torch.float32
+    assert torch.equal(picture.rgb, render(floats, scene.cameras.to(dtype=torch.float32)).rgb)
+    picture.rgb.sum().backward()
+    assert halves.means.grad is not None
+    assert halves.means.grad.dtype == dtype
+    assert halves.means.grad.isfinite().all()
+
+
+def test_mixed_precisions_follow_the_means() -> None:
+    scene = random_scene()
+    mixed = scene.to(torch.float32).gaussians.replace(sh=scene.sh, quats=scene.quats)
+    picture = render(mixed, scene.cameras)
+    assert picture.rgb.dtype == torch.float32
+    assert torch.equal(picture.rgb, render(scene.to(torch.float32).gaussians, scene.cameras).rgb)
+
+
+def test_strided_gaussians_equal_contiguous_ones() -> None:
+    scene = random_scene().to(torch.float32)
+    packed = torch.cat([x.reshape(20, -1) for x in scene.gaussians.tensors().values()], 1)
+    widths = [3, 4, 3, 1, 12]
+    means, quats, log_scales, logits, sh = packed.split(widths, 1)
+    assert not means.is_contiguous()
+    views = Gaussians(means, quats, log_scales, logits[:, 0], sh.unflatten(1, (4, 3)))
+    assert torch.equal(render(views, scene.cameras).rgb, render(scene.gaussians, scene.cameras).rgb)
+
+
+def test_probe_collects_the_densification_signal() -> None:
+    scene = random_scene()
+    for absgrad in (False, True):
+        probe = torch.zeros(2, 20, 4, dtype=torch.float64, requires_grad=True)
+        picture = render(scene.gaussians, scene.cameras, RenderOptions(absgrad=absgrad), probe=probe)
+        (picture.rgb * weights(picture.rgb)).sum().backward()
+        assert probe.grad is not None
+        assert probe.grad[..., :2].any()
+        assert probe.grad[..., 2:].any() == absgrad
+        if absgrad:
+            assert (probe.grad[..., 2:] >= probe.grad[..., :2].abs() - 1e-12).all()
+
+
+@pytest.mark.parametrize("mode", RasterizeMode)
+def test_contributions_are_the_shares_of_the_alpha(mode: RasterizeMode) -> None:
+    scene = random_scene()
+    options = RenderOptions(mode=mode)
+    sums = contributions(scene.gaussians, scene.cameras, options)
+    alpha = render(scene.gaussians, scene.cameras, options).alpha
+    torch.testing.assert_close(sums.sum(1), alpha.sum((1, 2)), rtol=1e-12, atol=0)
+
+
+def test_world_and_camera_moved_together_see_the_same() -> None:
+    """Base colours only: harmonics would have to be turned, too."""
+    scene = random_scene(degree=0)
+    motion = look_around(3)[2]  # 0.6 rad about y and a translation
+    c, s = 0.955336489125606, 0.29552020666133955
+    w, x, y, z = scene.quats.unbind(-1)
+    turned = torch.stack([c * w - s * y, c * x + s * z, c * y + s * w, c * z - s * x], -1)
+    moved = replace(
+        scene,
+        means=scene.means @ motion[:3, :3].T + motion[:3, 3],
+        quats=turned,
+        cam_from_world=scene.cam_from_world @ torch.linalg.inv(motion),
+    )
+    ours, truth = render(moved.gaussians, moved.cameras), render(scene.gaussians, scene.cameras)
+    torch.testing.assert_close(ours.rgb, truth.rgb, rtol=1e-9, atol=1e-11)
+
+
+def test_no_gaussians_leave_the_background() -> None:
+    scene = random_scene(n=0)
+    gaussians = leaves(scene.gaussians)
+    background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    for nonfinite in ("error", "skip", "trust"):
+        options = RenderOptions(depth="expected", nonfinite=nonfinite)
+        picture = render(gaussians, scene.cameras, options, background=background)
+        assert torch.equal(picture.rgb, background.expand(2, 29, 37, 3))
+        assert picture.depth is not None
+        assert not picture.alpha.any()
+        assert not picture.depth.any()
+    picture.rgb.sum().backward()
+    assert gaussians.sh.grad is not None
+    assert gaussians.sh.grad.shape == (0, 4, 3)
+
+
+def compiled_and_plain(scene: Scene, options: RenderOptions) -> list[list[Tensor]]:
+    """Picture and gradients of ``render``, compiled and not."""
+
+    def run(means: Tensor, quats: Tensor, log_scales: Tensor, logits: Tensor, sh: Tensor) -> Rendering:
+        gaussians = Gaussians(means, quats, log_scales, logits, sh)
+        return render(gaussians, scene.cameras, options, background=scene.background)
+
+    found = []
+    for function in (torch.compile(run, fullgraph=True, backend="aot_eager"), run):
+        inputs = list(leaves(scene.gaussians).tensors().values())
+        picture = function(*inputs)
+        total = (picture.rgb * weights(picture.rgb)).sum() + picture.alpha.sum()
+        found.append([picture.rgb, picture.alpha, *torch.autograd.grad(total, inputs)])
+    return found
+
+
+def test_compiles_into_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The number of tile entries depends on the data: torch must be told to expect that. The check for NaN cannot be
+    part of a graph (it may raise), hence ``trust``."""
+    monkeypatch.setattr("torch._dynamo.config.capture_dynamic_output_shape_ops", True)
+    scene = random_scene()
+    compiled, plain = compiled_and_plain(scene, RenderOptions(nonfinite="trust", mode=RasterizeMode.ANTIALIASED))
+    for x, y in zip(compiled, plain, strict=True):
+        torch.testing.assert_close(x, y, rtol=1e-12, atol=1e-14)
