@@ -1,3 +1,45 @@
-"""dyngs: static, dynamic and human Gaussian splatting on a CPU-first differentiable rasterizer."""
+"""dyngs: static, dynamic and human Gaussian splatting on a CPU-first differentiable rasterizer.
+
+The public names are imported on first use, so that ``import dyngs`` alone stays free of torch.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dyngs.camera import Cameras
+    from dyngs.compat import rasterization
+    from dyngs.errors import DyngsError
+    from dyngs.gaussians import Gaussians
+    from dyngs.rendering import Rendering, RenderOptions, contributions, render
 
 __version__ = "0.1.0"
+__all__ = [
+    "Cameras",
+    "DyngsError",
+    "Gaussians",
+    "RenderOptions",
+    "Rendering",
+    "contributions",
+    "rasterization",
+    "render",
+]
+
+_HOMES = {
+    "Cameras": "dyngs.camera",
+    "DyngsError": "dyngs.errors",
+    "Gaussians": "dyngs.gaussians",
+    "RenderOptions": "dyngs.rendering",
+    "Rendering": "dyngs.rendering",
+    "contributions": "dyngs.rendering",
+    "rasterization": "dyngs.compat",
+    "render": "dyngs.rendering",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'dyngs' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)

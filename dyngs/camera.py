@@ -46,5 +46,5 @@ class Cameras:
 
     def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
         """The same cameras on another device or in another precision."""
-        moved = (x.to(device=device, dtype=dtype) for x in (self.cam_from_world, self.intrinsics))
-        return Cameras(*moved, self.width, self.height)
+        pose, intrinsics = (x.to(device=device, dtype=dtype) for x in (self.cam_from_world, self.intrinsics))
+        return Cameras(pose, intrinsics, self.width, self.height)

@@ -14,7 +14,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.ops.finite import check_finite, finite_rows
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
-from dyngs.ops.rasterization import BlendOptions, contribution_sums, rasterize
+from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,8 @@ def render(
     """
     gaussians, cameras = _one_dtype(gaussians, cameras)
     if options.nonfinite != "trust":
-        gaussians = _deal_with_nonfinite(gaussians, cameras, options.nonfinite)
+        _check_finite_views(cameras, background)
+        gaussians = _deal_with_nonfinite(gaussians, options.nonfinite)
     projection, opacities = _project(gaussians, cameras, options)
     degree = gaussians.sh_degree if options.sh_degree is None else min(options.sh_degree, gaussians.sh_degree)
     colors = evaluate_harmonics(gaussians.means, cameras.centers, gaussians.sh, projection.radii, degree)
@@ -121,7 +122,7 @@ def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions
     """(V, N) sum over pixels of each Gaussian's blending weight: its share of every picture, for pruning scores."""
     gaussians, cameras = _one_dtype(gaussians.detach(), cameras)
     projection, opacities = _project(gaussians, cameras, options)
-    return contribution_sums(projection, opacities, (cameras.width, cameras.height), options.blending)
+    return tally(projection, opacities, (cameras.width, cameras.height), Tally.WEIGHTS, options.blending)
 
 
 def _project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Projection, Tensor]:
@@ -142,12 +143,19 @@ def _one_dtype(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Camer
     return gaussians, cameras
 
 
-def _deal_with_nonfinite(gaussians: Gaussians, cameras: Cameras, policy: str) -> Gaussians:
+def _check_finite_views(cameras: Cameras, background: Tensor | None) -> None:
     check_finite({"cam_from_world": cameras.cam_from_world, "intrinsics": cameras.intrinsics})
+    if background is not None:
+        check_finite({"background": background.to(cameras.intrinsics.dtype)})
+
+
+def _deal_with_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:
+    # log_scales can be finite and the scales not: from 88.8 in float32
+    watched = {**gaussians.tensors(), "exp(log_scales)": gaussians.scales.detach()}
     if policy == "error":
-        check_finite(gaussians.tensors())
+        check_finite(watched, 'clean the input, or render with nonfinite="skip" to leave these Gaussians out')
         return gaussians
-    keep = finite_rows(list(gaussians.tensors().values()))
+    keep = finite_rows(list(watched.values()))
     if bool(keep.all()):
         return gaussians
     cleaned = {}

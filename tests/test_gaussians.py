@@ -45,8 +45,14 @@ def test_opacities_are_the_sigmoid_and_do_not_depend_on_the_number_of_threads(
 
 @pytest.mark.parametrize(
     ("name", "shape"),
-    [("means", (5, 2)), ("quats", (4, 4)), ("log_scales", (5,)), ("logit_opacities", (5, 1)), ("sh", (5, 3)),
-     ("sh", (5, 1, 4))],
+    [
+        ("means", (5, 2)),
+        ("quats", (4, 4)),
+        ("log_scales", (5,)),
+        ("logit_opacities", (5, 1)),
+        ("sh", (5, 3)),
+        ("sh", (5, 1, 4)),
+    ],
 )
 def test_wrong_shapes_are_named(name: str, shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=f"{name} must be"):

@@ -83,7 +83,9 @@ def test_depth_where_nothing_is_drawn_is_zero_with_a_finite_gradient() -> None:
     assert picture.depth is not None
     assert picture.alpha[0, -1, -1] == picture.depth[0, -1, -1] == 0
     picture.depth.sum().backward()
-    assert all(x.grad is not None and x.grad.isfinite().all() for x in gaussians.tensors().values() if x is not gaussians.sh)
+    assert all(
+        x.grad is not None and x.grad.isfinite().all() for x in gaussians.tensors().values() if x is not gaussians.sh
+    )
 
 
 def test_alpha_of_a_half_transparent_wall() -> None:

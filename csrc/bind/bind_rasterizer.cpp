@@ -225,15 +225,17 @@ void bind_blending(nb::module_& module) {
   module.def("rasterize_forward",
              [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background, const EntryArrays& entries,
                 const BlendSettings& settings,
-                std::tuple<Array<S>, Array<S>, Array<int32_t>, MaybeArray<S>> out) {
+                std::tuple<Array<S>, Array<S>, Array<int32_t>, MaybeArray<S>> out, int tallied) {
                const Splats<S> s = in.with_colors(settings, colors);
                const int64_t pixels = s.num_views * s.width * s.height;
-               const auto& [color, transmittance, stop, contributions] = out;
+               const auto& [color, transmittance, stop, tally] = out;
                expect(background, s.num_views * s.channels, "background"), expect(color, pixels * s.channels, "color");
                expect(transmittance, pixels, "transmittance"), expect(stop, pixels, "stop");
-               expect(contributions, s.num_views * s.num_gaussians, "contributions");
+               expect(tally, s.num_views * s.num_gaussians, "tally");
+               if (tallied < 0 || tallied > 3 || tally.has_value() != (tallied > 0))
+                 throw nb::value_error("rasterize: a tally needs its array");
                const Image<S> image{color.data(), transmittance.data(), stop.data(), data_or_null(background),
-                                    data_or_null(contributions)};
+                                    data_or_null(tally), static_cast<Tally>(tallied)};
                const Entries checked = checked_entries(entries, s);
                nb::gil_scoped_release release;
                rasterize_forward(s, checked, image);

@@ -97,13 +97,22 @@ struct Entries {
   int64_t count;
 };
 
+// What is summed per Gaussian besides drawing.
+enum class Tally {
+  kNone,
+  kWeights,  // alpha T: its share of the picture
+  kPixels,   // pixels that it was blended into
+  kLanes,    // pixels that were computed for it, blended or not
+};
+
 template <class S>
 struct Image {
   S* color;               // (V, H, W, D), background composited
   S* transmittance;       // (V, H, W)
   int32_t* stop;          // (V, H, W) entry of the tile at which the pixel was full
   const S* background;    // (V, D) or null
-  S* contributions;       // (V, N) sum over pixels of alpha T, or null
+  S* tally;               // (V, N), or null with Tally::kNone
+  Tally tallied;
 };
 
 template <class S>

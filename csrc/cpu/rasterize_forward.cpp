@@ -17,7 +17,7 @@ template <class S>
 struct Scratch {
   Chunk<S> chunk;
   uint16_t list[kChunk + 16];
-  S sums[kChunk];  // contributions of the chunk's Gaussians
+  S sums[kChunk];  // tallies of the chunk's Gaussians
 };
 
 // Pixels that the Gaussian would take below transmittance_min are full: it is not added and they take no more.
@@ -28,7 +28,7 @@ void mark_full(Mask<S> full, int32_t position, BlockState<S, D>& state) {
   for (; bits != 0; bits &= bits - 1) state.stop[__builtin_ctz(bits)] = position;
 }
 
-template <class S, int D, bool kContributions>
+template <class S, int D, Tally kTally>
 void blend_block(const Splats<S>& s, const TileFrame<S>& frame, int block, int32_t chunk_begin, int listed,
                  Scratch<S>& scratch, BlockState<S, D>& block_state) {
   using P = Packet<S>;
@@ -53,7 +53,10 @@ void blend_block(const Splats<S>& s, const TileFrame<S>& frame, int block, int32
     state.transmittance = next;
     const S* color = scratch.chunk.template color<D>(i);
     for (int c = 0; c < channels; ++c) state.color[c] += weight * P(color[c]);
-    if constexpr (kContributions) scratch.sums[i] += horizontal_sum(weight);
+    if constexpr (kTally == Tally::kWeights) scratch.sums[i] += horizontal_sum(weight);
+    if constexpr (kTally == Tally::kPixels)
+      scratch.sums[i] += static_cast<S>(__builtin_popcount(to_bits(weight > zero)));
+    if constexpr (kTally == Tally::kLanes) scratch.sums[i] += static_cast<S>(kLanes);
   }
   block_state = state;
 }
@@ -77,7 +80,7 @@ bool any_open(const BlockState<S, D>& state) {
   return any(state.threshold < Packet<S>(std::numeric_limits<S>::infinity()));
 }
 
-template <class S, int D, bool kContributions>
+template <class S, int D, Tally kTally>
 void blend_tile(const Splats<S>& s, const Entries& entries, const Image<S>& image, int64_t tile, S* slot_sums) {
   const TileFrame<S> frame = tile_frame(s, tile);
   const int64_t begin = entries.tile_offsets[tile], end = entries.tile_offsets[tile + 1];
@@ -92,37 +95,47 @@ void blend_tile(const Splats<S>& s, const Entries& entries, const Image<S>& imag
   uint32_t open = frame.inside;
   for (int64_t at = begin; at < end && open != 0; at += kChunk) {
     load_chunk<D>(s, entries, frame, at, static_cast<int>(std::min<int64_t>(kChunk, end - at)), scratch.chunk);
-    if constexpr (kContributions) std::fill(scratch.sums, scratch.sums + kChunk, S(0));
+    if constexpr (kTally != Tally::kNone) std::fill(scratch.sums, scratch.sums + kChunk, S(0));
     for (int b = 0; b < kBlocks; ++b) {
       if (!(open >> b & 1)) continue;
       const int listed = scratch.chunk.list_block(b, scratch.list);
-      blend_block<S, D, kContributions>(s, frame, b, static_cast<int32_t>(at - begin), listed, scratch, state[b]);
+      blend_block<S, D, kTally>(s, frame, b, static_cast<int32_t>(at - begin), listed, scratch, state[b]);
       if (!any_open(state[b])) open &= ~(1u << b);
     }
-    if constexpr (kContributions)
+    if constexpr (kTally != Tally::kNone)
       for (int i = 0; i < scratch.chunk.count; ++i) slot_sums[entries.slots[at + i]] = scratch.sums[i];
   }
   for (int b = 0; b < kBlocks; ++b)
     if (frame.inside >> b & 1) write_block(s, frame, b, image, state[b]);
 }
 
-template <class S, int D, bool kContributions>
+template <class S, int D, Tally kTally>
 void blend_all(const Splats<S>& s, const Entries& entries, const Image<S>& image, S* slot_sums) {
   const int64_t tiles = s.num_views * ((s.width + kTile - 1) / kTile) * int64_t{(s.height + kTile - 1) / kTile};
   parallel_for(tiles, 1, s.threads, [&](int64_t begin, int64_t end) {
-    for (int64_t t = begin; t < end; ++t) blend_tile<S, D, kContributions>(s, entries, image, t, slot_sums);
+    for (int64_t t = begin; t < end; ++t) blend_tile<S, D, kTally>(s, entries, image, t, slot_sums);
   });
 }
 
-// Contributions per (Gaussian, tile) entry, then summed per Gaussian in slot order: the same for any thread count.
-template <class S>
-void blend_with_contributions(const Splats<S>& s, const Entries& entries, const Image<S>& image) {
+// Tallies per (Gaussian, tile) entry, then summed per Gaussian in slot order: the same for any thread count.
+template <class S, Tally kTally>
+void blend_with_tally(const Splats<S>& s, const Entries& entries, const Image<S>& image) {
   std::vector<S> slot_sums(entries.count, S(0));
-  blend_all<S, kDynamic, true>(s, entries, image, slot_sums.data());
+  blend_all<S, kDynamic, kTally>(s, entries, image, slot_sums.data());
   for (int64_t i = 0; i < s.num_views * s.num_gaussians; ++i) {
     S sum = 0;
     for (int64_t k = entries.slot_ranges[2 * i]; k < entries.slot_ranges[2 * i + 1]; ++k) sum += slot_sums[k];
-    image.contributions[i] = sum;
+    image.tally[i] = sum;
+  }
+}
+
+template <class S>
+void blend(const Splats<S>& s, const Entries& entries, const Image<S>& image) {
+  switch (s.channels) {
+    case 1: return blend_all<S, 1, Tally::kNone>(s, entries, image, nullptr);
+    case 3: return blend_all<S, 3, Tally::kNone>(s, entries, image, nullptr);
+    case 4: return blend_all<S, 4, Tally::kNone>(s, entries, image, nullptr);
+    default: return blend_all<S, kDynamic, Tally::kNone>(s, entries, image, nullptr);
   }
 }
 
@@ -130,12 +143,11 @@ void blend_with_contributions(const Splats<S>& s, const Entries& entries, const 
 
 template <class S>
 void rasterize_forward(const Splats<S>& s, const Entries& entries, const Image<S>& image) {
-  if (image.contributions != nullptr) return blend_with_contributions(s, entries, image);
-  switch (s.channels) {
-    case 1: return blend_all<S, 1, false>(s, entries, image, nullptr);
-    case 3: return blend_all<S, 3, false>(s, entries, image, nullptr);
-    case 4: return blend_all<S, 4, false>(s, entries, image, nullptr);
-    default: return blend_all<S, kDynamic, false>(s, entries, image, nullptr);
+  switch (image.tallied) {
+    case Tally::kWeights: return blend_with_tally<S, Tally::kWeights>(s, entries, image);
+    case Tally::kPixels: return blend_with_tally<S, Tally::kPixels>(s, entries, image);
+    case Tally::kLanes: return blend_with_tally<S, Tally::kLanes>(s, entries, image);
+    case Tally::kNone: return blend(s, entries, image);
   }
 }
 

@@ -12,20 +12,17 @@ from dyngs.errors import DyngsError
 from dyngs.ops.native import contiguous, core, num_threads
 
 
-def check_finite(tensors: Mapping[str, Tensor]) -> None:
+def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input") -> None:
     """Nothing, if every element is finite.
 
     Raises:
-        DyngsError: naming the tensor, how many elements and how many rows are not finite.
+        DyngsError: naming the tensor, how many elements and how many rows are not finite, and the ``remedy``.
     """
     for name, x in tensors.items():
         count = core.count_nonfinite(contiguous(x), num_threads())
         if count:
             rows = int((~finite_rows([x])).sum())
-            raise DyngsError(
-                f"{name} holds {count} NaN or infinite value(s) in {rows} of {len(x)} rows; "
-                'clean the input, or render with nonfinite="skip" to leave these Gaussians out'
-            )
+            raise DyngsError(f"{name} holds {count} NaN or infinite value(s) in {rows} of {len(x)} rows; {remedy}")
 
 
 def finite_rows(tensors: Sequence[Tensor]) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import torch
 from torch import Tensor
@@ -33,6 +34,36 @@ class BlendOptions:
     transmittance_min: float = 1e-4
     absgrad: bool = False
     max_entries: int = MAX_ENTRIES
+
+    @property
+    def thresholds(self) -> list[float]:
+        return [self.alpha_min, self.alpha_max, self.transmittance_min]
+
+
+@dataclass(frozen=True)
+class TileEntries:
+    """E pairs of a tile and a splat that meets it, sorted by view, tile, depth, index.
+
+    Attributes:
+        tile_offsets: (V T + 1,) int64: where each tile's pairs begin.
+        slot_ranges: (2 V N,) int32: begin and end of each splat's slots in a buffer of E records.
+        gaussians: (E,) int32: view * N + Gaussian.
+        slots: (E,) int32: the pair's own slot.
+    """
+
+    tile_offsets: Tensor
+    slot_ranges: Tensor
+    gaussians: Tensor
+    slots: Tensor
+
+    def tensors(self) -> list[Tensor]:
+        return [self.tile_offsets, self.slot_ranges, self.gaussians, self.slots]
+
+    @property
+    def tiles_per_gaussian(self) -> Tensor:
+        """(V N,) int32."""
+        begin, end = self.slot_ranges.view(-1, 2).unbind(1)
+        return end - begin
 
 
 @dataclass(frozen=True)
@@ -108,6 +139,7 @@ def _blend(
         tuple(entries),
         _settings(size, thresholds),
         (color, transmittance, stop, None),
+        0,
     )
     return color, transmittance, stop
 
@@ -191,12 +223,14 @@ def _backward(ctx, g_color, g_transmittance, _g_stop):
 torch.library.register_autograd("dyngs::blend", _backward, setup_context=_setup_context)
 
 
-def _splat_lists(projection: Projection, opacities: Tensor, size: list[int], options: BlendOptions):
-    thresholds = [options.alpha_min, options.alpha_max, options.transmittance_min]
+def bin_tiles(
+    projection: Projection, opacities: Tensor, size: tuple[int, int], options: BlendOptions = BlendOptions()
+) -> TileEntries:
+    """Which splats each 16x16 tile shows, nearest first; arguments as for ``rasterize``."""
     with torch.no_grad():
         splats = [projection.means2d, projection.factors, opacities, projection.radii]
-        entries = _bin_tiles(splats, projection.depths, size, thresholds, options.max_entries)
-    return list(entries), thresholds
+        thresholds = options.thresholds
+        return TileEntries(*_bin_tiles(splats, projection.depths, list(size), thresholds, options.max_entries))
 
 
 def rasterize(
@@ -208,6 +242,7 @@ def rasterize(
     background: Tensor | None = None,
     probe: Tensor | None = None,
     options: BlendOptions = BlendOptions(),
+    entries: TileEntries | None = None,
 ) -> Blended:
     """Splats blended front to back into V images of D channels.
 
@@ -222,13 +257,14 @@ def rasterize(
         probe: (V, N, 4) zeros; its gradient is the signed gradient of the 2D means in px, then (with ``absgrad``) the
             sum over pixels of its absolute values.
         options: thresholds.
+        entries: what ``bin_tiles`` returned for the same splats, size and options, to save doing it again.
 
     Raises:
         DyngsError: too many channels, or more (Gaussian, tile) pairs than ``options.max_entries``.
     """
     if not 1 <= colors.shape[-1] <= MAX_CHANNELS:
         raise DyngsError(f"colors have {colors.shape[-1]} channels; 1 to {MAX_CHANNELS} can be blended in one call")
-    entries, thresholds = _splat_lists(projection, opacities, list(size), options)
+    entries = entries or bin_tiles(projection, opacities, size, options)
     color, transmittance, _ = _blend(
         projection.means2d,
         projection.factors,
@@ -237,26 +273,42 @@ def rasterize(
         background,
         probe,
         projection.radii,
-        entries,
+        entries.tensors(),
         list(size),
-        thresholds,
+        options.thresholds,
         options.absgrad,
     )
     return Blended(color, transmittance)
 
 
-def contribution_sums(
-    projection: Projection, opacities: Tensor, size: tuple[int, int], options: BlendOptions = BlendOptions()
-) -> Tensor:
-    """(V, N) sums over pixels of alpha times transmittance: how much of each picture every Gaussian makes up.
+class Tally(IntEnum):
+    """What ``tally`` sums per Gaussian; numbers as in csrc/core/api.hpp."""
 
-    Arguments as for ``rasterize``; not differentiable.
+    WEIGHTS = 1
+    """alpha times transmittance: its share of the picture"""
+    PIXELS = 2
+    """pixels that it was blended into"""
+    LANES = 3
+    """pixels that were computed for it, blended or not"""
+
+
+def tally(
+    projection: Projection,
+    opacities: Tensor,
+    size: tuple[int, int],
+    kind: Tally,
+    options: BlendOptions = BlendOptions(),
+) -> Tensor:
+    """(V, N) sums over pixels of what ``kind`` says, for every Gaussian; not differentiable.
+
+    Other arguments as for ``rasterize``.
     """
-    entries, thresholds = _splat_lists(projection, opacities, list(size), options)
+    entries = bin_tiles(projection, opacities, size, options)
     shape = (opacities.shape[0], size[1], size[0])
     colors = torch.zeros_like(opacities)[..., None]
     sums = torch.empty_like(opacities, memory_format=torch.contiguous_format)
     image = (colors.new_empty(*shape, 1), colors.new_empty(shape), torch.empty(shape, dtype=torch.int32), sums)
     splats = _arrays(projection.means2d, projection.factors, opacities, projection.radii)
-    core.rasterize_forward(splats, contiguous(colors), None, tuple(entries), _settings(list(size), thresholds), image)
+    settings = _settings(list(size), options.thresholds)
+    core.rasterize_forward(splats, contiguous(colors), None, tuple(entries.tensors()), settings, image, int(kind))
     return sums

@@ -36,7 +36,9 @@ def test_counts_elements_and_rows(dtype: torch.dtype, places: set[tuple[int, int
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_extreme_but_finite_numbers_pass(dtype: torch.dtype) -> None:
     info = torch.finfo(dtype)
-    check_finite({"x": torch.tensor([info.max, -info.max, info.tiny, info.smallest_normal / 4, 0.0, -0.0], dtype=dtype)})
+    check_finite(
+        {"x": torch.tensor([info.max, -info.max, info.tiny, info.smallest_normal / 4, 0.0, -0.0], dtype=dtype)}
+    )
 
 
 def test_sees_strided_and_large_tensors() -> None:

@@ -27,7 +27,7 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 from dyngs.ops import reference
 from dyngs.ops.projection import Projection
-from dyngs.ops.rasterization import MAX_CHANNELS, Blended, BlendOptions, contribution_sums, rasterize
+from dyngs.ops.rasterization import MAX_CHANNELS, Blended, BlendOptions, Tally, rasterize, tally
 
 
 def with_channels(scene: Scene, channels: int) -> tuple[Projection, Tensor, Tensor, Tensor]:
@@ -125,7 +125,7 @@ def test_threads_do_not_matter(set_threads: Callable[[int], None]) -> None:
     for n in (1, 2, 8):
         set_threads(n)
         blended = draw(scene).blended
-        sums = contribution_sums(*splats_of(scene), scene.size)
+        sums = tally(*splats_of(scene), scene.size, Tally.WEIGHTS)
         found.append([blended.color, blended.transmittance, sums, *gradients(scene).values()])
     for other in found[1:]:
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
@@ -134,7 +134,9 @@ def test_threads_do_not_matter(set_threads: Callable[[int], None]) -> None:
 def test_threads_do_not_matter_to_the_sort(set_threads: Callable[[int], None]) -> None:
     """More than 2^18 Gaussians are sorted in parallel."""
     scene = random_scene(n=280_000, views=1, size=(48, 48)).to(torch.float32)
-    scene = replace(scene, means=0.3 * scene.means, scales=0.01 * scene.scales, opacities=0.005 + 0.01 * scene.opacities)
+    scene = replace(
+        scene, means=0.3 * scene.means, scales=0.01 * scene.scales, opacities=0.005 + 0.01 * scene.opacities
+    )
     projection, opacities = splats_of(scene)
     assert (projection.radii[..., 0] > 0).sum() > 2**18
     found = []
@@ -218,14 +220,14 @@ def test_contributions_are_the_slopes_of_the_colours(scene: Scene) -> None:
     colors = torch.rand_like(opacities)[..., None].requires_grad_()
     total = rasterize(projection, opacities, colors, scene.size).color.sum()
     (slope,) = torch.autograd.grad(total, colors)
-    sums = contribution_sums(projection, opacities, scene.size)
+    sums = tally(projection, opacities, scene.size, Tally.WEIGHTS)
     torch.testing.assert_close(sums, slope[..., 0], rtol=1e-12, atol=1e-14)
     torch.testing.assert_close((sums * colors[..., 0]).sum(), total, rtol=1e-12, atol=0)
 
 
 def test_contributions_and_the_background_make_up_the_picture(scene: Scene) -> None:
     projection, opacities = splats_of(scene)
-    sums = contribution_sums(projection, opacities, scene.size)
+    sums = tally(projection, opacities, scene.size, Tally.WEIGHTS)
     light = draw(scene).blended.transmittance
     torch.testing.assert_close(sums.sum(1) + light.sum((1, 2)), torch.full((2,), 37.0 * 29, dtype=torch.float64))
 
@@ -259,7 +261,7 @@ def test_no_gaussians_leave_the_background() -> None:
     assert (blended.transmittance == 1).all()
     found = gradients(scene)
     torch.testing.assert_close(found["background"], weights(blended.color).sum((1, 2)))
-    assert contribution_sums(*splats_of(scene), scene.size).shape == (2, 0)
+    assert tally(*splats_of(scene), scene.size, Tally.WEIGHTS).shape == (2, 0)
 
 
 @pytest.mark.parametrize("size", [(8192, 1), (1, 8192)], ids=str)
@@ -309,7 +311,7 @@ def test_gradient_given_as_an_expanded_scalar(scene: Scene) -> None:
     colors = colors.requires_grad_()
     rasterize(projection, opacities, colors, scene.size).color.sum().backward()
     assert colors.grad is not None
-    sums = contribution_sums(projection, opacities, scene.size)
+    sums = tally(projection, opacities, scene.size, Tally.WEIGHTS)
     torch.testing.assert_close(colors.grad, sums[..., None].expand(-1, -1, 3), rtol=1e-12, atol=1e-14)
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from dyngs.rendering import RenderOptions, render
 
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, StaticModel
@@ -20,6 +19,7 @@ from dyngs.data.loader import Picture
 from dyngs.data.synthetic import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.rendering import RenderOptions, render
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.train.evaluate import (
     evaluate_run,

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from dyngs.rendering import RenderOptions, render
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,6 +19,7 @@ from dyngs.data.synthetic import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.export.ply import SplatFile, read_ply, write_ply
 from dyngs.gaussians import Gaussians
+from dyngs.rendering import RenderOptions, render
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.view.frames import (
     OutputOptions,

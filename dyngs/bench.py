@@ -1,0 +1,264 @@
+"""``dyngs bench``: how fast the kernels are on this machine, next to what its matrix product reaches."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.data.write import write_text
+from dyngs.errors import DyngsError
+from dyngs.ops.native import active_isa, kernel_threads
+from dyngs.ops.projection import Projection, ProjectionOptions, project
+from dyngs.ops.rasterization import BlendOptions, Tally, TileEntries, bin_tiles, rasterize, tally
+
+SGEMM_SIZE = 2048
+STAGES = ("project", "bin + sort", "blend", "blend backward", "project backward")
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Gaussians and one camera, as the kernels take them.
+
+    Attributes:
+        means, quats, scales: (N, 3), (N, 4), (N, 3).
+        opacities: (N,).
+        colors: (1, N, 3).
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    cameras: Cameras
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.cameras.width, self.cameras.height
+
+
+@dataclass(frozen=True)
+class StageTimes:
+    """Medians over the repeats, at one number of threads.
+
+    Attributes:
+        threads: of the kernels and of the matrix product.
+        milliseconds: stage name to time.
+        fastest: the same, best of the repeats.
+        sgemm_gflops: rate of a float32 matrix product of 2048 x 2048, measured between the repeats.
+    """
+
+    threads: int
+    milliseconds: dict[str, float]
+    fastest: dict[str, float]
+    sgemm_gflops: float
+
+    @property
+    def total(self) -> float:
+        return sum(self.milliseconds.values())
+
+
+@dataclass(frozen=True)
+class RasterizeReport:
+    """What ``dyngs bench rasterize`` measured.
+
+    Attributes:
+        pairs: (pixel, Gaussian) pairs that were blended.
+        lanes_used: share of the computed pairs that were blended.
+        entries: (tile, Gaussian) pairs.
+    """
+
+    isa: str
+    num_gaussians: int
+    num_visible: int
+    width: int
+    height: int
+    entries: int
+    pairs: int
+    lanes_used: float
+    runs: list[StageTimes]
+
+
+def run_bench(argv: list[str]) -> int:
+    """Exit code of ``dyngs bench ARGV``."""
+    parser = _Parser(prog="dyngs bench", description="Measure the kernels on this machine.")
+    commands = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
+    raster = commands.add_parser("rasterize", help="projection, binning and blending, forward and backward")
+    raster.add_argument("--points", type=Path, help="npz with means3d, colors, viewmats, Ks, width, height")
+    raster.add_argument("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()])
+    raster.add_argument("--repeats", type=int, default=30)
+    raster.add_argument("--json", type=Path, help="also write the figures there")
+    try:
+        arguments = parser.parse_args(argv)
+    except SystemExit as stop:  # after --help
+        return int(stop.code or 0)
+    if arguments.repeats < 1 or min(arguments.threads) < 1:
+        raise DyngsError("dyngs bench: --repeats and --threads must be at least 1")
+    workload = garden_workload(arguments.points) if arguments.points else random_workload()
+    report = bench_rasterize(workload, sorted(set(arguments.threads)), arguments.repeats)
+    print(format_report(report))
+    if arguments.json:
+        write_text(arguments.json, json.dumps(asdict(report), indent=2) + "\n")
+    return 0
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose complaints are one line."""
+
+    def error(self, message: str):
+        raise DyngsError(f"{message} (see `{self.prog} --help`)")
+
+
+def garden_workload(path: Path) -> Workload:
+    """gsplat's benchmark: the points within 2 units of the origin, with random shapes and opacities, first camera.
+
+    Raises:
+        DyngsError: the file is missing or holds something else.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {name: file[name] for name in ("means3d", "colors", "viewmats", "Ks", "width", "height")}
+    except (OSError, ValueError, KeyError) as error:
+        raise DyngsError(f"{path}: cannot be read as a benchmark workload ({error})") from None
+    near = (np.abs(data["means3d"]) <= 2).all(axis=1)
+    means = torch.from_numpy(data["means3d"][near]).float()
+    colors = torch.from_numpy(data["colors"][near]).float()[None] / 255
+    view, intrinsics = (torch.from_numpy(data[name][:1]).float() for name in ("viewmats", "Ks"))
+    return _with_random_shapes(means, colors, Cameras(view, intrinsics, int(data["width"]), int(data["height"])))
+
+
+def random_workload(num_gaussians: int = 110_000) -> Workload:
+    """The same kind of load without a file: a plate of points seen at an angle."""
+    generator = torch.Generator().manual_seed(0)
+    means = (torch.rand(num_gaussians, 3, generator=generator) - 0.5) * torch.tensor([4.0, 4.0, 1.0])
+    view = torch.eye(4)
+    view[2, 3] = 3.0
+    intrinsics = torch.tensor([[480.0, 0, 324], [0, 480, 210], [0, 0, 1]])
+    colors = torch.rand(1, num_gaussians, 3, generator=generator)
+    return _with_random_shapes(means, colors, Cameras(view[None], intrinsics[None], 648, 420))
+
+
+def _with_random_shapes(means: Tensor, colors: Tensor, cameras: Cameras) -> Workload:
+    generator = torch.Generator().manual_seed(42)
+    n = len(means)
+    scales = torch.rand(n, 3, generator=generator) * 0.02
+    quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=generator), dim=-1)
+    return Workload(means, quats, scales, torch.rand(n, generator=generator), colors.contiguous(), cameras)
+
+
+def bench_rasterize(load: Workload, threads: list[int], repeats: int) -> RasterizeReport:
+    """Times of every stage, all stages and thread counts taken in turn so that noise hits them alike."""
+    with torch.no_grad():
+        projection = project(load.means, load.quats, load.scales, load.opacities, load.cameras, _LIMITS)
+    opacities = load.opacities[None]
+    entries = bin_tiles(projection, opacities, load.size)
+    pairs, lanes = (
+        float(tally(projection, opacities, load.size, kind).double().sum()) for kind in (Tally.PIXELS, Tally.LANES)
+    )
+    samples = {count: {name: [] for name in (*STAGES, "sgemm")} for count in threads}
+    for repeat in range(repeats + 2):
+        for count in threads:
+            taken = _time_stages(load, projection, entries, count)
+            if repeat >= 2:  # the first two warm caches and allocator
+                for name, seconds in taken.items():
+                    samples[count][name].append(seconds)
+    return RasterizeReport(
+        isa=active_isa(),
+        num_gaussians=len(load.means),
+        num_visible=int((projection.radii[0, :, 0] > 0).sum()),
+        width=load.size[0],
+        height=load.size[1],
+        entries=len(entries.gaussians),
+        pairs=int(pairs),
+        lanes_used=pairs / max(lanes, 1.0),
+        runs=[_summary(count, samples[count]) for count in threads],
+    )
+
+
+_LIMITS = ProjectionOptions(near=0.01)
+
+
+def _time_stages(load: Workload, projection: Projection, entries: TileEntries, threads: int) -> dict[str, float]:
+    """Seconds of each stage, once."""
+    leaves = [x.clone().requires_grad_() for x in (load.means, load.quats, load.scales)]
+    splats = [projection.means2d, projection.factors, load.opacities[None], load.colors]
+    means2d, factors, opacities, colors = (x.clone().requires_grad_() for x in splats)
+    flat = Projection(means2d, projection.depths, factors, projection.compensations, projection.radii)
+    seconds: dict[str, float] = {}
+    with kernel_threads(threads):
+        seconds["project"], projected = _timed(
+            lambda: project(*leaves, load.opacities, load.cameras, _LIMITS)  # type: ignore[misc]
+        )
+        seconds["bin + sort"], _ = _timed(lambda: bin_tiles(projection, load.opacities[None], load.size))
+        seconds["blend"], blended = _timed(
+            lambda: rasterize(flat, opacities, colors, load.size, options=BlendOptions(), entries=entries)
+        )
+        grad = torch.ones_like(blended.color)
+        seconds["blend backward"], _ = _timed(lambda: torch.autograd.backward(blended.color, grad))
+        outputs = [projected.means2d, projected.factors, projected.depths]
+        grads = [torch.ones_like(x) for x in outputs]
+        seconds["project backward"], _ = _timed(lambda: torch.autograd.backward(outputs, grads))
+    seconds["sgemm"] = _sgemm_seconds(threads)
+    return seconds
+
+
+def _timed(work: Callable):
+    start = time.perf_counter()
+    result = work()
+    return time.perf_counter() - start, result
+
+
+def _sgemm_seconds(threads: int) -> float:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    a = torch.ones(SGEMM_SIZE, SGEMM_SIZE)
+    a @ a
+    seconds, _ = _timed(lambda: a @ a)
+    torch.set_num_threads(before)
+    return seconds
+
+
+def _summary(threads: int, samples: dict[str, list[float]]) -> StageTimes:
+    milliseconds = {name: 1e3 * statistics.median(samples[name]) for name in STAGES}
+    fastest = {name: 1e3 * min(samples[name]) for name in STAGES}
+    return StageTimes(threads, milliseconds, fastest, 2e-9 * SGEMM_SIZE**3 / statistics.median(samples["sgemm"]))
+
+
+def format_report(report: RasterizeReport) -> str:
+    """The report as text."""
+    lines = [
+        f"{report.num_gaussians:,} Gaussians, {report.num_visible:,} visible at {report.width}x{report.height}, "
+        f"{report.entries:,} tile entries, {report.pairs / 1e6:.1f} M blended pairs, "
+        f"{report.lanes_used:.0%} of the lanes used; instruction set {report.isa}",
+        f"{'stage, median (best) ms':<26}" + "".join(f"{f'{run.threads} thread(s)':>20}" for run in report.runs),
+    ]
+    for name in STAGES:
+        cells = [f"{run.milliseconds[name]:10.2f} ({run.fastest[name]:6.2f})" for run in report.runs]
+        lines.append(f"{name:<26}" + "".join(f"{cell:>20}" for cell in cells))
+    rows = [
+        ("all stages", [f"{run.total:.2f}" for run in report.runs]),
+        ("speed-up", [f"{report.runs[0].total / run.total:.2f}x" for run in report.runs]),
+        ("project + bin, share", [f"{_preparation_share(run):.0%}" for run in report.runs]),
+        ("sgemm, GFLOP/s", [f"{run.sgemm_gflops:.0f}" for run in report.runs]),
+    ]
+    for name in ("blend", "blend backward"):
+        rates = [1e-3 * report.pairs / run.milliseconds[name] for run in report.runs]
+        rows.append((f"{name}, M pairs/s", [f"{rate:.0f}" for rate in rates]))
+        per_flop = [rate / run.sgemm_gflops for rate, run in zip(rates, report.runs, strict=True)]
+        rows.append(("  per sgemm GFLOP/s", [f"{x:.2f}" for x in per_flop]))
+    lines += [f"{name:<26}" + "".join(f"{cell:>20}" for cell in cells) for name, cells in rows]
+    return "\n".join(lines)
+
+
+def _preparation_share(run: StageTimes) -> float:
+    return (run.milliseconds["project"] + run.milliseconds["bin + sort"]) / run.total

@@ -1,0 +1,512 @@
+"""Numbers at the extremes: one test per row of the table in docs/numerics.md.
+
+Each compares float32 with float64 on the same numbers, or with the analytic answer, or asserts the exact error; and in
+each every gradient is finite.
+"""
+
+from __future__ import annotations
+
+import math
+import resource
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scenes import random_scene, relative_error, weights
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.conventions import SH_C0, RasterizeMode
+from dyngs.data.capture import Capture, PointCloud, View
+from dyngs.data.rebase import rebase
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.ops.projection import Projection, ProjectionOptions, project
+from dyngs.ops.rasterization import BlendOptions, rasterize
+from dyngs.rendering import Rendering, RenderOptions, render
+
+USUAL = RenderOptions()
+ANTIALIASED = RenderOptions(mode=RasterizeMode.ANTIALIASED)
+NO_THRESHOLDS = RenderOptions(alpha_min=0.0, transmittance_min=0.0)
+FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
+BACKGROUND = torch.tensor([0.1, 0.2, 0.4])
+
+
+def camera(width: int = 37, height: int = 29, focal: float = 30.0) -> Cameras:
+    """At the origin, looking along +z, float32."""
+    intrinsics = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]])
+    return Cameras(torch.eye(4)[None], intrinsics, width, height)
+
+
+def some_gaussians(n: int = 6, z: float = 3.0, **changes: Tensor | float) -> Gaussians:
+    """n float32 Gaussians in front of ``camera()``; numbers in ``changes`` fill a whole field."""
+    scene = random_scene(n=n, views=1, seed=11).to(torch.float32)
+    means = 0.5 * scene.means + torch.tensor([0.0, 0.0, z])
+    gaussians = replace(scene, means=means, opacities=0.5 + 0.4 * scene.opacities).gaussians
+    given = {
+        name: value if isinstance(value, Tensor) else torch.full_like(getattr(gaussians, name), value)
+        for name, value in changes.items()
+    }
+    return gaussians.replace(**given)
+
+
+def one_gaussian(mean: tuple[float, float, float], scale: float, opacity: float = 0.5) -> Gaussians:
+    return Gaussians(
+        means=torch.tensor([mean]),
+        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        log_scales=torch.full((1, 3), math.log(scale)),
+        logit_opacities=torch.tensor([math.log(opacity / (1 - opacity))]),
+        sh=torch.tensor([[[1.0, 0.5, -0.5]]]),
+    )
+
+
+def drawn_with_gradients(
+    gaussians: Gaussians, cameras: Cameras, options: RenderOptions, dtype: torch.dtype
+) -> tuple[Rendering, dict[str, Tensor]]:
+    """A picture, and the gradients of a weighted sum of its colours and alphas."""
+    leaves = Gaussians(**{k: x.detach().to(dtype).requires_grad_() for k, x in gaussians.tensors().items()})
+    picture = render(leaves, cameras.to(dtype=dtype), options, background=BACKGROUND)
+    total = (picture.rgb * weights(picture.rgb)).sum() + (picture.alpha * weights(picture.alpha)).sum()
+    found = torch.autograd.grad(total, list(leaves.tensors().values()))
+    return picture, dict(zip(FIELDS, found, strict=True))
+
+
+def check_against_float64(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    *,
+    options: RenderOptions = USUAL,
+    tolerance: float = 1e-5,
+    gradient_tolerance: float = 1e-4,
+) -> Rendering:
+    """The float32 picture, after comparing it and its gradients with float64 of the same numbers.
+
+    Tolerances are those without thresholds: colours absolutely (rounding of 6e-8 times up to a hundred operations),
+    gradients relative to the largest of their kind (terms of both signs cancel). With thresholds a pixel within rounding
+    of one may differ by 1/255.
+    """
+    unlimited = replace(options, alpha_min=0.0, transmittance_min=0.0)
+    picture, slopes = drawn_with_gradients(gaussians, cameras, unlimited, torch.float32)
+    truth, true_slopes = drawn_with_gradients(gaussians, cameras, unlimited, torch.float64)
+    assert (picture.rgb - truth.rgb).abs().max() < tolerance
+    assert (picture.alpha - truth.alpha).abs().max() < tolerance
+    for name in FIELDS:
+        assert slopes[name].isfinite().all(), name
+        scale = max(1e-6, float(true_slopes[name].abs().max()))  # smaller gradients move nothing
+        assert (slopes[name] - true_slopes[name]).abs().max() / scale < gradient_tolerance, name
+    picture, slopes = drawn_with_gradients(gaussians, cameras, options, torch.float32)
+    truth, _ = drawn_with_gradients(gaussians, cameras, options, torch.float64)
+    assert (picture.rgb - truth.rgb).abs().max() < tolerance + 1.1 / 255
+    assert all(x.isfinite().all() for x in slopes.values())
+    return picture
+
+
+def is_background(picture: Rendering) -> bool:
+    return torch.equal(picture.rgb, BACKGROUND.to(picture.rgb.dtype).expand_as(picture.rgb))
+
+
+def gradients_vanish(gaussians: Gaussians, cameras: Cameras, options: RenderOptions = USUAL) -> bool:
+    """Nothing is drawn, and every gradient is exactly zero."""
+    picture, slopes = drawn_with_gradients(gaussians, cameras, options, torch.float32)
+    return is_background(picture) and not any(x.any() for x in slopes.values())
+
+
+# --- scales -----------------------------------------------------------------------------------------------------------
+
+
+def test_scale_1e_minus_12_is_a_dot_of_the_low_pass() -> None:
+    """Alpha is o exp(-d^2 / (2 eps2d)), whatever the rotation."""
+    gaussians = some_gaussians(n=1, means=torch.tensor([[0.0, 0.0, 3.0]]), log_scales=math.log(1e-12))
+    picture = check_against_float64(gaussians, camera(), options=NO_THRESHOLDS)
+    x, y = torch.meshgrid(torch.arange(37) + 0.5 - 18.5, torch.arange(29) + 0.5 - 14.5, indexing="xy")
+    expected = gaussians.opacities * (-(x * x + y * y) / 0.6).exp()
+    torch.testing.assert_close(picture.alpha[0], expected, rtol=0, atol=1e-6)
+    check_against_float64(some_gaussians(log_scales=math.log(1e-12)), camera())
+
+
+def test_scale_1e_minus_12_vanishes_when_antialiased() -> None:
+    assert gradients_vanish(some_gaussians(log_scales=math.log(1e-12)), camera(), ANTIALIASED)
+
+
+def test_scale_1e12_is_a_uniform_veil() -> None:
+    picture = check_against_float64(some_gaussians(log_scales=math.log(1e12)), camera())
+    alpha = 1 - (1 - some_gaussians().opacities.clamp_max(0.99)).prod()
+    torch.testing.assert_close(picture.alpha, alpha.expand(1, 29, 37), rtol=0, atol=2e-6)
+    check_against_float64(some_gaussians(log_scales=math.log(1e12)), camera(), options=ANTIALIASED)
+
+
+@pytest.mark.parametrize("log_scale", [-1e4, 43.0, 80.0, 88.7])
+def test_scales_that_underflow_or_overflow_their_squares_stay_finite(log_scale: float) -> None:
+    """exp(43)^2 is the last square that float32 holds; larger Gaussians are culled, smaller ones are dots."""
+    _, slopes = drawn_with_gradients(some_gaussians(log_scales=log_scale), camera(), USUAL, torch.float32)
+    assert all(x.isfinite().all() for x in slopes.values())
+
+
+def test_scales_beyond_float32_are_an_error_or_skipped() -> None:
+    gaussians = some_gaussians(log_scales=89.0)
+    with pytest.raises(DyngsError, match=r"exp\(log_scales\) holds 18 NaN or infinite value\(s\) in 6 of 6 rows"):
+        render(gaussians, camera())
+    assert gradients_vanish(gaussians, camera(), RenderOptions(nonfinite="skip"))
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("mode", RasterizeMode)
+def test_needles_of_1e8_to_1(axis: int, mode: RasterizeMode) -> None:
+    """1000 units long, 1e-5 thick. The gradient with respect to the rotation is large (a turn by 1e-3 rad moves the needle
+    out of its pixel), and with respect to the thickness negligible."""
+    log_scales = torch.full((6, 3), math.log(1e-5))
+    log_scales[:, axis] = math.log(1e3)
+    check_against_float64(
+        some_gaussians(log_scales=log_scales), camera(), options=RenderOptions(mode=mode), gradient_tolerance=1e-3
+    )
+
+
+def test_needle_keeps_its_width() -> None:
+    """A diagonal needle: alpha o exp(-d^2 / (2 eps2d)) with d the distance from the line, to 1e-5 (d has 7 digits)."""
+    angle = 0.7
+    gaussians = one_gaussian((0.0, 0.0, 3.0), 1.0)
+    gaussians = gaussians.replace(
+        quats=torch.tensor([[math.cos(angle / 2), 0, 0, math.sin(angle / 2)]]),
+        log_scales=torch.tensor([[math.log(1e4), math.log(1e-4), math.log(1e-4)]]),
+    )
+    alpha = render(gaussians, camera(), NO_THRESHOLDS).alpha[0]
+    x, y = torch.meshgrid(torch.arange(37) + 0.5 - 18.5, torch.arange(29) + 0.5 - 14.5, indexing="xy")
+    distance = x.double() * math.sin(angle) - y.double() * math.cos(angle)
+    torch.testing.assert_close(alpha.double(), 0.5 * (-(distance**2) / (0.6 + 2e-6)).exp(), rtol=0, atol=1e-5)
+
+
+# --- quaternions ------------------------------------------------------------------------------------------------------
+
+
+def test_zero_quaternion_is_the_identity() -> None:
+    zero, identity = some_gaussians(quats=0.0), some_gaussians(quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1))
+    assert torch.equal(render(zero, camera()).rgb, render(identity, camera()).rgb)
+    check_against_float64(zero, camera())
+    _, slopes = drawn_with_gradients(zero, camera(), USUAL, torch.float32)
+    assert not slopes["quats"].any()
+    assert slopes["log_scales"].any()
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e3, 1e30, 1e-30])
+def test_unnormalised_quaternions(size: float) -> None:
+    """Same picture; the gradient is divided by the size."""
+    unit, long = some_gaussians(), some_gaussians(quats=some_gaussians().quats * size)
+    picture = check_against_float64(long, camera())
+    torch.testing.assert_close(picture.rgb, render(unit, camera(), background=BACKGROUND).rgb, rtol=0, atol=1e-5)
+    slopes, unit_slopes = (drawn_with_gradients(g, camera(), NO_THRESHOLDS, torch.float32)[1] for g in (long, unit))
+    if size == 1e-30:
+        assert (slopes["quats"].abs() <= 1e12 * unit_slopes["quats"].abs().max() * 10).all()  # capped, see below
+    else:
+        assert relative_error(slopes["quats"] * size, unit_slopes["quats"]) < 1e-4
+
+
+def test_denormal_quaternions() -> None:
+    """The direction of a denormal has few digits, but it is a direction: same picture as that direction normalised. The
+    gradient per unit is capped at 1e12 times that of a unit quaternion."""
+    units = torch.tensor(
+        [[1.0, 0, 0, 0], [1.0, 1, 0, 0], [0.5, 0.5, -0.5, 0.5], [0, 0, 1, 1], [1, 0, -1, 0], [1, 1, 1, 1]]
+    )
+    tiny = some_gaussians(quats=units * 2.0**-140)
+    assert (tiny.quats != 0).any()
+    assert tiny.quats.abs().max() < torch.finfo(torch.float32).tiny
+    slopes = {}
+    for name, gaussians in {"tiny": tiny, "unit": some_gaussians(quats=units)}.items():
+        picture, slopes[name] = drawn_with_gradients(gaussians, camera(), NO_THRESHOLDS, torch.float32)
+        if name == "unit":
+            torch.testing.assert_close(picture.rgb, tiny_rgb, rtol=0, atol=1e-6)
+        tiny_rgb = picture.rgb
+    assert slopes["tiny"]["quats"].isfinite().all()
+    lengths = units.abs().amax(1, keepdim=True) / units.norm(dim=1, keepdim=True)
+    unit_slopes = slopes["unit"]["quats"] * units.norm(dim=1, keepdim=True)
+    assert relative_error(slopes["tiny"]["quats"], unit_slopes * lengths * 1e12) < 1e-4
+
+
+# --- opacities --------------------------------------------------------------------------------------------------------
+
+
+def blended_with(opacities: list[float], dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """Alpha of a ball, and the gradients of opacity and position, through the ops that take opacities."""
+    n = len(opacities)
+    cameras = camera().to(dtype=dtype)
+    opacity = torch.tensor(opacities, dtype=dtype, requires_grad=True)
+    means = torch.tensor([[0.0, 0, 3]], dtype=dtype).repeat(n, 1).requires_grad_()
+    quats, scales = torch.ones(n, 4, dtype=dtype), torch.full((n, 3), 0.2, dtype=dtype)
+    projection = project(means, quats, scales, opacity, cameras)
+    blended = rasterize(projection, opacity[None], torch.ones(1, n, 1, dtype=dtype), (37, 29))
+    (blended.color * weights(blended.color)).sum().backward()
+    assert opacity.grad is not None
+    assert means.grad is not None
+    return 1 - blended.transmittance[0], opacity.grad, means.grad
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1 / 255])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_opacity_0_and_1_in_255_are_not_drawn(opacity: float, dtype: torch.dtype) -> None:
+    alpha, opacity_slope, mean_slope = blended_with([opacity], dtype)
+    assert not alpha.any()
+    assert not opacity_slope.any()
+    assert not mean_slope.any()
+
+
+def test_opacity_just_above_the_threshold_is_drawn_where_it_peaks() -> None:
+    alpha, opacity_slope, mean_slope = blended_with([1.01 / 255], torch.float32)
+    assert 0 < (alpha > 0).sum() <= 4
+    assert opacity_slope.isfinite().all()
+    assert mean_slope.isfinite().all()
+
+
+def test_opacity_1_is_clamped_and_the_clamp_stops_the_gradient() -> None:
+    alpha, opacity_slope, mean_slope = blended_with([1.0], torch.float32)
+    truth, true_slope, true_mean = blended_with([1.0], torch.float64)
+    assert float(alpha.max()) == pytest.approx(0.99)
+    assert (alpha - truth).abs().max() < 1e-6 + 1.1 / 255
+    assert opacity_slope.item() == pytest.approx(true_slope.item(), rel=0.01)  # a pixel at the edge may be missing
+    assert relative_error(mean_slope, true_mean) < 0.01
+
+
+@pytest.mark.parametrize("logit", [-100.0, 100.0])
+def test_logits_of_plus_and_minus_100(logit: float) -> None:
+    gaussians = some_gaussians(logit_opacities=logit)
+    if logit < 0:
+        assert gradients_vanish(gaussians, camera())
+        return
+    picture = check_against_float64(gaussians, camera(), tolerance=2e-5)
+    assert float(picture.alpha.max()) <= 1
+    _, slopes = drawn_with_gradients(gaussians, camera(), USUAL, torch.float32)
+    assert not slopes["logit_opacities"].any()  # the sigmoid is flat there
+    assert slopes["means"].any()
+
+
+# --- positions --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "mean",
+    [(0.0, 0.0, 0.0), (0.0, 0.0, 0.2), (0.3, 0.1, 0.2), (0.0, 0.0, -3.0), (1.0, 1.0, 0.0), (0.0, 0.0, 1e10)],
+    ids=[
+        "camera centre",
+        "on the near plane",
+        "on it, beside the axis",
+        "behind",
+        "beside the camera",
+        "on the far plane",
+    ],
+)
+@pytest.mark.parametrize("scale", [0.01, 10.0, 1e6])
+def test_centres_outside_the_planes_are_culled(mean: tuple[float, float, float], scale: float) -> None:
+    assert gradients_vanish(one_gaussian(mean, scale), camera())
+
+
+@pytest.mark.parametrize("mean", [(0.0, 0.0, 0.2001), (0.3, -0.2, 0.21), (5.0, 3.0, 0.25)])
+@pytest.mark.parametrize("scale", [0.05, 1.0, 100.0])
+def test_straddling_the_near_plane(mean: tuple[float, float, float], scale: float) -> None:
+    """Drawn by its linearisation at the centre, however much of it lies behind the camera."""
+    check_against_float64(one_gaussian(mean, scale), camera(), gradient_tolerance=1e-3)
+
+
+def test_distance_of_1e7_units() -> None:
+    near = one_gaussian((0.2, -0.1, 3.0), 0.2)
+    far = one_gaussian((0.2e7, -0.1e7, 3e7), 0.2e7)
+    picture = check_against_float64(far, camera(), options=replace(USUAL, depth="expected"))
+    torch.testing.assert_close(picture.rgb, render(near, camera(), background=BACKGROUND).rgb, rtol=0, atol=1e-5)
+    check_against_float64(one_gaussian((1.0, 2.0, 1e7), 0.1), camera())
+    assert gradients_vanish(one_gaussian((1e7, 0.0, 3.0), 0.1), camera())
+
+
+# --- a world origin far from the scene --------------------------------------------------------------------------------
+
+GEOREFERENCED = np.array([4_500_123.25, -1_234_567.5, 812.0])
+
+
+def capture_at(offset: np.ndarray) -> Capture:
+    """Three views and the points of a small scene, moved by ``offset``."""
+    scene = random_scene(n=30, views=3, seed=21)
+    views = []
+    for v, pose in enumerate(scene.cam_from_world.numpy()):
+        moved = pose.copy()
+        moved[:3, 3] -= pose[:3, :3] @ offset
+        intrinsics = scene.intrinsics[v].numpy()
+        views.append(View(str(v), Capture.__module__, moved, intrinsics, scene.width, scene.height))  # type: ignore[arg-type]
+    points = PointCloud(scene.means.numpy() + offset, np.zeros((30, 3), np.uint8))
+    return Capture(root=None, format="colmap", splits={"train": tuple(views)}, points=points)  # type: ignore[arg-type]
+
+
+def picture_of(capture: Capture) -> Tensor:
+    """Float32 Gaussians on the capture's points, seen by its float32 cameras."""
+    scene = random_scene(n=30, views=3, seed=21).to(torch.float32)
+    views = capture.splits["train"]
+    poses = torch.from_numpy(np.stack([v.cam_from_world for v in views])).float()
+    assert capture.points is not None
+    gaussians = scene.gaussians.replace(means=torch.from_numpy(capture.points.xyz).float())
+    gaussians = gaussians.replace(sh=scene.sh[:, :1])
+    return render(gaussians, Cameras(poses, scene.intrinsics, scene.width, scene.height)).rgb
+
+
+def test_world_origin_far_away_is_rebased_on_load() -> None:
+    """Subtracted in float64 the offset costs 1e-9 units; kept, float32 cannot even resolve 0.25 units there."""
+    near, far = capture_at(np.zeros(3)), capture_at(GEOREFERENCED)
+    rebased = rebase(far)
+    truth = picture_of(near)
+    assert np.linalg.norm(rebased.world_offset - GEOREFERENCED) < 10
+    assert (picture_of(rebased) - truth).abs().quantile(0.99) < 1e-4
+    assert (picture_of(rebased) - truth).abs().max() < 2 / 255
+    assert (picture_of(far) - truth).abs().max() > 0.1
+    assert near is rebase(near)
+
+
+# --- many of them -----------------------------------------------------------------------------------------------------
+
+
+def test_thousands_of_coincident_opaque_gaussians() -> None:
+    """The first by index covers the rest: 0.99 of its colour; the next would leave less than 1e-4 (0.01 squared, rounded
+    down in float32) and is not added."""
+    n = 5000
+    gaussians = one_gaussian((0.0, 0.0, 3.0), 1e4)
+    gaussians = gaussians.select(torch.zeros(n, dtype=torch.long))
+    gaussians = gaussians.replace(logit_opacities=torch.full((n,), 100.0), sh=torch.rand(n, 1, 3))
+    picture, slopes = drawn_with_gradients(gaussians, camera(), USUAL, torch.float32)
+    first = gaussians.base_rgb[0]
+    torch.testing.assert_close(
+        picture.rgb, (0.99 * first + 0.01 * BACKGROUND).expand_as(picture.rgb), rtol=0, atol=1e-6
+    )
+    assert all(x.isfinite().all() for x in slopes.values())
+    assert slopes["sh"][0].any()
+    assert not slopes["sh"][2:].any()
+
+
+def test_thousands_of_coincident_faint_gaussians() -> None:
+    n = 3000
+    gaussians = one_gaussian((0.0, 0.0, 3.0), 0.3, opacity=0.01).select(torch.zeros(n, dtype=torch.long))
+    gaussians = gaussians.replace(sh=torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(2)))
+    # float32 multiplies 3000 factors: 3000 * 6e-8 = 2e-4 at worst
+    picture = check_against_float64(gaussians, camera(), tolerance=2e-4, gradient_tolerance=2e-3)
+    assert picture.alpha.max() > 0.999
+
+
+def test_equal_depths_are_ordered_by_index() -> None:
+    """Two veils at one depth: the first in the list is in front, also after the list is reversed."""
+    pair = one_gaussian((0.0, 0.0, 3.0), 1e4).select(torch.tensor([0, 0]))
+    pair = pair.replace(sh=torch.tensor([[[1.0, 0, 0]], [[0, 1.0, 0]]]))
+    for order in ([0, 1], [1, 0]):
+        gaussians = pair.select(torch.tensor(order))
+        rgb = gaussians.base_rgb
+        expected = 0.5 * rgb[0] + 0.25 * rgb[1] + 0.25 * BACKGROUND
+        picture = check_against_float64(gaussians, camera())
+        torch.testing.assert_close(picture.rgb, expected.expand_as(picture.rgb), rtol=0, atol=1e-6)
+
+
+def test_one_gaussian_covering_a_4k_picture() -> None:
+    cameras = camera(3840, 2160, focal=3000.0)
+    gaussians = one_gaussian((0.1, 0.0, 3.0), 1e3)
+    leaves = Gaussians(**{k: x.requires_grad_() for k, x in gaussians.tensors().items()})
+    start = time.perf_counter()
+    picture = render(leaves, cameras, background=BACKGROUND)
+    picture.rgb.sum().backward()
+    assert time.perf_counter() - start < 10  # about 0.5 s; a hang is what this looks for
+    expected = (0.5 * gaussians.base_rgb + 0.5 * BACKGROUND).expand_as(picture.rgb)
+    torch.testing.assert_close(picture.rgb.detach(), expected.detach(), rtol=0, atol=1e-5)
+    assert leaves.sh.grad is not None
+    assert float(leaves.sh.grad[0, 0, 0]) == pytest.approx(0.5 * SH_C0 * 3840 * 2160, rel=1e-4)  # 8e6 numbers summed
+    assert all(x.grad is not None and x.grad.isfinite().all() for x in leaves.tensors().values())
+
+
+# --- sizes ------------------------------------------------------------------------------------------------------------
+
+
+def test_no_gaussians() -> None:
+    empty = some_gaussians().select(torch.zeros(0, dtype=torch.long))
+    assert gradients_vanish(empty, camera())
+    assert gradients_vanish(empty, camera(), RenderOptions(nonfinite="skip"))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 8192), (8192, 1)], ids=str)
+def test_pictures_of_one_pixel_or_one_line(size: tuple[int, int]) -> None:
+    picture = check_against_float64(some_gaussians(), camera(*size))
+    assert picture.rgb.shape == (1, size[1], size[0], 3)
+    assert picture.alpha.any()
+
+
+def test_more_than_2_to_the_31_intersections_are_refused_before_anything_is_allocated() -> None:
+    """2100 veils on 16384 x 16384 px (a million tiles): 2.2e9 pairs, which alone would take 17 GB."""
+    gaussians = one_gaussian((0.0, 0.0, 3.0), 1e6).select(torch.zeros(2100, dtype=torch.long))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    message = (
+        r"render refused: 2100 Gaussians in 1 view\(s\) of 16384x16384 px meet 2202009600 tiles, "
+        r"more than the limit of 2147483647; lower the resolution, the scales or the number of views"
+    )
+    with pytest.raises(DyngsError, match=message):
+        render(gaussians, camera(16384, 16384))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1_000_000  # kB
+
+
+def test_limit_of_intersections_is_exact() -> None:
+    projection = Projection(
+        means2d=torch.full((1, 3, 2), 32.0),
+        depths=torch.ones(1, 3),
+        factors=torch.tensor([1e-6, 0, 1e-6]).repeat(1, 3, 1),
+        compensations=torch.ones(1, 3),
+        radii=torch.full((1, 3, 2), 10**9, dtype=torch.int32),
+    )
+    opacities, colors = torch.full((1, 3), 0.5), torch.ones(1, 3, 1)
+    blended = rasterize(projection, opacities, colors, (64, 64), options=BlendOptions(max_entries=48))
+    torch.testing.assert_close(blended.transmittance, torch.full((1, 64, 64), 0.125), rtol=0, atol=1e-5)
+    with pytest.raises(DyngsError, match="meet 48 tiles, more than the limit of 47"):
+        rasterize(projection, opacities, colors, (64, 64), options=BlendOptions(max_entries=47))
+
+
+# --- NaN and infinity -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16])
+def test_nonfinite_gaussians_are_named(name: str, bad: float, dtype: torch.dtype) -> None:
+    gaussians = some_gaussians()
+    gaussians = Gaussians(**{k: x.to(dtype) for k, x in gaussians.tensors().items()})
+    getattr(gaussians, name).view(6, -1)[[1, 4], -1] = bad
+    with pytest.raises(DyngsError, match=rf"^{name} holds 2 NaN or infinite value\(s\) in 2 of 6 rows; .*skip"):
+        render(gaussians, camera())
+
+
+@pytest.mark.parametrize("nonfinite", ["error", "skip"])
+@pytest.mark.parametrize("name", ["cam_from_world", "intrinsics", "background"])
+def test_nonfinite_views_are_named_whatever_the_policy(name: str, nonfinite: str) -> None:
+    cameras, background = camera(), BACKGROUND.clone()
+    given = {"cam_from_world": cameras.cam_from_world, "intrinsics": cameras.intrinsics, "background": background}
+    given[name].view(-1)[2] = float("nan")
+    with pytest.raises(DyngsError, match=rf"^{name} holds 1 NaN or infinite value\(s\)"):
+        render(some_gaussians(), cameras, RenderOptions(nonfinite=nonfinite), background=background)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_skipping_nonfinite_gaussians_equals_leaving_them_out(bad: float) -> None:
+    """Bitwise; and exactly zero gradients where they were."""
+    gaussians = some_gaussians(n=12)
+    for row, name in enumerate(FIELDS):
+        getattr(gaussians, name).view(12, -1)[2 * row, 0] = bad
+    keep = torch.tensor([i not in (0, 2, 4, 6, 8) for i in range(12)])
+    options = RenderOptions(nonfinite="skip")
+    picture, slopes = drawn_with_gradients(gaussians, camera(), options, torch.float32)
+    truth, true_slopes = drawn_with_gradients(gaussians.select(keep), camera(), USUAL, torch.float32)
+    assert torch.equal(picture.rgb, truth.rgb)
+    assert torch.equal(picture.radii[:, keep], truth.radii)
+    assert not picture.radii[:, ~keep].any()
+    for name in FIELDS:
+        assert torch.equal(slopes[name][keep], true_slopes[name]), name
+        assert not slopes[name][~keep].any(), name
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities"])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_projection_culls_what_it_cannot_place(name: str, bad: float) -> None:
+    """The ops below ``render`` do not look for NaN, but every comparison is phrased so that it fails."""
+    scene = random_scene(n=4, views=1).to(torch.float32)
+    getattr(scene, name).view(4, -1)[1, -1] = bad
+    options = ProjectionOptions()
+    p = project(scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras, options)
+    for x in (p.means2d, p.depths, p.factors, p.compensations):
+        assert x.isfinite().all()
+    if name != "quats" or not math.isnan(bad):
+        assert not p.radii[0, 1].any() or name in ("opacities", "quats")
