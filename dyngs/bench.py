@@ -222,7 +222,7 @@ def _sgemm_seconds(threads: int) -> float:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     a = torch.ones(SGEMM_SIZE, SGEMM_SIZE)
-    a @ a
+    _timed(lambda: a @ a)  # wakes the threads up
     seconds, _ = _timed(lambda: a @ a)
     torch.set_num_threads(before)
     return seconds

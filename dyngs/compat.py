@@ -61,8 +61,8 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Pictures (C, H, W, D), their alphas (C, H, W, 1), and what was computed on the way.
 
-    Differentiable in means, quats, scales, opacities, colors, viewmats and backgrounds. ``meta["means2d"]`` may be asked to
-    ``retain_grad()``; with ``absgrad`` it also gets an attribute ``absgrad`` in the backward pass.
+    Differentiable in means, quats, scales, opacities, colors, viewmats and backgrounds. ``meta["means2d"]`` may be
+    asked to ``retain_grad()``; with ``absgrad`` it also gets an attribute ``absgrad`` in the backward pass.
 
     Args:
         means: (N, 3) world.

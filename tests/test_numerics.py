@@ -84,8 +84,8 @@ def check_against_float64(
     """The float32 picture, after comparing it and its gradients with float64 of the same numbers.
 
     Tolerances are those without thresholds: colours absolutely (rounding of 6e-8 times up to a hundred operations),
-    gradients relative to the largest of their kind (terms of both signs cancel). With thresholds a pixel within rounding
-    of one may differ by 1/255.
+    gradients relative to the largest of their kind (terms of both signs cancel) or to 0.01 (the pixels' own gradients are
+    of size 1: less is noise). With thresholds a pixel within rounding of one may differ by 1/255.
     """
     unlimited = replace(options, alpha_min=0.0, transmittance_min=0.0)
     picture, slopes = drawn_with_gradients(gaussians, cameras, unlimited, torch.float32)
@@ -94,7 +94,7 @@ def check_against_float64(
     assert (picture.alpha - truth.alpha).abs().max() < tolerance
     for name in FIELDS:
         assert slopes[name].isfinite().all(), name
-        scale = max(1e-6, float(true_slopes[name].abs().max()))  # smaller gradients move nothing
+        scale = max(0.01, float(true_slopes[name].abs().max()))
         assert (slopes[name] - true_slopes[name]).abs().max() / scale < gradient_tolerance, name
     picture, slopes = drawn_with_gradients(gaussians, cameras, options, torch.float32)
     truth, _ = drawn_with_gradients(gaussians, cameras, options, torch.float64)
@@ -135,6 +135,7 @@ def test_scale_1e12_is_a_uniform_veil() -> None:
     alpha = 1 - (1 - some_gaussians().opacities.clamp_max(0.99)).prod()
     torch.testing.assert_close(picture.alpha, alpha.expand(1, 29, 37), rtol=0, atol=2e-6)
     check_against_float64(some_gaussians(log_scales=math.log(1e12)), camera(), options=ANTIALIASED)
+    check_against_float64(some_gaussians(log_scales=math.log(1e3)), camera(), options=ANTIALIASED)
 
 
 @pytest.mark.parametrize("log_scale", [-1e4, 43.0, 80.0, 88.7])
@@ -154,8 +155,7 @@ def test_scales_beyond_float32_are_an_error_or_skipped() -> None:
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("mode", RasterizeMode)
 def test_needles_of_1e8_to_1(axis: int, mode: RasterizeMode) -> None:
-    """1000 units long, 1e-5 thick. The gradient with respect to the rotation is large (a turn by 1e-3 rad moves the needle
-    out of its pixel), and with respect to the thickness negligible."""
+    """1000 units long, 1e-5 thick. Along the view (axis 2) or across it."""
     log_scales = torch.full((6, 3), math.log(1e-5))
     log_scales[:, axis] = math.log(1e3)
     check_against_float64(
@@ -260,7 +260,7 @@ def test_opacity_just_above_the_threshold_is_drawn_where_it_peaks() -> None:
 def test_opacity_1_is_clamped_and_the_clamp_stops_the_gradient() -> None:
     alpha, opacity_slope, mean_slope = blended_with([1.0], torch.float32)
     truth, true_slope, true_mean = blended_with([1.0], torch.float64)
-    assert float(alpha.max()) == pytest.approx(0.99)
+    assert float(alpha.detach().max()) == pytest.approx(0.99)
     assert (alpha - truth).abs().max() < 1e-6 + 1.1 / 255
     assert opacity_slope.item() == pytest.approx(true_slope.item(), rel=0.01)  # a pixel at the edge may be missing
     assert relative_error(mean_slope, true_mean) < 0.01
@@ -381,7 +381,7 @@ def test_thousands_of_coincident_faint_gaussians() -> None:
     gaussians = one_gaussian((0.0, 0.0, 3.0), 0.3, opacity=0.01).select(torch.zeros(n, dtype=torch.long))
     gaussians = gaussians.replace(sh=torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(2)))
     # float32 multiplies 3000 factors: 3000 * 6e-8 = 2e-4 at worst
-    picture = check_against_float64(gaussians, camera(), tolerance=2e-4, gradient_tolerance=2e-3)
+    picture = check_against_float64(gaussians, camera(), tolerance=2e-4, gradient_tolerance=1e-3)
     assert picture.alpha.max() > 0.999
 
 
@@ -423,7 +423,11 @@ def test_no_gaussians() -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 8192), (8192, 1)], ids=str)
 def test_pictures_of_one_pixel_or_one_line(size: tuple[int, int]) -> None:
-    picture = check_against_float64(some_gaussians(), camera(*size))
+    # at 4096 px float32 resolves 2e-4 px
+    tolerances = (1e-5, 1e-4) if size == (1, 1) else (1e-4, 1e-3)
+    picture = check_against_float64(
+        some_gaussians(), camera(*size), tolerance=tolerances[0], gradient_tolerance=tolerances[1]
+    )
     assert picture.rgb.shape == (1, size[1], size[0], 3)
     assert picture.alpha.any()
 

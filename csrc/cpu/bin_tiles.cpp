@@ -3,13 +3,13 @@
 // order. One span of tile columns per Gaussian and tile row is computed once; counting and emitting both read the spans,
 // so they cannot disagree.
 #include <bit>
-#include <cmath>
 #include <stdexcept>
 #include <string>
 #include <utility>
 
 #include "cpu/kernels.hpp"
 #include "cpu/parallel.hpp"
+#include "cpu/spans.hpp"
 
 namespace dyngs {
 namespace {
@@ -17,77 +17,6 @@ namespace {
 constexpr int kRadixBits = 11, kBuckets = 1 << kRadixBits;
 // Below these sizes starting threads costs more than they save.
 constexpr int64_t kParallelSort = 1 << 18, kParallelSpans = 1 << 11;
-
-struct Span {
-  int32_t begin, end;  // tile columns [begin, end)
-};
-
-struct Rows {
-  int32_t begin, end;  // tile rows [begin, end)
-};
-
-struct Grid {
-  int width, height, columns, rows;
-};
-
-template <class S>
-int32_t clamp_to(S x, int32_t hi) {
-  return x > S(0) ? (x < static_cast<S>(hi) ? static_cast<int32_t>(x) : hi) : 0;
-}
-
-// Pixels whose centre lies in [lo, hi], as tile indices; a slack of 1/1000 px covers rounding of the bounds.
-template <class S>
-Span tiles_between(S lo, S hi, int size, int tiles) {
-  const S slack = S(1e-3);
-  const int32_t first = clamp_to(std::ceil(lo - S(0.5) - slack), size);
-  const int32_t last = clamp_to(std::floor(hi + S(0.5) + slack), size);  // one past the last pixel
-  if (!(first < last)) return {0, 0};
-  return {first / kTile, std::min(tiles, (last + kTile - 1) / kTile)};
-}
-
-// The ellipse u^2 + v^2 <= t of one Gaussian (see math/projection.hpp for u, v).
-template <class S>
-struct Ellipse {
-  S x, y, u, w, v, t, half_height, tip;  // tip: dy of the rightmost point
-};
-
-template <class S>
-Ellipse<S> make_ellipse(const Splats<S>& s, int64_t row) {
-  Ellipse<S> e;
-  e.x = s.means2d[2 * row], e.y = s.means2d[2 * row + 1];
-  e.u = s.factors[3 * row], e.w = s.factors[3 * row + 1], e.v = s.factors[3 * row + 2];
-  e.t = S(2) * std::log(s.opacities[row] / s.alpha_min);
-  const S root = std::sqrt(e.t);
-  e.half_height = root / e.v;
-  e.tip = -e.w * root / (e.v * std::sqrt(e.w * e.w + e.v * e.v));
-  return e;
-}
-
-// Largest x reached within rows dy in [lo, hi]; `side` +1 right, -1 left. Concave in dy, so clamping the tip is exact.
-template <class S>
-S reach(const Ellipse<S>& e, S lo, S hi, S side) {
-  const S dy = std::min(std::max(side * e.tip, lo), hi);
-  const S inside = std::max(S(0), e.t - e.v * e.v * dy * dy);
-  return e.x + (side * std::sqrt(inside) - e.w * dy) / e.u;
-}
-
-template <class S>
-Span row_span(const Ellipse<S>& e, int tile_row, const Grid& grid) {
-  const S lo = std::max(static_cast<S>(tile_row * kTile) + S(0.5) - e.y, -e.half_height);
-  const S hi = std::min(static_cast<S>(tile_row * kTile + kTile) - S(0.5) - e.y, e.half_height);
-  const S slack = S(1e-3);
-  if (!(lo <= hi + slack)) return {0, 0};
-  if (!std::isfinite(e.t)) return {0, grid.columns};  // alpha_min = 0: no pixel is negligible
-  return tiles_between(reach(e, lo, hi, S(-1)), reach(e, lo, hi, S(1)), grid.width, grid.columns);
-}
-
-template <class S>
-Rows tile_rows(const Splats<S>& s, int64_t row, const Grid& grid) {
-  if (!(s.opacities[row] > s.alpha_min)) return {0, 0};
-  const S y = s.means2d[2 * row + 1], r = static_cast<S>(s.radii[2 * row + 1]);
-  const Span span = tiles_between(y - r, y + r, grid.height, grid.rows);
-  return {span.begin, span.end};
-}
 
 template <class S>
 struct DepthKey;
@@ -149,30 +78,53 @@ struct Part {
 };
 
 template <class S>
+void prefetch_splat(const Splats<S>& s, int64_t row) {
+  __builtin_prefetch(s.means2d + 2 * row);
+  __builtin_prefetch(s.factors + 3 * row);
+  __builtin_prefetch(s.opacities + row);
+}
+
+// Appends up to 16 splats to the part, each with its rows' spans.
+template <class S>
+void append_spans(const Splats<S>& s, const Grid& grid, const int32_t* order, int count, Part& part) {
+  int32_t rows[kLanes], begin[kLanes], end[kLanes];
+  for (int i = 0; i < kLanes; ++i) rows[i] = order[std::min(i, count - 1)];
+  const Ellipses<S> ellipses = make_ellipses(s, rows);
+  tile_rows(ellipses, grid, begin, end);
+  size_t place[kLanes], total = part.spans.size();
+  int32_t most = 0;
+  for (int i = 0; i < count; ++i) {
+    place[i] = total;
+    total += end[i] - begin[i];
+    most = std::max(most, end[i] - begin[i]);
+    if (begin[i] < end[i]) part.splats.push_back({rows[i], begin[i], end[i] - begin[i]});
+  }
+  part.spans.resize(total);
+  for (int32_t r = 0; r < most; ++r) {
+    Packet<S> tile_row;
+    for (int i = 0; i < kLanes; ++i) tile_row[i] = static_cast<S>(begin[i] + r);
+    Span spans[kLanes];
+    row_spans(ellipses, tile_row, grid, spans);
+    for (int i = 0; i < count; ++i) {
+      if (begin[i] + r >= end[i]) continue;
+      part.spans[place[i] + r] = spans[i];
+      part.entries += spans[i].end - spans[i].begin;
+      int64_t* tiles = part.per_tile.data() + int64_t{begin[i] + r} * grid.columns;
+      for (int32_t c = spans[i].begin; c < spans[i].end; ++c) ++tiles[c];
+    }
+  }
+}
+
+template <class S>
 Part find_spans(const Splats<S>& s, const Grid& grid, const int32_t* order, int64_t count) {
-  constexpr int64_t kAhead = 8;
   Part part;
   part.splats.reserve(count);
   part.spans.reserve(2 * count);
   part.per_tile.assign(int64_t{grid.columns} * grid.rows, 0);
-  for (int64_t k = 0; k < count; ++k) {
-    if (k + kAhead < count) {  // depth order jumps through memory
-      __builtin_prefetch(s.means2d + 2 * order[k + kAhead]);
-      __builtin_prefetch(s.factors + 3 * order[k + kAhead]);
-      __builtin_prefetch(s.opacities + order[k + kAhead]);
-      __builtin_prefetch(s.radii + 2 * order[k + kAhead]);
-    }
-    const int64_t row = order[k];
-    const Rows rows = tile_rows(s, row, grid);
-    if (rows.begin >= rows.end) continue;
-    part.splats.push_back({order[k], rows.begin, rows.end - rows.begin});
-    const Ellipse<S> e = make_ellipse(s, row);
-    for (int32_t r = rows.begin; r < rows.end; ++r) {
-      const Span span = row_span(e, r, grid);
-      part.spans.push_back(span);
-      part.entries += span.end - span.begin;
-      for (int32_t c = span.begin; c < span.end; ++c) ++part.per_tile[int64_t{r} * grid.columns + c];
-    }
+  for (int64_t k = 0; k < count; k += kLanes) {
+    for (int64_t ahead = k + kLanes; ahead < std::min(count, k + 2 * kLanes); ++ahead)
+      prefetch_splat(s, order[ahead]);  // depth order jumps through memory
+    append_spans(s, grid, order + k, static_cast<int>(std::min<int64_t>(kLanes, count - k)), part);
   }
   return part;
 }

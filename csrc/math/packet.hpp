@@ -195,12 +195,11 @@ inline Packet<float> exp2_of(Packet<float> x) {
   return p;
 }
 
-// Lane 0..15 as numbers.
+// Towards zero; for |x| below 2^31.
 template <class S>
-Packet<S> lane_index() {
-  Packet<S> r;
-  for (int i = 0; i < kLanes; ++i) r[i] = static_cast<S>(i);
-  return r;
+Packet<S> truncated(Packet<S> x) {
+  using Int = typename LaneTypes<S>::IntVec;
+  return __builtin_convertvector(__builtin_convertvector(x.v, Int), typename Packet<S>::Vec);
 }
 
 template <class S>

@@ -188,18 +188,20 @@ void shape_vjp(const ProjectionState<R>& st, const Splat<R>& out, const SplatGra
   const auto& m0 = st.m[0];
   const auto& m1 = st.m[1];
   const R two(S(2)), half(S(0.5));
-  // compensation = sqrt(minors / c); its slope is unbounded at zero area, where we stop it
+  // c = minors + eps h with h = |M_row0|^2 V^2 + 1; d(minors / c) = eps (h dminors - minors dh) / c^2, without the
+  // difference of nearly equal terms that dminors / c - minors dc / c^2 is for large splats. The slope of the
+  // compensation sqrt(minors / c) is unbounded at zero area, where we stop it.
   const auto has_area = st.sum_minors > R(S(1e-12)) * st.c;
   const R slope = select(has_area, half * g.compensation / max_of(out.compensation, R(S(1e-6))), R(S(0)));
-  R g_minors = slope / st.c;
-  R g_c = -slope * st.sum_minors / (st.c * st.c);
+  const R h = st.norm0 * out.v * out.v + R(S(1)), share = R(eps) / st.c;
   const R g_u = g.u - st.b * out.v * g.w;
   const R g_b = -out.v * out.u * g.w;
   R g_v = g.v - st.b * out.u * g.w;
-  g_c += -half * out.u * out.u * out.u * g_u;
-  g_minors += g_c;
-  const R g_norm0 = R(eps) * out.v * out.v * g_c;
-  g_v += two * R(eps) * st.norm0 * out.v * g_c;
+  const R g_c = -half * out.u * out.u * out.u * g_u;
+  const R g_minors = g_c + slope * share * h / st.c;
+  const R g_h = R(eps) * g_c - slope * share * (st.sum_minors / st.c);
+  const R g_norm0 = out.v * out.v * g_h;
+  g_v += two * st.norm0 * out.v * g_h;
   R g_n[3];
   for (int k = 0; k < 3; ++k) {
     gm[0][k] = two * m0[k] * g_norm0 + g_b * st.n[k];

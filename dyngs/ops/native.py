@@ -1,7 +1,7 @@
 """The compiled core for this processor, and how tensors reach it.
 
-The wheel holds one module per x86-64 level; the newest that the processor runs is imported. ``DYNGS_ISA=v2|v3|v4`` picks
-an older one, for tests.
+The wheel holds one module per x86-64 level; the newest that the processor runs is imported. ``DYNGS_ISA=v2|v3|v4``
+picks an older one, for tests.
 """
 
 from __future__ import annotations

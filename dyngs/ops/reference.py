@@ -1,7 +1,7 @@
 """Slow, obvious versions of the native ops in plain torch: what the kernels are tested against.
 
-Everything is dense: every pixel looks at every Gaussian. Meant for float64 and a few Gaussians on a few pixels. Gradients
-come from autograd. Sources: Zwicker et al. 2001, Kerbl et al. 2023, Yu et al. 2024 (compensation).
+Everything is dense: every pixel looks at every Gaussian. Meant for float64 and a few Gaussians on a few pixels.
+Gradients come from autograd. Sources: Zwicker et al. 2001, Kerbl et al. 2023, Yu et al. 2024 (compensation).
 """
 
 from __future__ import annotations
