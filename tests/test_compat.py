@@ -1,4 +1,4 @@
-"""``dyngs.rasterization``: the interface of gsplat 1.5, and agreement with gsplat's own formulas where it is installed."""
+"""``dyngs.rasterization``: the interface of gsplat 1.5, and agreement with gsplat's formulas where it is installed."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import inspect
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from types import ModuleType
 from typing import Any
 
@@ -230,7 +231,7 @@ def test_tile_lists_are_sorted_by_depth_and_complete(packed: bool) -> None:
     depths, ids = meta["depths"].reshape(-1), meta["flatten_ids"].long()
     assert meta["isect_offsets"].shape == (3, 2, 3)
     bounds = [*meta["isect_offsets"].flatten().tolist(), len(ids)]
-    for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
+    for begin, end in pairwise(bounds):
         assert (depths[ids[begin:end]].diff() >= 0).all()
     counts = torch.bincount(ids, minlength=len(depths))
     assert torch.equal(counts, meta["tiles_per_gauss"].reshape(-1).long())
@@ -334,8 +335,9 @@ def test_wrong_shapes_and_dtypes_are_named(name: str, scene: Scene) -> None:
 
 def test_no_gaussians() -> None:
     scene = random_scene(n=0)
+    colors = torch.zeros(0, 3, dtype=torch.float64)
     for packed in (True, False):
-        picture, alpha, meta = call(scene, colors=torch.zeros(0, 3).double(), backgrounds=scene.background, packed=packed)
+        picture, alpha, meta = call(scene, colors=colors, backgrounds=scene.background, packed=packed)
         assert torch.equal(picture, scene.background[:, None, None].expand(2, 29, 37, 3))
         assert not alpha.any()
         assert meta["flatten_ids"].numel() == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -50,8 +51,10 @@ def test_is_the_three_ops_in_a_row(mode: RasterizeMode) -> None:
 
 @pytest.mark.parametrize("depth", ["accumulated", "expected"])
 def test_gradcheck(depth: str) -> None:
-    """Through activations, cameras, colours, alpha, depth and background, without thresholds. Wide Gaussians: where alpha
-    is nearly zero, 1 - transmittance has no digits, and depth / alpha none either."""
+    """Through activations, cameras, colours, alpha, depth and background, without thresholds.
+
+    Wide Gaussians: where alpha is nearly zero, 1 - transmittance has no digits, and depth / alpha none either.
+    """
     scene = random_scene(n=3, views=2, size=(4, 3), degree=1)
     scene = replace(scene, scales=5 * scene.scales)
     options = replace(EXACT, depth=depth, mode=RasterizeMode.ANTIALIASED)
@@ -189,6 +192,22 @@ def test_world_and_camera_moved_together_see_the_same() -> None:
     )
     ours, truth = render(moved.gaussians, moved.cameras), render(scene.gaussians, scene.cameras)
     torch.testing.assert_close(ours.rgb, truth.rgb, rtol=1e-9, atol=1e-11)
+
+
+def test_threads_do_not_matter(set_threads: Callable[[int], None]) -> None:
+    """Bitwise, activations and their derivatives included."""
+    scene = random_scene(n=40_000, size=(75, 50), seed=9).to(torch.float32)
+    scene = replace(scene, scales=0.05 * scene.scales, opacities=0.2 * scene.opacities)
+    found = []
+    for n in (1, 2, 8):
+        set_threads(n)
+        gaussians = leaves(scene.gaussians)
+        picture = render(gaussians, scene.cameras, RenderOptions(depth="expected"), background=scene.background)
+        total = (picture.rgb * weights(picture.rgb)).sum() + picture.alpha.sum()
+        found.append([picture.rgb, picture.alpha, picture.depth])
+        found[-1] += torch.autograd.grad(total, list(gaussians.tensors().values()))
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
 
 def test_no_gaussians_leave_the_background() -> None:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp")
 _TAIL_BYTES = 4096
-_END_MARKERS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+_PNG_END = b"IEND"
+_END_MARKERS = {".png": _PNG_END, ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def read_mask(path: Path) -> Tensor:
 
 
 def check_picture(path: Path) -> PictureHeader:
-    """Header of a picture that is very likely complete; a file without its end marker is decoded to find out.
+    """Header of a picture that is very likely complete; a JPEG without its end marker is decoded to find out.
 
     Raises:
         DyngsError: the file is missing, truncated or no picture.
@@ -103,6 +104,8 @@ def check_picture(path: Path) -> PictureHeader:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
             complete = marker in file.read()
+        if not complete and marker == _PNG_END:  # not decoded: libpng would add lines of its own to the error
+            raise DyngsError(f"{path}: the picture is truncated or damaged (its end is missing); copy it again")
         if not complete:
             read_picture(path)
     return header

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import contiguous, core, num_threads
+from dyngs.ops.native import array, core, num_threads
 
 
 def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input") -> None:
@@ -19,7 +19,7 @@ def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input")
         DyngsError: naming the tensor, how many elements and how many rows are not finite, and the ``remedy``.
     """
     for name, x in tensors.items():
-        count = core.count_nonfinite(contiguous(x), num_threads())
+        count = core.count_nonfinite(array(x), num_threads())
         if count:
             rows = int((~finite_rows([x])).sum())
             raise DyngsError(f"{name} holds {count} NaN or infinite value(s) in {rows} of {len(x)} rows; {remedy}")

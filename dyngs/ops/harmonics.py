@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyngs.ops.native import contiguous, core, num_threads
+from dyngs.ops.native import array, core, num_threads
 
 
 @torch.library.custom_op("dyngs::harmonics", mutates_args=(), device_types="cpu")
 def _harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:
     colors = means.new_empty(centers.shape[0], means.shape[0], 3)
-    arrays = (contiguous(x) for x in (means, centers, sh, radii))
-    core.harmonics_forward(*arrays, colors, degree, num_threads())
+    arrays = (array(x) for x in (means, centers, sh, radii))
+    core.harmonics_forward(*arrays, array(colors), degree, num_threads())
     return colors
 
 
@@ -29,9 +29,9 @@ def _harmonics_backward(
     g_means, g_sh = (torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means, sh))
     g_centers = centers.new_zeros(centers.shape)
     core.harmonics_backward(
-        *(contiguous(x) for x in inputs),
-        (contiguous(colors), contiguous(grad)),
-        (g_means, g_sh, g_centers if with_centers else None),
+        *(array(x) for x in inputs),
+        (array(colors), array(grad)),
+        (array(g_means), array(g_sh), array(g_centers) if with_centers else None),
         degree,
         num_threads(),
     )

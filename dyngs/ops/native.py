@@ -15,6 +15,7 @@ from types import ModuleType
 
 import torch  # first: its libgomp is then the one that both use
 from torch import Tensor
+from torch.utils.dlpack import to_dlpack
 
 from dyngs.errors import DyngsError
 
@@ -66,6 +67,9 @@ def kernel_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def contiguous(x: Tensor) -> Tensor:
-    """``x`` as the kernels take it: detached, C-contiguous."""
-    return x.detach().contiguous()
+def array(x: Tensor):
+    """``x`` as the kernels take it: detached, C-contiguous, in a DLPack capsule (good for one call).
+
+    A capsule costs 0.5 us where handing over the tensor itself costs 5 us, and a training step passes a hundred.
+    """
+    return to_dlpack(x.detach().contiguous())

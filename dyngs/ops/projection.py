@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.ops.native import contiguous, core, num_threads
+from dyngs.ops.native import array, core, num_threads
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def _settings(width: int, height: int, limits: list[float], antialiased: bool):
 
 def _arrays(*tensors: Tensor):
     kind = core.GaussianArraysF32 if tensors[0].dtype == torch.float32 else core.GaussianArraysF64
-    return kind(*(contiguous(x) for x in tensors))
+    return kind(*(array(x) for x in tensors))
 
 
 @torch.library.custom_op("dyngs::project", mutates_args=(), device_types="cpu")
@@ -84,7 +84,7 @@ def _project(
     radii = torch.empty(*rows, 2, dtype=torch.int32)
     arrays = _arrays(means, quats, scales, opacities, viewmats, intrinsics)
     settings = _settings(size[0], size[1], limits, antialiased)
-    core.project_forward(arrays, settings, means2d, depths, factors, compensations, radii)
+    core.project_forward(arrays, settings, *(array(x) for x in (means2d, depths, factors, compensations, radii)))
     return means2d, depths, factors, compensations, radii
 
 
@@ -117,9 +117,9 @@ def _project_backward(
     core.project_backward(
         _arrays(*gaussians),
         settings,
-        radii.contiguous(),
-        tuple(contiguous(g) for g in grads),
-        (*out, g_viewmats if with_viewmats else None),
+        array(radii),
+        tuple(array(g) for g in grads),
+        (*(array(x) for x in out), array(g_viewmats) if with_viewmats else None),
     )
     return out[0], out[1], out[2], g_viewmats
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import contiguous, core, num_threads
+from dyngs.ops.native import array, core, num_threads
 from dyngs.ops.projection import Projection
 
 TILE = 16
@@ -85,7 +85,7 @@ def _settings(size: list[int], thresholds: list[float]):
 
 def _arrays(means2d: Tensor, factors: Tensor, opacities: Tensor, radii: Tensor):
     kind = core.SplatArraysF32 if means2d.dtype == torch.float32 else core.SplatArraysF64
-    return kind(*(contiguous(x) for x in (means2d, factors, opacities, radii)))
+    return kind(*(array(x) for x in (means2d, factors, opacities, radii)))
 
 
 @torch.library.custom_op("dyngs::bin_tiles", mutates_args=(), device_types="cpu")
@@ -94,7 +94,7 @@ def _bin_tiles(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     try:
         entries = core.bin_tiles(
-            _arrays(*splats), contiguous(depths), _settings(size, thresholds), min(max_entries, MAX_ENTRIES)
+            _arrays(*splats), array(depths), _settings(size, thresholds), min(max_entries, MAX_ENTRIES)
         )
     except ValueError as error:  # std::length_error
         raise DyngsError(f"render refused: {error}; lower the resolution, the scales or the number of views") from None
@@ -134,11 +134,11 @@ def _blend(
     stop = torch.empty(shape, dtype=torch.int32)
     core.rasterize_forward(
         _arrays(means2d, factors, opacities, radii),
-        contiguous(colors),
-        None if background is None else contiguous(background),
-        tuple(entries),
+        array(colors),
+        None if background is None else array(background),
+        tuple(array(x) for x in entries),
         _settings(size, thresholds),
-        (color, transmittance, stop, None),
+        (array(color), array(transmittance), array(stop), None),
         0,
     )
     return color, transmittance, stop
@@ -171,12 +171,12 @@ def _blend_backward(
     probe = means2d.new_empty(*opacities.shape, 4) if with_probe else means2d.new_empty(0)
     core.rasterize_backward(
         _arrays(means2d, factors, opacities, radii),
-        contiguous(colors),
-        None if background is None else contiguous(background),
-        tuple(entries),
+        array(colors),
+        None if background is None else array(background),
+        tuple(array(x) for x in entries),
         _settings(size, thresholds),
-        (*(contiguous(g) for g in grads), *image),
-        (*out, probe if with_probe else None),
+        tuple(array(x) for x in (*grads, *image)),
+        (*(array(x) for x in out), array(probe) if with_probe else None),
         absgrad,
     )
     return out[0], out[1], out[2], out[3], probe
@@ -309,6 +309,7 @@ def tally(
     sums = torch.empty_like(opacities, memory_format=torch.contiguous_format)
     image = (colors.new_empty(*shape, 1), colors.new_empty(shape), torch.empty(shape, dtype=torch.int32), sums)
     splats = _arrays(projection.means2d, projection.factors, opacities, projection.radii)
+    lists = tuple(array(x) for x in entries.tensors())
     settings = _settings(list(size), options.thresholds)
-    core.rasterize_forward(splats, contiguous(colors), None, tuple(entries.tensors()), settings, image, int(kind))
+    core.rasterize_forward(splats, array(colors), None, lists, settings, tuple(array(x) for x in image), int(kind))
     return sums

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from dyngs.ops.native import active_isa, contiguous, core, kernel_threads, num_threads
+from dyngs.ops.native import active_isa, array, core, kernel_threads, num_threads
 
 ROOT = Path(__file__).parents[2]
 
@@ -60,11 +60,11 @@ def test_thread_counts_come_back_after_an_error() -> None:
     assert (num_threads(), torch.get_num_threads()) == (before, before)
 
 
-def test_contiguous_detaches_and_copies_only_if_needed() -> None:
+def test_array_detaches_and_copies_only_if_needed() -> None:
     x = torch.zeros(4, 2, requires_grad=True)
-    assert contiguous(x).data_ptr() == x.data_ptr()
-    assert not contiguous(x).requires_grad
-    assert contiguous(x[:, 0]).stride() == (1,)
+    assert torch.from_dlpack(array(x)).data_ptr() == x.data_ptr()
+    assert not torch.from_dlpack(array(x)).requires_grad
+    assert torch.from_dlpack(array(x[:, 0])).stride() == (1,)
 
 
 def test_arrays_of_the_wrong_size_are_refused_before_they_are_read() -> None:

@@ -76,7 +76,7 @@ def test_equals_the_reference(seed: int, antialiased: bool, eps2d: float, alpha_
         assert relative_error(x, y) < 1e-9, name
 
 
-def test_gradcheck(scene: Scene) -> None:
+def test_gradcheck() -> None:
     options = ProjectionOptions(alpha_min=0.0)
     leaves = random_scene(n=3, views=2).leaves()
 
@@ -124,7 +124,7 @@ def test_many_cameras_equal_one_at_a_time(scene: Scene) -> None:
             assert torch.equal(getattr(alone, name)[0], getattr(together, name)[v])
 
 
-def test_no_gaussians(scene: Scene) -> None:
+def test_no_gaussians() -> None:
     empty = random_scene(n=0)
     p = splats(empty)
     assert p.means2d.shape == (2, 0, 2)

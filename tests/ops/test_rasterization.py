@@ -174,7 +174,7 @@ def test_many_cameras_equal_one_at_a_time(scene: Scene) -> None:
         assert torch.equal(torch.autograd.grad(total, means2d)[0][0], together_slopes["means2d"][v])
 
 
-def test_probe_is_the_gradient_of_the_2d_means(scene: Scene) -> None:
+def test_probe_is_the_gradient_of_the_2d_means() -> None:
     """Signed part: exactly that of means2d. Absolute part: the sum over pixels, by autograd pixel for pixel."""
     scene = random_scene(n=5, views=2, size=(9, 7), seed=2)
     projection, opacities, colors, background = with_channels(scene, 3)
@@ -230,6 +230,19 @@ def test_contributions_and_the_background_make_up_the_picture(scene: Scene) -> N
     sums = tally(projection, opacities, scene.size, Tally.WEIGHTS)
     light = draw(scene).blended.transmittance
     torch.testing.assert_close(sums.sum(1) + light.sum((1, 2)), torch.full((2,), 37.0 * 29, dtype=torch.float64))
+
+
+def test_tally_of_pixels_counts_those_that_a_gaussian_was_blended_into() -> None:
+    """With one colour channel per Gaussian the reference shows who is in which pixel."""
+    scene = random_scene(n=30, views=1, seed=13)
+    scene = replace(scene, opacities=scene.opacities**0.2, scales=2 * scene.scales)  # some pixels fill up
+    projection, opacities = splats_of(scene)
+    picture = reference.rasterize(projection, opacities, torch.eye(30, dtype=torch.float64)[None], scene.size).color
+    pixels = tally(projection, opacities, scene.size, Tally.PIXELS)
+    assert torch.equal(pixels, (picture > 0).sum((1, 2)).double())
+    lanes = tally(projection, opacities, scene.size, Tally.LANES)
+    assert (lanes >= pixels).all()
+    assert not (lanes % 16).any()  # whole 4x4 blocks
 
 
 def test_order_of_the_gaussians_does_not_matter(scene: Scene) -> None:
@@ -361,7 +374,7 @@ def test_opcheck_bin_tiles(scene: Scene) -> None:
     torch.library.opcheck(torch.ops.dyngs.bin_tiles.default, given)
 
 
-def test_gradcheck(scene: Scene) -> None:
+def test_gradcheck() -> None:
     scene = random_scene(n=3, views=1, size=(5, 4))
     projection, opacities, colors, background = with_channels(scene, 2)
     projection = replace(projection, radii=torch.full_like(projection.radii, 100))
