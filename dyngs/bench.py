@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NoReturn, TypeVar
 
 import numpy as np
 import torch
@@ -20,6 +21,8 @@ from dyngs.errors import DyngsError
 from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, Tally, TileEntries, bin_tiles, rasterize, tally
+
+T = TypeVar("T")
 
 SGEMM_SIZE = 2048
 STAGES = ("project", "bin + sort", "blend", "blend backward", "project backward")
@@ -115,7 +118,7 @@ def run_bench(argv: list[str]) -> int:
 class _Parser(argparse.ArgumentParser):
     """A parser whose complaints are one line."""
 
-    def error(self, message: str):
+    def error(self, message: str) -> NoReturn:
         raise DyngsError(f"{message} (see `{self.prog} --help`)")
 
 
@@ -212,7 +215,8 @@ def _time_stages(load: Workload, projection: Projection, entries: TileEntries, t
     return seconds
 
 
-def _timed(work: Callable):
+def _timed(work: Callable[[], T]) -> tuple[float, T]:
+    """Seconds that ``work`` took, and its result."""
     start = time.perf_counter()
     result = work()
     return time.perf_counter() - start, result

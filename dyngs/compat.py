@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
+from dyngs.ops.finite import check_finite
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import MAX_CHANNELS, TILE, BlendOptions, TileEntries, bin_tiles, rasterize
@@ -85,7 +86,7 @@ def rasterization(
         channel_chunk: channels per pass, at most 40.
 
     Raises:
-        DyngsError: shapes that do not fit, or an argument that dyngs does not support (the others).
+        DyngsError: shapes that do not fit, NaN or infinite input, or an argument that dyngs does not support (the others).
     """
     unsupported = {
         "tile_size": tile_size != TILE,
@@ -106,6 +107,8 @@ def rasterization(
     _refuse(unsupported)
     _check_choices(render_mode, rasterize_mode)
     _check_shapes(means, quats, scales, opacities, viewmats, Ks)
+    check_finite({"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors})
+    check_finite({"viewmats": viewmats, "Ks": Ks})
     cameras = Cameras(viewmats, Ks, width, height)
     limits = ProjectionOptions(eps2d, near_plane, far_plane, 1 / 255, radius_clip, rasterize_mode == "antialiased")
     splats = _project(means, quats, scales, opacities, cameras, limits, packed=packed)
@@ -154,6 +157,8 @@ def _check_shapes(
 ) -> None:
     if means.ndim != 2:
         raise DyngsError(f"rasterization: means must be (N, 3), got {tuple(means.shape)}; scenes are not batched here")
+    if means.dtype not in (torch.float32, torch.float64):
+        raise DyngsError(f"rasterization: means is {means.dtype}; use float32 (or float64 for checks)")
     n, c = len(means), len(viewmats)
     wanted = {
         "means": (means, (n, 3)),

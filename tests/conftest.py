@@ -32,6 +32,12 @@ def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 @pytest.fixture
+def one_thread(set_threads: Callable[[int], None]) -> None:
+    """For tests of tiny pictures, where waking threads would take most of the time, above all on a busy machine."""
+    set_threads(1)
+
+
+@pytest.fixture
 def set_threads() -> Iterator[Callable[[int], None]]:
     """``torch.set_num_threads``, undone afterwards."""
     before = torch.get_num_threads()

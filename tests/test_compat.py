@@ -23,6 +23,8 @@ from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions
 from dyngs.rendering import RenderOptions, render
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 WHY = "gsplat is not installed (pip install --no-deps gsplat==1.5.3)"
 GSPLAT_LIMITS = ProjectionOptions(near=0.01)
 MODES = ["RGB", "D", "ED", "RGB+D", "RGB+ED"]

@@ -23,7 +23,7 @@ MAX_FILE_LINES = 500
 MAX_FUNCTION_LINES = 60
 MAX_PARAMETERS = 8
 
-LONG_FUNCTIONS: dict[str, str] = {}
+LONG_FUNCTIONS = {"rasterization": "34 arguments of gsplat's, each with its line of documentation"}
 """Functions that may be longer, each with its reason."""
 
 MANY_PARAMETERS = {
@@ -33,7 +33,10 @@ MANY_PARAMETERS = {
 """Functions that may take more parameters, each with its reason."""
 
 HEAVY = ("pycolmap", "trimesh", "kornia", "OpenImageIO", "skimage", "av", "rich", "tensorboard", "lpips")
-WITHOUT_MIRROR = {"test_layout.py": "about the repository, not one module"}
+WITHOUT_MIRROR = {
+    "test_layout.py": "about the repository, not one module",
+    "test_numerics.py": "the table of docs/numerics.md",
+}
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

@@ -16,6 +16,8 @@ from dyngs.ops.projection import ProjectionOptions
 from dyngs.ops.rasterization import BlendOptions
 from dyngs.rendering import Rendering, RenderOptions, contributions, render
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 EXACT = RenderOptions(alpha_min=0.0, transmittance_min=0.0)
 
 

@@ -3,6 +3,7 @@
 // order. One span of tile columns per Gaussian and tile row is computed once; counting and emitting both read the spans,
 // so they cannot disagree.
 #include <bit>
+#include <limits>
 #include <stdexcept>
 #include <string>
 #include <utility>
@@ -176,6 +177,9 @@ template <class S>
 Binning bin_tiles(const Splats<S>& s, int64_t max_entries) {
   const Grid grid{s.width, s.height, (s.width + kTile - 1) / kTile, (s.height + kTile - 1) / kTile};
   const int64_t tiles = int64_t{grid.columns} * grid.rows;
+  if (s.num_views * s.num_gaussians > std::numeric_limits<int32_t>::max())  // rows are int32
+    throw std::length_error(std::to_string(s.num_gaussians) + " Gaussians in " + std::to_string(s.num_views) +
+                            " views are more than 2^31 - 1 splats");
   std::vector<std::vector<Part>> views;
   int64_t total = 0;
   for (int64_t v = 0; v < s.num_views; ++v) {

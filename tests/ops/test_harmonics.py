@@ -12,6 +12,8 @@ from torch import Tensor
 from dyngs.ops import reference
 from dyngs.ops.harmonics import evaluate_harmonics
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 def all_visible(scene: Scene) -> Tensor:
     return torch.ones(len(scene.cam_from_world), len(scene.means), 2, dtype=torch.int32)

@@ -16,6 +16,8 @@ from dyngs.camera import Cameras
 from dyngs.ops import reference
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 OUTPUTS = ("means2d", "depths", "factors", "compensations")
 INPUTS = ("means", "quats", "scales", "cam_from_world")
 DEFAULTS = ProjectionOptions()

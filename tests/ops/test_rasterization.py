@@ -29,6 +29,8 @@ from dyngs.ops import reference
 from dyngs.ops.projection import Projection
 from dyngs.ops.rasterization import MAX_CHANNELS, Blended, BlendOptions, Tally, rasterize, tally
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 def with_channels(scene: Scene, channels: int) -> tuple[Projection, Tensor, Tensor, Tensor]:
     """Projection, opacities (V, N), colours (V, N, D), backgrounds (V, D)."""

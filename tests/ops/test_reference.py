@@ -14,6 +14,8 @@ from dyngs.ops import reference
 from dyngs.ops.projection import Projection, ProjectionOptions
 from dyngs.ops.rasterization import BlendOptions
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 def one_camera(width: int = 8, height: int = 8, focal: float = 50.0) -> Cameras:
     intrinsics = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], dtype=torch.float64)
