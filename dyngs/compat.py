@@ -86,7 +86,7 @@ def rasterization(
         channel_chunk: channels per pass, at most 40.
 
     Raises:
-        DyngsError: shapes that do not fit, NaN or infinite input, or an argument that dyngs does not support (the others).
+        DyngsError: shapes that do not fit, NaN or infinite input, or an argument that dyngs does not support.
     """
     unsupported = {
         "tile_size": tile_size != TILE,

@@ -76,7 +76,7 @@ class DefaultStrategy(Section):
     kind: Literal["default"] = "default"
     absgrad: bool = False
     grad_threshold: Positive = Field(
-        default=2e-4, description="mean over visible views, NDC units (8e-4 suits absgrad)"
+        default=2e-4, description="mean over views, NDC units; shorter runs than 30,000 go lower (8e-4 suits absgrad)"
     )
     dense_fraction: Positive = Field(
         default=0.01, description="of the extent: smaller ones are cloned, larger ones split"

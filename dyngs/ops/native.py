@@ -15,7 +15,7 @@ from types import ModuleType
 
 import torch  # first: its libgomp is then the one that both use
 from torch import Tensor
-from torch.utils.dlpack import to_dlpack
+from torch.utils.dlpack import to_dlpack  # pyright: ignore[reportPrivateImportUsage]
 
 from dyngs.errors import DyngsError
 

@@ -21,7 +21,7 @@ from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.model import StaticScene
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.train.sampler import ViewSampler
-from dyngs.train.schedule import densify_schedule, filter_steps, growth_per_change
+from dyngs.train.schedule import densify_schedule, filter_steps, grad_threshold, growth_per_change
 from dyngs.train.step import Trainer
 
 
@@ -98,7 +98,8 @@ def _densifier(config: Config, background: str, extent: float) -> Densifier:
     schedule = densify_schedule(strategy, steps, background == "white")
     if isinstance(strategy, McmcStrategy):
         return McmcDensifier(strategy, schedule, growth_per_change(strategy, steps))
-    return DefaultDensifier(strategy, schedule, extent)
+    threshold = grad_threshold(strategy, steps)
+    return DefaultDensifier(strategy.model_copy(update={"grad_threshold": threshold}), schedule, extent)
 
 
 def _render_options(config: Config) -> RenderOptions:

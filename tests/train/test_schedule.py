@@ -14,6 +14,7 @@ from dyngs.train.schedule import (
     active_sh_degree,
     densify_schedule,
     filter_steps,
+    grad_threshold,
     growth_per_change,
     means_rate,
 )
@@ -49,6 +50,14 @@ def test_short_runs() -> None:
     assert (schedule.start, schedule.stop, schedule.resets) == (100, 1000, (400,))
     assert densify_schedule(DefaultStrategy(), 7000, white_background=True).resets == (117, 700, 1400, 2100, 2800)
     assert densify_schedule(DefaultStrategy(), 10, white_background=True).resets == ()
+
+
+def test_short_runs_densify_from_a_lower_gradient_on() -> None:
+    strategy = DefaultStrategy()
+    assert grad_threshold(strategy, 30_000) == grad_threshold(strategy, 60_000) == strategy.grad_threshold
+    thresholds = [grad_threshold(strategy, steps) for steps in (500, 2000, 7000, 29_999)]
+    assert thresholds == sorted(thresholds)
+    assert thresholds[0] > 0.25 * strategy.grad_threshold
 
 
 def test_means_rate_is_log_linear_times_the_extent() -> None:
