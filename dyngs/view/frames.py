@@ -119,8 +119,8 @@ def write_path_frames(
 def write_split(run_dir: Path, split: str, out_dir: Path, output: OutputOptions = OutputOptions()) -> list[Path]:
     """Paths of the files written for a split of a run: ``NAME.png`` per view, and ``sheet.png`` (truth, render, error).
 
-    The sheet shows at most 12 views, evenly spread, with their PSNR. The background is that of training, black where
-    that was random.
+    The sheet shows at most 12 views, evenly spread, with their PSNR, black where a mask leaves pixels out. The
+    background is that of training, black where that was random.
 
     Args:
         run_dir: folder of a run with at least one checkpoint.
@@ -147,10 +147,16 @@ def write_split(run_dir: Path, split: str, out_dir: Path, output: OutputOptions 
             if i in shown:
                 truth = picture.composite(background)
                 label = f"{picture.name}  {psnr(torch.from_numpy(frame.rgb), truth, picture.mask):.2f} dB"
-                rows.append(SheetRow(label, to_uint8(truth.numpy()), to_uint8(frame.rgb)))
+                rows.append(_sheet_row(label, truth, torch.from_numpy(frame.rgb), picture.mask))
     sheet = out_dir / "sheet.png"
     write_image(sheet, contact_sheet(rows))
     return [*writer.written, sheet]
+
+
+def _sheet_row(label: str, truth: Tensor, rendered: Tensor, mask: Tensor | None) -> SheetRow:
+    """A row of the sheet; pixels that do not count are black on both sides, so that they show no error."""
+    counts = 1.0 if mask is None else mask[..., None]
+    return SheetRow(label, to_uint8((truth * counts).numpy()), to_uint8((rendered * counts).numpy()))
 
 
 def splat_options(splat: SplatFile) -> RenderOptions:
