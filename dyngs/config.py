@@ -118,7 +118,7 @@ class OptimConfig(Section):
     lr_scales: Positive = 5e-3
     lr_quats: Positive = 1e-3
     eps: Positive = 1e-15
-    sparse: bool = Field(default=True, description="skip Gaussians that received no gradient in the step")
+    sparse: bool = Field(default=False, description="skip Gaussians that received no gradient in the step")
 
 
 class TrainConfig(Section):
