@@ -14,6 +14,13 @@ from dyngs.ops.native import core
 OPS_WITH_A_CORE = ("projection", "harmonics", "rasterization", "finite")
 
 
+@pytest.fixture(autouse=True)
+def empty_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test runs in an empty folder, as a user would: nothing is left in the checkout, and processes that a test
+    starts import the installed package, not the sources beside them."""
+    monkeypatch.chdir(tmp_path_factory.mktemp("empty"))
+
+
 @pytest.fixture
 def scene() -> Scene:
     """20 Gaussians, 2 views, 37x29 px, float64."""

@@ -24,7 +24,8 @@ def _load_core() -> tuple[ModuleType, str]:
     try:
         baseline = import_module("dyngs.ops._core_v2")
     except ImportError as error:
-        raise ImportError(f"the compiled core of dyngs is missing ({error}); install with `pip install .`") from error
+        advice = "install with `pip install .`, and run Python outside the source folder, which hides the installed one"
+        raise ImportError(f"the compiled core of dyngs is missing ({error}); {advice}") from error
     best = baseline.best_isa()
     isa = os.environ.get("DYNGS_ISA", best)
     if isa not in ("v2", "v3", "v4") or isa > best:
