@@ -107,8 +107,8 @@ def test_no_drawer_for_odds_and_ends() -> None:
 
 
 def test_no_paths_of_one_machine() -> None:
-    folders = "|".join(("work", "home", "root", "opt", "mnt", "Users"))
-    pattern = re.compile(rf"[\"'(\s=](/({folders})/|[A-Z]:\\Users)")
+    homes = "|".join(("work", "home", "root", "opt", "mnt", "Users"))
+    pattern = re.compile(rf"[\"'(\s=](/({homes})/|[A-Z]:\\Users)")
     folders = [f for f in ("dyngs", "csrc", "tests", "configs", "docs", "benchmarks", ".ci") if (ROOT / f).is_dir()]
     files = [f for folder in folders for f in (ROOT / folder).rglob("*") if f.is_file() and f.stat().st_size < 2**20]
     files += [ROOT / f for f in ("README.md", "pyproject.toml", "CMakeLists.txt") if (ROOT / f).is_file()]
