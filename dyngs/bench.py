@@ -1,15 +1,14 @@
-"""``dyngs bench``: how fast the kernels are on this machine, next to what its matrix product reaches."""
+"""How fast the kernels are on this machine, next to what its matrix product reaches."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NoReturn, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -90,36 +89,6 @@ class RasterizeReport:
     pairs: int
     lanes_used: float
     runs: list[StageTimes]
-
-
-def run_bench(argv: list[str]) -> int:
-    """Exit code of ``dyngs bench ARGV``."""
-    parser = _Parser(prog="dyngs bench", description="Measure the kernels on this machine.")
-    commands = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
-    raster = commands.add_parser("rasterize", help="projection, binning and blending, forward and backward")
-    raster.add_argument("--points", type=Path, help="npz with means3d, colors, viewmats, Ks, width, height")
-    raster.add_argument("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()])
-    raster.add_argument("--repeats", type=int, default=30)
-    raster.add_argument("--json", type=Path, help="also write the figures there")
-    try:
-        arguments = parser.parse_args(argv)
-    except SystemExit as stop:  # after --help
-        return int(stop.code or 0)
-    if arguments.repeats < 1 or min(arguments.threads) < 1:
-        raise DyngsError("dyngs bench: --repeats and --threads must be at least 1")
-    workload = garden_workload(arguments.points) if arguments.points else random_workload()
-    report = bench_rasterize(workload, sorted(set(arguments.threads)), arguments.repeats)
-    print(format_report(report))
-    if arguments.json:
-        write_text(arguments.json, json.dumps(asdict(report), indent=2) + "\n")
-    return 0
-
-
-class _Parser(argparse.ArgumentParser):
-    """A parser whose complaints are one line."""
-
-    def error(self, message: str) -> NoReturn:
-        raise DyngsError(f"{message} (see `{self.prog} --help`)")
 
 
 def garden_workload(path: Path) -> Workload:
@@ -236,6 +205,11 @@ def _summary(threads: int, samples: dict[str, list[float]]) -> StageTimes:
     milliseconds = {name: 1e3 * statistics.median(samples[name]) for name in STAGES}
     fastest = {name: 1e3 * min(samples[name]) for name in STAGES}
     return StageTimes(threads, milliseconds, fastest, 2e-9 * SGEMM_SIZE**3 / statistics.median(samples["sgemm"]))
+
+
+def write_report(report: RasterizeReport, path: Path) -> None:
+    """Write the figures as JSON."""
+    write_text(path, json.dumps(asdict(report), indent=2) + "\n")
 
 
 def format_report(report: RasterizeReport) -> str:

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from dyngs import __version__
-from dyngs.cli import data, demo, doctor, evaluate, export, render, train
+from dyngs.cli import bench, data, demo, doctor, evaluate, export, render, train
 from dyngs.errors import DyngsError
 
 EXIT_ERROR = 2
@@ -44,10 +44,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(arguments: list[str]) -> int:
-    if arguments[:1] == ["bench"]:  # has a parser of its own
-        from dyngs.bench import run_bench
-
-        return run_bench(arguments[1:])
     parser = make_parser()
     try:
         parsed = parser.parse_args(arguments)
@@ -76,10 +72,8 @@ def make_parser() -> argparse.ArgumentParser:
 def _add_commands(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for module in (demo, train, evaluate, render, export, data):
+    for module in (demo, train, evaluate, render, export, data, bench, doctor):
         module.add_parser(commands)
-    commands.add_parser("bench", help="measure the speed of the rasterizer (dyngs bench rasterize)", add_help=False)
-    doctor.add_parser(commands)
     return parser
 
 

@@ -1,0 +1,62 @@
+"""The benchmark: its counts are exact and its table is complete; times are not tested."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dyngs.bench import STAGES, bench_rasterize, format_report, garden_workload, random_workload, write_report
+from dyngs.cli import main
+from dyngs.errors import DyngsError
+from dyngs.ops.projection import ProjectionOptions
+from dyngs.ops.reference import project, rasterize
+
+
+def test_counts_agree_with_the_reference() -> None:
+    """Pairs are pixels with alpha >= 1/255 that are not full: the reference finds them, one Gaussian at a time."""
+    load = random_workload(30)
+    report = bench_rasterize(load, [1], repeats=1)
+    assert report.num_gaussians == 30
+    projection = project(
+        load.means, load.quats, load.scales, load.opacities, load.cameras, ProjectionOptions(near=0.01)
+    )
+    pairs = 0
+    for i in range(30):
+        alone = torch.zeros(1, 30)
+        alone[0, i] = load.opacities[i]
+        pairs += int((rasterize(projection, alone, load.colors, load.size).transmittance < 1).sum())
+    assert report.pairs == pytest.approx(pairs, abs=3)  # alpha within rounding of 1/255
+    assert 0 < report.lanes_used <= 1
+
+
+def test_table_and_json_hold_every_stage(tmp_path: Path) -> None:
+    report = bench_rasterize(random_workload(50), [1, 2], repeats=2)
+    text = format_report(report)
+    assert all(stage in text for stage in (*STAGES, "sgemm", "speed-up", "M pairs/s"))
+    write_report(report, tmp_path / "bench.json")
+    written = json.loads((tmp_path / "bench.json").read_text())
+    assert [run["threads"] for run in written["runs"]] == [1, 2]
+    assert set(written["runs"][0]["milliseconds"]) == set(STAGES)
+
+
+def test_points_beyond_two_units_are_left_out(tmp_path: Path) -> None:
+    points = np.array([[0.0, 0, 3], [0, 0, 1], [0, 1.5, 1]], np.float32)
+    path = tmp_path / "points.npz"
+    view = np.eye(4, dtype=np.float32)[None]
+    arrays = {"means3d": points, "colors": np.zeros((3, 3), np.uint8), "viewmats": view, "Ks": np.eye(3)[None]}
+    np.savez(path, **arrays, width=8, height=6)
+    load = garden_workload(path)
+    assert len(load.means) == 2
+    assert load.size == (8, 6)
+
+
+def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(DyngsError, match=r"missing\.npz"):
+        garden_workload(tmp_path / "missing.npz")
+    for arguments in (["bench"], ["bench", "x"], ["bench", "rasterize", "--threads", "0"]):
+        assert main(arguments) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1
