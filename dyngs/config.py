@@ -26,7 +26,8 @@ class DataConfig(Section):
     """Where the pictures are and how they are read."""
 
     root: Path = Field(description="capture folder")
-    format: Literal["auto", "blender", "nerfstudio", "colmap"] = "auto"
+    format: Literal["auto", "blender", "nerfstudio", "colmap", "nerfies", "llff", "camera_folders"] = "auto"
+    frames: str | None = Field(default=None, description="start:stop:step over the capture's times, as Python slices")
     downscale: float = Field(default=1.0, ge=1.0, description="divide width and height by this")
     longest_side: int | None = Field(
         default=None, ge=1, description="shrink so that the longer side has at most this many px"
@@ -36,6 +37,7 @@ class DataConfig(Section):
         default="auto", description="auto: white where the pictures have alpha, black otherwise"
     )
     cache_mb: float = Field(default=4096, ge=0, description="memory for decoded pictures")
+    frame_cache_mb: float = Field(default=4096, ge=0, description="disk for the frames of videos")
 
 
 class PointsInit(Section):
@@ -54,10 +56,9 @@ class RandomInit(Section):
     half_extent: Positive = Field(default=1.3, description="half the cube's side, world units")
 
 
-class StaticModel(Section):
-    """3D Gaussian splatting, Mip-Splatting's filters as options."""
+class SceneModel(Section):
+    """What all models have in common: how Gaussians are coloured and drawn."""
 
-    kind: Literal["static"] = "static"
     sh_degree: int = Field(default=3, ge=0, le=4)
     rasterize_mode: RasterizeMode = RasterizeMode.CLASSIC
     eps2d: float = Field(
@@ -65,6 +66,74 @@ class StaticModel(Section):
     )
     filter_3d: bool = Field(default=False, description="Mip-Splatting's 3D smoothing filter")
     near: Positive = Field(default=0.2, description="near plane, world units")
+
+
+class StaticModel(SceneModel):
+    """3D Gaussian splatting, Mip-Splatting's filters as options."""
+
+    kind: Literal["static"] = "static"
+
+
+class FieldSection(Section):
+    """What all deformation fields have in common: which attributes move."""
+
+    move_rotations: bool = True
+    move_scales: bool = True
+    move_opacities: bool = Field(default=False, description="things may appear and vanish")
+    move_colors: bool = Field(default=False, description="the base colour may change over time")
+
+
+class HexplaneField(FieldSection):
+    """Planes over pairs of space and time axes and a small decoder (4DGS, Wu et al. 2024)."""
+
+    kind: Literal["hexplane"] = "hexplane"
+    channels: int = Field(default=32, ge=1, description="features per plane and level")
+    resolution: int = Field(default=64, ge=2, description="of the first level along x, y and z")
+    levels: tuple[Annotated[int, Field(ge=1)], ...] = Field(default=(1, 2), min_length=1, description="multipliers")
+    time_resolution: int = Field(default=0, ge=0, description="0 = half the number of training times")
+    width: int = Field(default=64, ge=1, description="of the decoder")
+    depth: int = Field(default=1, ge=1, description="linear layers before the heads")
+    lr_planes: Positive = Field(default=1.6e-3, description="times the scene extent")
+    lr_decoder: Positive = Field(default=1.6e-4, description="times the scene extent")
+    lr_decay: Fraction = Field(default=0.01, description="last over first rate")
+    space_smoothness: float = Field(default=1e-4, ge=0)
+    time_smoothness: float = Field(default=0.01, ge=0)
+    time_sparsity: float = Field(default=1e-4, ge=0, description="weight of mean |1 - plane| on the planes with time")
+
+
+class MlpField(FieldSection):
+    """A multilayer perceptron on encoded position and time (Deformable-3DGS, Yang et al. 2024)."""
+
+    kind: Literal["mlp"] = "mlp"
+    depth: int = Field(default=8, ge=2, description="hidden layers")
+    width: int = Field(default=256, ge=1)
+    space_frequencies: int = Field(default=10, ge=0, le=16)
+    time_frequencies: int = Field(default=6, ge=0, le=16)
+    lr: Positive = 8e-4
+    lr_decay: Fraction = Field(default=0.002, description="last over first rate")
+
+
+class TrajectoryField(FieldSection):
+    """A polynomial and a Fourier series per Gaussian, no network: for small motion and long clips."""
+
+    kind: Literal["trajectory"] = "trajectory"
+    polynomial: int = Field(default=3, ge=0, le=8, description="highest power of time")
+    fourier: int = Field(default=4, ge=0, le=32, description="number of frequencies")
+    lr_means: Positive = Field(default=1.6e-4, description="of the coefficients, times the scene extent")
+    lr_quats: Positive = 1e-3
+    lr_decay: Fraction = Field(default=0.01, description="last over first rate")
+    rigidity: float = Field(default=0.0, ge=0, description="weight of neighbours' differing motion")
+
+
+class DynamicModel(SceneModel):
+    """Canonical Gaussians and a deformation field over time. Step numbers follow ``train.steps``."""
+
+    kind: Literal["dynamic"] = "dynamic"
+    deform: Annotated[HexplaneField | MlpField | TrajectoryField, Field(discriminator="kind")] = HexplaneField()
+    coarse: Fraction = Field(default=0.13, description="share of the run that trains without motion")
+    still_below: float = Field(default=0.3, ge=0, description="px in the nearest training view; 0 = all may move")
+    motion_sparsity: float = Field(default=0.01, ge=0, description="weight of the mean motion, in scene extents")
+    time_jitter: float = Field(default=0.0, ge=0, description="of the step between times, annealed; 0.1 suits videos")
 
 
 class DefaultStrategy(Section):
@@ -148,7 +217,7 @@ class Config(Section):
     """Everything that decides a run."""
 
     data: DataConfig
-    model: StaticModel = StaticModel()
+    model: Annotated[StaticModel | DynamicModel, Field(discriminator="kind")] = StaticModel()
     init: Annotated[PointsInit | RandomInit, Field(discriminator="kind")] = PointsInit()
     strategy: Annotated[DefaultStrategy | McmcStrategy, Field(discriminator="kind")] = DefaultStrategy()
     optim: OptimConfig = OptimConfig()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,16 @@ from pydantic_core import ErrorDetails
 from yaml.composer import ComposerError
 
 from dyngs.config import Config
-from dyngs.config_schema import allowed_values, choices_of, config_keys, keys_of_section, section_class
+from dyngs.config_schema import (
+    allowed_values,
+    choices_of,
+    config_keys,
+    keys_of_location,
+    kinds_of,
+    section_at,
+    section_class,
+    section_classes,
+)
 from dyngs.data.write import write_text
 from dyngs.errors import DyngsError
 
@@ -39,8 +48,8 @@ def load_config(preset: Path | None, overrides: Iterable[str] = ()) -> Config:
     Args:
         preset: a YAML file, or the name of a packaged preset (``static``, ``configs/static.yaml``) where no such file
             exists; None starts from the defaults.
-        overrides: ``section.key=value`` with the value in YAML. A changed ``kind`` replaces its whole section, whatever
-            the order of the overrides.
+        overrides: ``section.key=value`` with the value in YAML. A changed ``kind`` replaces its whole section and
+            nothing outside it, whatever the order of the overrides.
 
     Returns:
         the checked configuration; ``data.root`` is made absolute, so that later commands work from any folder.
@@ -51,9 +60,7 @@ def load_config(preset: Path | None, overrides: Iterable[str] = ()) -> Config:
     layers = _Layers()
     if preset is not None:
         layers.add_file(find_preset(preset))
-    parsed = [_parse_override(text) for text in overrides]
-    for override in sorted(parsed, key=lambda o: o.keys[-1] != "kind"):  # stable: kinds first
-        layers.add_override(override)
+    layers.add_overrides(overrides)
     config = _validate(layers)
     data = config.data.model_copy(update={"root": config.data.root.absolute()})
     return config.model_copy(update={"data": data})
@@ -76,8 +83,7 @@ def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
         )
     layers = _Layers()
     layers.add_file(file)
-    for text in overrides:
-        layers.add_override(_parse_override(text))
+    layers.add_overrides(overrides)
     return _validate(layers)
 
 
@@ -141,12 +147,12 @@ _PresetLoader.add_implicit_resolver("tag:yaml.org,2002:float", _EXACT_FLOAT, lis
 
 @dataclass(frozen=True)
 class _Leaf:
-    """One value of a YAML text: where it lies, what it is, and how it was written."""
+    """One value of a file or an override: where it lies, what it is, how it was written and where."""
 
     keys: tuple[str, ...]
     value: Any
     text: str
-    line: int
+    origin: str
 
 
 def _read_leaves(text: str, origin: str) -> list[_Leaf]:
@@ -183,7 +189,7 @@ def _walk(loader: yaml.SafeLoader, node: yaml.MappingNode, above: tuple[str, ...
             yield from _walk(loader, value_node, (*above, key), origin)
         else:
             text = value_node.value if isinstance(value_node, yaml.ScalarNode) else ""
-            yield _Leaf((*above, key), loader.construct_object(value_node, deep=True), text, line)
+            yield _Leaf((*above, key), loader.construct_object(value_node, deep=True), text, f"{origin}:{line}")
 
 
 def _describe_yaml_error(error: yaml.YAMLError, origin: str) -> str:
@@ -200,19 +206,23 @@ def _describe_yaml_error(error: yaml.YAMLError, origin: str) -> str:
 # ---------------------------------------------------------------------------------------------------- layers
 
 
-@dataclass(frozen=True)
-class _Override:
-    keys: tuple[str, ...]
-    text: str
-    origin: str
-
-
-def _parse_override(text: str) -> _Override:
-    key, equals, value = text.partition("=")
-    keys = tuple(key.strip().split("."))
+def _read_override(text: str) -> list[_Leaf]:
+    """The values that an override sets: one, or those of a section that is given as a whole."""
+    key, equals, written = (part.strip() for part in text.partition("="))
+    keys = tuple(key.split("."))
     if not equals or not all(re.fullmatch(r"\w+", k) for k in keys):
         raise DyngsError(f"{text!r} is not an override; write section.key=value, for instance train.steps=2000")
-    return _Override(keys, value.strip(), text)
+    loader = _PresetLoader(written)
+    try:
+        node = loader.get_single_node()
+        if isinstance(node, yaml.MappingNode) and node.value:
+            return [replace(leaf, origin=text) for leaf in _walk(loader, node, keys, text)]
+        value = None if node is None else loader.construct_object(node, deep=True)
+    except (yaml.YAMLError, RecursionError):
+        value = written  # a path or a name that happens not to be YAML
+    finally:
+        loader.dispose()
+    return [_Leaf(keys, value, written, text)]
 
 
 @dataclass
@@ -231,49 +241,46 @@ class _Layers:
         except OSError as error:
             raise DyngsError(f"{path}: cannot be read ({error.strerror})") from None
         for leaf in _read_leaves(text, str(path)):
-            self._set(leaf.keys, leaf.value, leaf.text, f"{path}:{leaf.line}")
+            self._set(leaf)
 
-    def add_override(self, override: _Override) -> None:
-        loader = _PresetLoader(override.text)
-        try:
-            node = loader.get_single_node()
-            if isinstance(node, yaml.MappingNode) and node.value:
-                leaves = list(_walk(loader, node, override.keys, override.origin))
-                for leaf in sorted(leaves, key=lambda o: o.keys[-1] != "kind"):
-                    if leaf.keys[-1] == "kind":
-                        self._drop_other_kind(leaf.keys[0], leaf.value)
-                    self._set(leaf.keys, leaf.value, leaf.text, override.origin)
-                return
-            value = None if node is None else loader.construct_object(node, deep=True)
-        except (yaml.YAMLError, RecursionError):
-            value = override.text  # a path or a name that happens not to be YAML
-        finally:
-            loader.dispose()
-        if override.keys[-1] == "kind":
-            self._drop_other_kind(override.keys[0], value)
-        self._set(override.keys, value, override.text, override.origin)
+    def add_overrides(self, overrides: Iterable[str]) -> None:
+        leaves = [leaf for text in overrides for leaf in _read_override(text)]
+        # what empties a section goes first, outer sections before inner ones
+        for leaf in sorted(leaves, key=lambda o: (o.keys[-1] != "kind" and o.value != {}, len(o.keys))):
+            if leaf.keys[-1] == "kind":
+                self._drop_other_kind(leaf.keys[:-1], leaf.value)
+            self._set(leaf)
 
-    def _drop_other_kind(self, name: str, kind: Any) -> None:
-        """Empty section ``name`` if it is of another kind than ``kind``."""
-        section = self.tree.get(name)
-        if isinstance(section, dict) and name in Config.model_fields:
-            present = section.get("kind", section_class(name).model_fields["kind"].default)
-            if present != kind:
-                section.clear()
+    def _drop_other_kind(self, keys: tuple[str, ...], kind: Any) -> None:
+        """Empty the section at ``keys`` if it is of another kind than ``kind``."""
+        section = self.value_at(keys)
+        info = section_at(self.tree, keys).model_fields.get(keys[-1]) if keys else None
+        if not isinstance(section, dict) or info is None or not kinds_of(info):
+            return
+        if section.get("kind", info.get_default().kind) != kind:
+            section.clear()
+            self.origins = {k: v for k, v in self.origins.items() if k[: len(keys)] != keys}
 
-    def _set(self, keys: tuple[str, ...], value: Any, text: str, origin: str) -> None:
-        section = self.tree
+    def _set(self, leaf: _Leaf) -> None:
+        keys, value, section = leaf.keys, leaf.value, self.tree
         for depth, key in enumerate(keys[:-1], start=1):
             inner = section.setdefault(key, {})
             if inner is None:
                 inner = section[key] = {}
             if not isinstance(inner, dict):
-                raise DyngsError(f"{origin}: {'.'.join(keys[:depth])} is a value, it has no key {keys[depth]!r}")
+                raise DyngsError(f"{leaf.origin}: {'.'.join(keys[:depth])} is a value, it has no key {keys[depth]!r}")
             section = inner
         if isinstance(value, str) and value.startswith("~/"):
             value = os.path.expanduser(value)
         section[keys[-1]] = value
-        self.origins[keys], self.written[keys] = origin, text
+        self.origins[keys], self.written[keys] = leaf.origin, leaf.text
+
+    def value_at(self, keys: tuple[str, ...]) -> Any:
+        """The value or section at ``keys``; None where there is none."""
+        node: Any = self.tree
+        for key in keys:
+            node = node.get(key) if isinstance(node, dict) else None
+        return node
 
     def origin_of(self, keys: tuple[str, ...]) -> str:
         """Where the value at ``keys``, or else the first one below it, was written; "" if nowhere."""
@@ -284,13 +291,19 @@ class _Layers:
 # ---------------------------------------------------------------------------------------------------- checking
 
 
+def _fill_in_kinds(section: type[BaseModel], node: dict[str, Any]) -> None:
+    """Put an empty section where one is absent, and the default ``kind`` where a section with variants has none."""
+    for name, info in section.model_fields.items():
+        if section_classes(info):
+            inner = node[name] = {} if node.get(name) is None else node[name]
+            if isinstance(inner, dict):
+                if kinds_of(info):
+                    inner.setdefault("kind", info.get_default().kind)
+                _fill_in_kinds(section_class(info, inner.get("kind")), inner)
+
+
 def _validate(layers: _Layers) -> Config:
-    for name, info in Config.model_fields.items():
-        if layers.tree.get(name) is None:
-            layers.tree[name] = {}
-        section = layers.tree[name]
-        if info.discriminator and isinstance(section, dict):
-            section.setdefault("kind", info.get_default().kind)
+    _fill_in_kinds(Config, layers.tree)
     try:
         return Config.model_validate(layers.tree)
     except ValidationError as error:
@@ -305,66 +318,51 @@ def _take_as_text(layers: _Layers, problems: list[ErrorDetails]) -> bool:
     """Replace numbers, dates and such by what was written where the schema wants text; True if anything changed."""
     changed = False
     for problem in problems:
-        keys = _keys_of(layers.tree, problem["loc"])
+        keys = keys_of_location(problem["loc"])
         if problem["type"] in ("string_type", "path_type") and layers.written.get(keys):
-            section = layers.tree
-            for key in keys[:-1]:
-                section = section[key]
+            section = layers.value_at(keys[:-1])
             changed = changed or section[keys[-1]] != layers.written[keys]
             section[keys[-1]] = layers.written[keys]
     return changed
 
 
-def _keys_of(tree: dict[str, Any], loc: tuple[int | str, ...]) -> tuple[str, ...]:
-    """The keys of a pydantic location, without the ``kind`` tags that pydantic puts between them."""
-    keys: list[str] = []
-    section: Any = tree
-    for i, part in enumerate(loc):
-        is_tag = isinstance(section, dict) and section.get("kind") == part and 0 < i < len(loc) - 1
-        if is_tag and part not in section:
-            continue
-        keys.append(str(part))
-        section = section.get(part) if isinstance(section, dict) else None
-    return tuple(keys)
-
-
 def _explain(layers: _Layers, problem: ErrorDetails) -> str:
-    keys = _keys_of(layers.tree, problem["loc"])
-    kind = problem["type"]
-    if kind == "union_tag_invalid":
-        keys = (*keys, "kind")
-    origin = layers.origin_of(keys)
+    keys = keys_of_location(problem["loc"])
+    section = section_at(layers.tree, keys)
+    what, dotted = problem["type"], ".".join(keys)
+    origin = layers.origin_of((*keys, "kind") if what == "union_tag_invalid" else keys)
     prefix = f"{origin}: " if origin else ""
-    dotted = ".".join(keys)
-    section = _section_at(layers.tree, keys)
-    if kind == "extra_forbidden":
-        full = next((k for k in layers.origins if k[: len(keys)] == keys), keys)
-        owners = [k.kind for k in config_keys() if k.name == dotted]
-        if owners:
-            return f"{prefix}{dotted} belongs to {keys[0]}.kind={owners[0]}, not to {layers.tree[keys[0]].get('kind')}"
-        return f"{prefix}unknown key {dotted!r}{_did_you_mean_key(full, section)}"
-    if kind == "missing":
+    if what == "extra_forbidden":
+        return prefix + _explain_unknown(layers, keys)
+    info = section.model_fields[keys[-1]]
+    if what == "missing":
         example = "data.root=FOLDER" if dotted == "data.root" else f"{dotted}=..."
-        return f"{prefix}{dotted} is missing ({section.model_fields[keys[-1]].description}); give {example}"
-    if kind in ("model_type", "model_attributes_type", "dict_type"):
-        return f"{prefix}{dotted} is a section, not a value; its keys: {', '.join(keys_of_section(dotted))}"
-    value = problem["input"].get("kind") if kind == "union_tag_invalid" else problem["input"]
-    if kind == "union_tag_invalid":
-        choices = [c.strip().strip("'") for c in problem.get("ctx", {})["expected_tags"].split(",")]
+        return f"{prefix}{dotted} is missing ({info.description}); give {example}"
+    if what in ("model_type", "model_attributes_type", "dict_type"):
+        inside = dict.fromkeys(key for variant in section_classes(info) for key in variant.model_fields)
+        return f"{prefix}{dotted} is a section, not a value; its keys: {', '.join(inside)}"
+    if what == "union_tag_invalid":
+        dotted, value, choices = f"{dotted}.kind", layers.value_at((*keys, "kind")), kinds_of(info)
         allowed = f"one of {', '.join(choices)}"
     else:
-        info = section.model_fields[keys[-1]]
-        choices, allowed = choices_of(info.annotation), allowed_values(info)
+        value, choices, allowed = layers.value_at(keys), choices_of(info.annotation), allowed_values(info)
     close = get_close_matches(str(value), choices, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ""
     return f"{prefix}{dotted} must be {allowed}, not {_shorten(value)}{hint}"
 
 
-def _section_at(tree: dict[str, Any], keys: tuple[str, ...]) -> type[BaseModel]:
-    """The section class that holds the last of ``keys`` (``Config`` itself for a section)."""
-    if len(keys) < 2 or keys[0] not in Config.model_fields:
-        return Config
-    return section_class(keys[0], tree[keys[0]].get("kind"))
+def _explain_unknown(layers: _Layers, keys: tuple[str, ...]) -> str:
+    """What to say of a key that its section does not have: that another kind has it, or what is near."""
+    above, dotted = keys[:-1], ".".join(keys)
+    holder = section_at(layers.tree, above).model_fields.get(above[-1]) if above else None
+    variants = section_classes(holder) if holder is not None else []
+    owners = [str(v.model_fields["kind"].default) for v in variants if keys[-1] in v.model_fields]
+    if owners:
+        present = layers.value_at((*above, "kind"))
+        return f"{dotted} belongs to {'.'.join(above)}.kind={' or '.join(owners)}, not to {present}"
+    full = next((k for k in layers.origins if k[: len(keys)] == keys), keys)
+    section = section_at(layers.tree, keys)
+    return f"unknown key {dotted!r}{_did_you_mean_key(full, section, inside=bool(above) and full == keys)}"
 
 
 def _shorten(value: object) -> str:
@@ -372,17 +370,19 @@ def _shorten(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _did_you_mean_key(keys: tuple[str, ...], section: type[BaseModel]) -> str:
-    """``; did you mean ...?`` with the nearest key, preferring the same section, then the same last word elsewhere."""
-    everything = [key.name for key in config_keys()]
-    above = keys[:-1]
+def _did_you_mean_key(keys: tuple[str, ...], section: type[BaseModel], inside: bool) -> str:
+    """``; did you mean ...?`` with the nearest key: of ``section`` if ``inside``, else the same last word elsewhere."""
+    everything = list(dict.fromkeys(key.name for key in config_keys()))
+    dotted = ".".join(keys)
     siblings = get_close_matches(keys[-1], list(section.model_fields), n=1)
+    if siblings and inside:
+        return f"; did you mean {'.'.join((*keys[:-1], siblings[0]))!r}?"
     elsewhere = [name for name in everything if name.split(".")[-1] == keys[-1]]
-    if siblings and len(above) == 1 and above[0] in Config.model_fields:
-        return f"; did you mean {'.'.join((*above, siblings[0]))!r}?"
+    if len(keys) > 1:
+        elsewhere = get_close_matches(dotted, elsewhere, n=1) or elsewhere
     if elsewhere:
-        return f"; did you mean {' or '.join(repr(name) for name in dict.fromkeys(elsewhere))}?"
-    close = get_close_matches(".".join(keys), everything, n=1)
+        return f"; did you mean {' or '.join(repr(name) for name in elsewhere)}?"
+    close = get_close_matches(dotted, everything, n=1)
     if close:
         return f"; did you mean {close[0]!r}?"
     return f"; known here: {', '.join(section.model_fields)}"

@@ -5,7 +5,8 @@ Error messages and the documentation's table are made from this, so that neither
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from types import NoneType
@@ -24,54 +25,74 @@ class ConfigKey:
 
     Attributes:
         name: dotted, for instance ``train.steps``.
-        kind: the section's variant if it has several (the default ``kind``), else "".
+        kinds: the variants that have the key, outermost first, as ``("dynamic", "mlp")``; empty where all have it.
         allowed: what it may be, in words.
         default: as YAML, "" where the key is required.
         description: one line, may be empty.
     """
 
     name: str
-    kind: str
+    kinds: tuple[str, ...]
     allowed: str
     default: str
     description: str
 
 
 def config_keys() -> list[ConfigKey]:
-    """Every key of ``Config`` in declaration order; a ``kind`` that decides on the section's other keys comes once."""
-    rows = []
-    for name, info in Config.model_fields.items():
-        models = section_classes(info)
-        if len(models) > 1:
-            kinds = [kind for model in models for kind in choices_of(model.model_fields["kind"].annotation)]
-            rows.append(ConfigKey(f"{name}.kind", "", f"one of {', '.join(kinds)}", info.get_default().kind, ""))
-        for model in models:
-            variant = str(model.model_fields["kind"].default) if len(models) > 1 else ""
-            for key, inner in model.model_fields.items():
-                if not (variant and key == "kind"):
-                    words = (allowed_values(inner), _default_text(inner), inner.description or "")
-                    rows.append(ConfigKey(f"{name}.{key}", variant, *words))
-    return rows
+    """Every key of ``Config`` in declaration order.
+
+    Of a section with variants comes first the ``kind``, then what all have alike, then what each has of its own.
+    """
+    return list(_keys_below(Config, ""))
+
+
+def _keys_below(section: type[BaseModel], prefix: str) -> Iterator[ConfigKey]:
+    """The keys of ``section``, named with ``prefix``; their kinds are those of the sections inside it."""
+    for key, info in section.model_fields.items():
+        name, variants = prefix + key, section_classes(info)
+        if not variants:
+            yield ConfigKey(name, (), allowed_values(info), _default_text(info), info.description or "")
+        elif len(variants) == 1:
+            yield from _keys_below(variants[0], f"{name}.")
+        else:
+            kinds = ", ".join(kinds_of(info))
+            yield ConfigKey(f"{name}.kind", (), f"one of {kinds}", info.get_default().kind, "")
+            tables = [[k for k in _keys_below(v, f"{name}.") if k.name != f"{name}.kind"] for v in variants]
+            shared = [k for k in tables[0] if all(k in table for table in tables)]
+            yield from shared
+            for variant, table in zip(variants, tables, strict=True):
+                kind = str(variant.model_fields["kind"].default)
+                yield from (replace(k, kinds=(kind, *k.kinds)) for k in table if k not in shared)
 
 
 def keys_table() -> str:
     """All keys as a table in Markdown, for docs/cli.md."""
     lines = ["| key | allowed | default | |", "|---|---|---|---|"]
     for key in config_keys():
-        variant = f" ({key.kind})" if key.kind else ""
+        variant = f" ({', '.join(key.kinds)})" if key.kinds else ""
         default = f"`{key.default}`" if key.default else "required"
-        lines.append(f"| `{key.name}`{variant} | {key.allowed} | {default} | {key.description} |")
+        lines.append(
+            f"| `{key.name}`{variant} | {key.allowed} | {default} | {key.description.replace('|', chr(92) + '|')} |"
+        )
     return "\n".join(lines) + "\n"
 
 
-def allowed_values(info: FieldInfo) -> str:
-    """What a field accepts, in words: ``an integer >= 1``, ``one of white, black``, ``true or false``."""
+def allowed_values(info: FieldInfo, plural: bool = False) -> str:
+    """What a field accepts, in words: ``an integer >= 1``, ``a list of integers >= 1``, ``one of white, black``."""
     annotation = info.annotation
     optional = NoneType in get_args(annotation)
     plain = next((a for a in get_args(annotation) if a is not NoneType), annotation) if optional else annotation
+    one = {bool: "true or false", int: "an integer", float: "a number", str: "text", Path: "a path"}
+    many = {bool: "true or false", int: "integers", float: "numbers", str: "texts", Path: "paths"}
     choices = choices_of(plain)
-    words = {bool: "true or false", int: "an integer", float: "a number", str: "text", Path: "a path"}
-    text = f"one of {', '.join(choices)}" if choices else words.get(plain, str(plain))  # type: ignore[arg-type]
+    if choices:
+        text = f"one of {', '.join(choices)}"
+    elif get_origin(plain) is tuple:
+        some = any(getattr(item, "min_length", None) for item in info.metadata)
+        items = allowed_values(FieldInfo.from_annotation(get_args(plain)[0]), plural=True)
+        text = f"a {'non-empty ' if some else ''}list of {items}"
+    else:
+        text = (many if plural else one).get(plain, str(plain))  # type: ignore[arg-type]
     symbols = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     bounds = [
         f"{symbol} {getattr(item, name):g}"
@@ -97,22 +118,57 @@ def _default_text(info: FieldInfo) -> str:
     value = info.default.value if isinstance(info.default, Enum) else info.default
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
+    if isinstance(value, tuple):
+        return f"[{', '.join(str(v) for v in value)}]"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+# ---------------------------------------------------------------------------------------------------- sections
+
+
 def section_classes(info: FieldInfo) -> list[type[BaseModel]]:
-    """The section classes that a field of ``Config`` may hold."""
+    """The section classes that a field may hold: several for a section with a ``kind``, none for a value."""
     options = get_args(info.annotation) or (info.annotation,)
     return [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
 
 
-def section_class(name: str, kind: object = None) -> type[BaseModel]:
-    """The class of section ``name`` in its variant ``kind`` (the first one where there is no such variant)."""
-    models = section_classes(Config.model_fields[name])
-    chosen = (m for m in models if "kind" in m.model_fields and kind in choices_of(m.model_fields["kind"].annotation))
-    return next(chosen, models[0])
+def kinds_of(info: FieldInfo) -> list[str]:
+    """The kinds that a section may be of; none where it has no variants."""
+    variants = section_classes(info)
+    return [k for v in variants for k in choices_of(v.model_fields["kind"].annotation)] if len(variants) > 1 else []
 
 
-def keys_of_section(name: str) -> list[str]:
-    """The keys of all variants of section ``name``."""
-    return list(dict.fromkeys(k.name.split(".")[1] for k in config_keys() if k.name.startswith(f"{name}.")))
+def section_class(info: FieldInfo, kind: object) -> type[BaseModel]:
+    """The class of a section in its variant ``kind`` (the default one where there is no such variant)."""
+    variants = section_classes(info)
+    if len(variants) == 1:
+        return variants[0]
+    chosen = (v for v in variants if kind in choices_of(v.model_fields["kind"].annotation))
+    return next(chosen, type(info.get_default()))
+
+
+def section_at(tree: dict[str, Any], keys: tuple[str, ...]) -> type[BaseModel]:
+    """The class of the section that holds the last of ``keys`` (the innermost known one), by the kinds in ``tree``."""
+    section: type[BaseModel] = Config
+    node: Any = tree
+    for key in keys[:-1]:
+        info = section.model_fields.get(key)
+        if info is None or not section_classes(info):
+            break
+        node = node.get(key) if isinstance(node, dict) else None
+        section = section_class(info, node.get("kind") if isinstance(node, dict) else None)
+    return section
+
+
+def keys_of_location(location: tuple[int | str, ...]) -> tuple[str, ...]:
+    """The keys of a pydantic location: without the kinds after sections with variants, without indices."""
+    keys: list[str] = []
+    section: type[BaseModel] = Config
+    parts = iter(location)
+    for part in parts:
+        keys.append(str(part))
+        info = section.model_fields.get(str(part))
+        if info is None or not section_classes(info):
+            break
+        section = section_class(info, next(parts, None) if kinds_of(info) else None)
+    return tuple(keys)

@@ -18,5 +18,5 @@ def export_ply(run_dir: Path, path: Path) -> Path:
     model = run.config.model
     comments = (f"step: {run.step}",)
     return write_ply(
-        path, run.gaussians, model.rasterize_mode, comments, eps2d=model.eps2d, world_offset=run.info.world_offset
+        path, run.scene.at(0.0), model.rasterize_mode, comments, eps2d=model.eps2d, world_offset=run.info.world_offset
     )

@@ -3,12 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
+from dyngs.static.densify import EditResult
 from dyngs.static.filters import filter_std, fuse_filter
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What a model draws for a picture.
+
+    Attributes:
+        gaussians: differentiable in the parameters.
+        penalties: differentiable regularizers, weighted, by name.
+    """
+
+    gaussians: Gaussians
+    penalties: dict[str, Tensor] = field(default_factory=dict)
 
 
 class StaticScene:
@@ -23,18 +38,23 @@ class StaticScene:
         self._cameras = filter_cameras
         self._filter_std: Tensor | None = None
 
-    def gaussians_at(self, parameters: Gaussians, batch: object) -> Gaussians:
-        """What is drawn for ``batch``, which is of no matter here; differentiable in ``parameters``."""
+    def gaussians_at(self, parameters: Gaussians, batch: object, step: int) -> Drawn:
+        """What is drawn; ``batch`` and ``step`` are of no matter here."""
         if not self._cameras:
-            return parameters
+            return Drawn(parameters)
         if self._filter_std is None or len(self._filter_std) != len(parameters):
             self._filter_std = filter_std(parameters.means, self._cameras)
-        return fuse_filter(parameters, self._filter_std)
+        return Drawn(fuse_filter(parameters, self._filter_std))
 
-    def after_step(self, parameters: Gaussians, step: int, *, edited: bool) -> None:
-        """Bring what depends on the parameters up to date."""
-        if self._cameras and (edited or step in self.refresh_steps):
+    def after_step(self, parameters: Gaussians, step: int, result: EditResult | None) -> int:
+        """Bring what depends on the parameters up to date; nothing of its own is optimized, so 0 is returned."""
+        if self._cameras and (result is not None or step in self.refresh_steps):
             self._filter_std = filter_std(parameters.means, self._cameras)
+        return 0
+
+    def num_moving(self, num_gaussians: int) -> int:
+        """None of them moves."""
+        return 0
 
     def state(self) -> dict[str, Tensor]:
         return {} if self._filter_std is None else {"filter_std": self._filter_std}

@@ -8,12 +8,13 @@ import numpy as np
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.config import Config, DataConfig, McmcStrategy
+from dyngs.config import Config, DataConfig, DynamicModel, McmcStrategy
 from dyngs.data.capture import Capture, View
 from dyngs.data.images import target_size
 from dyngs.data.intrinsics import scaled_intrinsics
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
+from dyngs.deform.model import DynamicScene, Surroundings4D
 from dyngs.rendering import RenderOptions
 from dyngs.static.densify import DefaultDensifier, Densifier
 from dyngs.static.init import StartValues, Surroundings, initial_gaussians
@@ -21,8 +22,8 @@ from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.model import StaticScene
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.train.sampler import ViewSampler
-from dyngs.train.schedule import densify_schedule, filter_steps, grad_threshold, growth_per_change
-from dyngs.train.step import Trainer
+from dyngs.train.schedule import deform_schedule, densify_schedule, filter_steps, grad_threshold, growth_per_change
+from dyngs.train.step import Model, Trainer
 
 
 def assemble(config: Config) -> Trainer:
@@ -41,7 +42,7 @@ def assemble(config: Config) -> Trainer:
     x, y, z = (float(value) for value in capture.world_offset)
     return Trainer(
         config=config,
-        model=_model(config, capture),
+        model=_model(config, capture, scene.extent, generator),
         optimizer=GaussianOptimizer(gaussians, config.optim),
         densifier=_densifier(config, background, scene.extent),
         pictures=pictures,
@@ -86,11 +87,21 @@ def training_cameras(views: Sequence[View], options: DataConfig) -> list[Cameras
     return cameras
 
 
-def _model(config: Config, capture: Capture) -> StaticScene:
-    if not config.model.filter_3d:
-        return StaticScene()
+def training_times(capture: Capture) -> tuple[float, ...]:
+    """Distinct times of the training views in [0, 1], ascending; empty without times."""
+    return tuple(sorted({view.time for view in capture.splits["train"] if view.time is not None}))
+
+
+def _model(config: Config, capture: Capture, extent: float, generator: torch.Generator) -> Model:
+    """The model asked for; a static one where there are no times for anything to move in."""
+    model, steps = config.model, config.train.steps
     cameras = training_cameras(capture.splits["train"], config.data)
-    return StaticScene(cameras, filter_steps(config.strategy, config.train.steps))
+    still = StaticScene(cameras, filter_steps(config.strategy, steps)) if model.filter_3d else StaticScene()
+    times = training_times(capture)
+    if not isinstance(model, DynamicModel) or len(times) < 2:
+        return still
+    surroundings = Surroundings4D(times, cameras, extent)
+    return DynamicScene(model, deform_schedule(model, steps), surroundings, still, generator)
 
 
 def _densifier(config: Config, background: str, extent: float) -> Densifier:

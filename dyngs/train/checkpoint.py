@@ -17,12 +17,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dyngs.config import Config, StaticModel
+from dyngs.config import Config, SceneModel
 from dyngs.config_io import load_resolved
 from dyngs.data.write import whole_file, write_text
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.static.filters import fuse_filter
+from dyngs.deform.trained import TrainedScene, trained_scene
 
 FORMAT_VERSION = 1
 KEEP_CHECKPOINTS = 2
@@ -66,13 +66,13 @@ class LoadedRun:
 
     Attributes:
         config: the resolved configuration.
-        gaussians: with the 3D filter fused where the model has one.
+        scene: what is drawn at any time.
         step, seconds_train: how far and how long it was trained (0 s where ``timing.json`` is lost).
         info: of the checkpoint.
     """
 
     config: Config
-    gaussians: Gaussians
+    scene: TrainedScene
     step: int
     seconds_train: float
     info: CheckpointInfo
@@ -149,20 +149,19 @@ def load_run(run_dir: Path) -> LoadedRun:
     """
     config = load_resolved(run_dir)
     checkpoint = latest_checkpoint(run_dir)
-    gaussians = stored_gaussians(checkpoint, config.model)
+    scene = stored_scene(checkpoint, config.model)
     step = checkpoint.info.step
-    return LoadedRun(config, gaussians, step, seconds_at(run_dir, step), checkpoint.info)
+    return LoadedRun(config, scene, step, seconds_at(run_dir, step), checkpoint.info)
 
 
-def stored_gaussians(checkpoint: Checkpoint, model: StaticModel) -> Gaussians:
-    """The Gaussians of a checkpoint as they are drawn: with the 3D filter fused where ``model`` has one."""
+def stored_scene(checkpoint: Checkpoint, model: SceneModel) -> TrainedScene:
+    """The scene of a checkpoint of ``model``."""
     part = checkpoint.part("gaussians")
-    missing = [name for name in _FIELDS if name not in part]
-    if missing:
-        raise DyngsError(f"the checkpoint of step {checkpoint.info.step} lacks {', '.join(missing)}")
-    gaussians = Gaussians(**{name: part[name] for name in _FIELDS})
-    std = checkpoint.part("model").get("filter_std")
-    return fuse_filter(gaussians, std) if model.filter_3d and std is not None else gaussians
+    try:
+        gaussians = Gaussians(**{name: part[name] for name in _FIELDS})
+        return trained_scene(gaussians, checkpoint.part("model"), model)
+    except KeyError as missing:
+        raise DyngsError(f"the checkpoint of step {checkpoint.info.step} lacks {missing}") from None
 
 
 def last_good(run_dir: Path) -> str:

@@ -14,13 +14,13 @@ from statistics import fmean, median
 import torch
 from torch import Tensor
 
-from dyngs.config import StaticModel
+from dyngs.config import SceneModel
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.write import write_text
 from dyngs.errors import DyngsError
-from dyngs.gaussians import Gaussians
+from dyngs.deform.trained import TrainedScene
 from dyngs.rendering import RenderOptions, render
 from dyngs.train.checkpoint import load_run
 from dyngs.train.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
@@ -107,7 +107,7 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
     with _num_threads(threads):
         loader = PictureLoader(views, run.config.data)
         pictures = (loader[i] for i in range(len(loader)))
-        scores, reasons = score_views(run.gaussians, pictures, render_options(run.config.model), colour, lpips)
+        scores, reasons = score_views(run.scene, pictures, render_options(run.config.model), colour, lpips)
     if len({(s.width, s.height) for s in scores}) > 1:
         notes.append("views differ in size; width and height are those of the first")
     report = EvalReport(
@@ -121,8 +121,8 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
         flip=_mean([s.flip for s in scores]),
         lpips=_mean([s.lpips for s in scores]),
         lpips_net=lpips_net,
-        num_gaussians=len(run.gaussians),
-        model_mb=parameter_megabytes(run.gaussians),
+        num_gaussians=len(run.scene),
+        model_mb=parameter_megabytes(run.scene),
         fps=1 / median(s.render_seconds for s in scores),
         seconds_train=run.seconds_train,
         step=run.step,
@@ -140,12 +140,12 @@ def report_path(run_dir: Path, split: str) -> Path:
 
 
 def score_views(
-    gaussians: Gaussians, pictures: Iterable[Picture], options: RenderOptions, background: Tensor, lpips: Lpips
+    scene: TrainedScene, pictures: Iterable[Picture], options: RenderOptions, background: Tensor, lpips: Lpips
 ) -> tuple[list[ViewScore], dict[str, str]]:
     """Scores of the Gaussians against pictures, and the reasons for metrics that are None.
 
     Args:
-        gaussians: N Gaussians.
+        scene: what to draw, at the time of each picture.
         pictures: truth and camera of each view, drawn one at a time.
         options: as in training, without depth.
         background: (3,) colour behind both the truth and the render.
@@ -158,8 +158,8 @@ def score_views(
     reasons: dict[str, str] = {}
     for picture in pictures:
         if not scores:
-            _timed_render(gaussians, picture, options, background)  # the warm-up
-        rendered, seconds = _timed_render(gaussians, picture, options, background)
+            _timed_render(scene, picture, options, background)  # the warm-up
+        rendered, seconds = _timed_render(scene, picture, options, background)
         if not rendered.isfinite().all():
             raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
         truth, mask = picture.composite(background), picture.mask
@@ -203,23 +203,23 @@ def evaluation_background(choice: str, has_alpha: bool) -> tuple[str, Tensor]:
     return resolved, torch.full((3,), _BACKGROUNDS[resolved])
 
 
-def render_options(model: StaticModel) -> RenderOptions:
+def render_options(model: SceneModel) -> RenderOptions:
     """How a trained model wants to be drawn."""
     return RenderOptions(near=model.near, eps2d=model.eps2d, mode=model.rasterize_mode)
 
 
-def parameter_megabytes(gaussians: Gaussians) -> float:
-    """Size of the parameters in MB (1e6 bytes) as float32: 236 bytes per Gaussian at SH degree 3."""
-    return 4e-6 * sum(x.numel() for x in gaussians.tensors().values())
+def parameter_megabytes(scene: TrainedScene) -> float:
+    """Size in MB (1e6 bytes) as float32: 236 bytes per Gaussian at SH degree 3, and the field where something moves."""
+    return 4e-6 * (sum(x.numel() for x in scene.gaussians.tensors().values()) + scene.num_field_values)
 
 
 def _timed_render(
-    gaussians: Gaussians, picture: Picture, options: RenderOptions, background: Tensor
+    scene: TrainedScene, picture: Picture, options: RenderOptions, background: Tensor
 ) -> tuple[Tensor, float]:
-    """(H, W, 3) rendered picture and the seconds that it took."""
+    """(H, W, 3) rendered picture and the seconds that it took, the deformation included."""
     with torch.no_grad():
         start = time.perf_counter()
-        rendering = render(gaussians, picture.cameras, options, background=background)
+        rendering = render(scene.at(picture.time), picture.cameras, options, background=background)
         seconds = time.perf_counter() - start
     return rendering.rgb[0], seconds
 

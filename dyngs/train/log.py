@@ -27,6 +27,7 @@ class LogRecord:
         loss: of this step, regularizers included.
         psnr: of this step's picture, dB; None where its mask leaves nothing.
         num_gaussians: after the step.
+        num_moving: those of them that depend on time.
         bad_gradients: how often so far a Gaussian was left out of a step because its gradient was not finite.
         seconds: training time so far, over all resumes.
     """
@@ -35,6 +36,7 @@ class LogRecord:
     loss: float
     psnr: float | None
     num_gaussians: int
+    num_moving: int
     bad_gradients: int
     seconds: float
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from dyngs.config import DefaultStrategy, McmcStrategy, OptimConfig, TrainConfig
+from dyngs.config import DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, TrainConfig
+from dyngs.deform.model import DeformSchedule
 from dyngs.static.densify import DensifySchedule
 
 PUBLISHED_STEPS = 30_000
@@ -16,6 +17,8 @@ RESET_SHARE = 0.2
 """Of a short run, between resets."""
 MAX_GROWTH = 0.25
 FILTER_EVERY = 100
+FIRST_SPLIT, LAST_SPLIT, SPLIT_GAP = 0.3, 0.7, 0.05
+"""When a dynamic model freezes what does not move, in shares of the run."""
 
 
 def scaled(step: int, steps: int) -> int:
@@ -77,3 +80,11 @@ def filter_steps(strategy: DefaultStrategy | McmcStrategy, steps: int) -> range:
     """Steps after which Mip-Splatting's 3D filter is recomputed: each 100 from the end of densification on."""
     first = -(-scaled(strategy.stop, steps) // FILTER_EVERY) * FILTER_EVERY
     return range(first, steps - FILTER_EVERY + 1, FILTER_EVERY)
+
+
+def deform_schedule(model: DynamicModel, steps: int) -> DeformSchedule:
+    """The phases of a dynamic model in a run of ``steps``; where all may move (``still_below`` is 0) nothing is frozen."""
+    fine = min(max(1, round(model.coarse * steps)), steps)
+    shares = [FIRST_SPLIT + i * SPLIT_GAP for i in range(round((LAST_SPLIT - FIRST_SPLIT) / SPLIT_GAP) + 1)]
+    splits = sorted({round(share * steps) for share in shares}) if model.still_below > 0 else []
+    return DeformSchedule(fine, tuple(step for step in splits if step > fine), steps)

@@ -15,7 +15,8 @@ from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.rendering import RenderOptions, render
-from dyngs.static.densify import Densifier
+from dyngs.static.densify import Densifier, EditResult
+from dyngs.static.model import Drawn
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.train.sampler import ViewSampler
@@ -25,12 +26,20 @@ from dyngs.train.schedule import active_sh_degree, means_rate
 class Model(Protocol):
     """What turns the parameters stored per Gaussian into the Gaussians of a picture."""
 
-    def gaussians_at(self, parameters: Gaussians, batch: Picture) -> Gaussians:
-        """What is drawn for ``batch``; differentiable in ``parameters``."""
+    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
+        """What is drawn for ``batch`` in ``step``; differentiable in ``parameters`` and in what the model learns."""
         ...
 
-    def after_step(self, parameters: Gaussians, step: int, *, edited: bool) -> None:
-        """Bring what depends on the parameters up to date; ``edited``: the set of Gaussians has changed."""
+    def after_step(self, parameters: Gaussians, step: int, result: EditResult | None) -> int:
+        """Optimize what is the model's own and follow ``result``, the change of the set of Gaussians if there was one.
+
+        Returns:
+            the number of rows left out because their gradient was not finite.
+        """
+        ...
+
+    def num_moving(self, num_gaussians: int) -> int:
+        """How many of the Gaussians depend on time."""
         ...
 
     def state(self) -> dict[str, Tensor]: ...
@@ -92,14 +101,14 @@ class Trainer:
         picture = self.pictures[self.sampler.next(self.generator)]
         background = self._background_colour()
         parameters = self.optimizer.parameters
-        gaussians = self.model.gaussians_at(parameters, picture)
-        probe = torch.zeros(1, len(gaussians), 4, requires_grad=True) if self.densifier.wants_signal(step) else None
+        drawn = self.model.gaussians_at(parameters, picture, step)
+        probe = torch.zeros(1, len(parameters), 4, requires_grad=True) if self.densifier.wants_signal(step) else None
         options = replace(self.options, sh_degree=active_sh_degree(config.train, step, parameters.sh_degree))
-        rendering = render(gaussians, picture.cameras, options, background=background, probe=probe)
+        rendering = render(drawn.gaussians, picture.cameras, options, background=background, probe=probe)
         rendered, truth = rendering.rgb[0], picture.composite(background)
         terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
-        terms |= self.densifier.regularizers(parameters)
-        loss = _finite_sum(terms, step, picture.name)
+        terms |= drawn.penalties | self.densifier.regularizers(parameters)
+        loss = _finite_sum(terms, step, picture, drawn.gaussians)
         sum(terms.values(), torch.zeros(())).backward()
         if probe is not None and probe.grad is not None:
             size = (picture.cameras.width, picture.cameras.height)
@@ -115,7 +124,7 @@ class Trainer:
         if result is not None:
             self.optimizer.apply(result)
         self.densifier.perturb(self.optimizer.parameters, lr_means, self.generator)
-        self.model.after_step(self.optimizer.parameters, step, edited=result is not None)
+        self.bad_gradients += self.model.after_step(self.optimizer.parameters, step, result)
         self.done = step
 
     def checkpoint(self) -> Checkpoint:
@@ -150,12 +159,15 @@ class Trainer:
         return torch.full((3,), 1.0 if self.background == "white" else 0.0)
 
 
-def _finite_sum(terms: dict[str, Tensor], step: int, view: str) -> float:
+def _finite_sum(terms: dict[str, Tensor], step: int, picture: Picture, gaussians: Gaussians) -> float:
     values = {name: float(term.detach()) for name, term in terms.items()}
     for name, value in values.items():
         if not math.isfinite(value):
+            broken = [f for f, x in gaussians.tensors().items() if not bool(x.isfinite().all())]
+            moment = "" if picture.time is None else f" at time {picture.time:g}"
+            cause = f"the {', '.join(broken)} drawn{moment} are not finite" if broken else "look at that picture"
             raise DyngsError(
-                f"step {step}, view {view!r}: the loss term {name!r} is {value}; look at that picture, or "
-                "lower the rates in optim"
+                f"step {step}, view {picture.name!r}: the loss term {name!r} is {value}; {cause}; lower the rates in "
+                f"optim{' and model.deform' if broken and moment else ''}"
             )
     return sum(values.values())

@@ -115,11 +115,13 @@ class _Loop:
 
     def _tell(self, report: StepReport) -> None:
         quality = psnr(report.rendered, report.truth, report.picture.mask)
+        num_gaussians = len(self.trainer.optimizer.parameters)
         record = LogRecord(
             step=report.step,
             loss=report.loss,
             psnr=quality if math.isfinite(quality) else None,
-            num_gaussians=len(self.trainer.optimizer.parameters),
+            num_gaussians=num_gaussians,
+            num_moving=self.trainer.model.num_moving(num_gaussians),
             bad_gradients=self.trainer.bad_gradients,
             seconds=round(self.watch.seconds, 3),
         )

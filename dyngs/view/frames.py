@@ -142,7 +142,7 @@ def write_split(run_dir: Path, split: str, out_dir: Path, output: OutputOptions 
     with _FrameWriter(out_dir, output) as writer:
         for i, stem in enumerate(file_stems([view.name for view in views])):
             picture = loader[i]
-            frame = next(render_frames(run.gaussians, picture.cameras, options, background))
+            frame = next(render_frames(run.scene.at(picture.time), picture.cameras, options, background))
             writer.write(stem, frame)
             if i in shown:
                 truth = picture.composite(background)

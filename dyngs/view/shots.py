@@ -82,7 +82,7 @@ def shot_of_run(run_dir: Path, options: ShotOptions) -> Shot:
         place = orbit_path if options.path == "orbit" else spiral_path
         path = CameraPath(place(around, options.num_frames))
     cameras = path.cameras if options.size is None else resize_cameras(path.cameras, *options.size)
-    return Shot(run.gaussians, cameras, render_options(run.config.model), background, path.fps)
+    return Shot(run.scene.at(0.0), cameras, render_options(run.config.model), background, path.fps)
 
 
 def shot_of_ply(file: Path, options: ShotOptions) -> Shot:

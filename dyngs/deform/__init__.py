@@ -1,0 +1,1 @@
+"""Scenes that move: canonical Gaussians and a deformation field over time."""

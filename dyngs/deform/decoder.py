@@ -1,0 +1,70 @@
+"""The small network at the end of a field: features in, one number per degree of freedom out, zero before training."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from dyngs.config import FieldSection
+from dyngs.deform.field import Offsets
+from dyngs.deform.learned import LearnedTensors
+from dyngs.ops.perceptron import Layer, perceptron
+
+
+class Decoder:
+    """A multilayer perceptron whose last layer starts at zero.
+
+    Args:
+        num_inputs: features per row.
+        hidden: units of the hidden layers.
+        options: which heads there are.
+        skip: layer whose input is the features once more, beside the hidden units.
+    """
+
+    def __init__(
+        self, num_inputs: int, hidden: Sequence[int], options: FieldSection, *, skip: int | None = None
+    ) -> None:
+        self.widths = [num_inputs, *hidden, sum(head_sizes(options).values())]
+        self.skip = skip
+
+    def start_values(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """Weights by Glorot and Bengio 2010 and zero biases; the last layer all zero."""
+        values: dict[str, Tensor] = {}
+        last = len(self.widths) - 2
+        for i in range(last + 1):
+            fan_in = self.widths[i] + (self.widths[0] if i == self.skip else 0)
+            fan_out = self.widths[i + 1]
+            bound = 0.0 if i == last else math.sqrt(6 / (fan_in + fan_out))
+            uniform = torch.rand((fan_out, fan_in), generator=generator)
+            values[f"weight{i}"] = (2 * uniform - 1) * bound
+            values[f"bias{i}"] = torch.zeros(fan_out)
+        return values
+
+    def __call__(self, features: Tensor, learned: LearnedTensors) -> Tensor:
+        """(M, K) outputs of ``features`` (M, num_inputs) with the weights in ``learned``."""
+        layers = [Layer(learned[f"weight{i}"], learned[f"bias{i}"]) for i in range(len(self.widths) - 1)]
+        return perceptron(features, layers, skip=self.skip)
+
+
+def head_sizes(options: FieldSection) -> Mapping[str, int]:
+    """Name of every head in ``Offsets`` to its number of outputs, in order."""
+    wanted = {
+        "means": (3, True),
+        "quats": (4, options.move_rotations),
+        "log_scales": (3, options.move_scales),
+        "logit_opacities": (1, options.move_opacities),
+        "colors": (3, options.move_colors),
+    }
+    return {name: size for name, (size, is_on) in wanted.items() if is_on}
+
+
+def split_heads(outputs: Tensor, options: FieldSection) -> Offsets:
+    """The outputs (M, K) of the heads by name."""
+    heads = head_sizes(options)
+    parts = dict(zip(heads, outputs.split(list(heads.values()), dim=1), strict=True))
+    if "logit_opacities" in parts:
+        parts["logit_opacities"] = parts["logit_opacities"][:, 0]
+    return Offsets(**parts)

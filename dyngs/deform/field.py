@@ -1,0 +1,111 @@
+"""What every deformation field offers, and how its offsets change Gaussians.
+
+Local letters: M moving Gaussians, a subset of the N of a scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from dyngs.deform.learned import LearnedTensors
+from dyngs.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """By how much M Gaussians differ from their canonical form at one time; zeros mean that they do not.
+
+    Attributes:
+        means: (M, 3) world units.
+        quats: (M, 4) added to the identity (1, 0, 0, 0); the sum turns the Gaussian after its own rotation.
+        log_scales: (M, 3).
+        logit_opacities: (M,).
+        colors: (M, 3) of the base colour, in units of the constant SH coefficient.
+    """
+
+    means: Tensor
+    quats: Tensor | None = None
+    log_scales: Tensor | None = None
+    logit_opacities: Tensor | None = None
+    colors: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class FieldSetup:
+    """What a field must know of its scene.
+
+    Attributes:
+        center, half_size: (3,) of the box in which things move, world units; no side is zero.
+        num_times: distinct training times.
+        num_moving: M.
+        extent: of the scene, world units; learning rates are relative to it.
+    """
+
+    center: Tensor
+    half_size: Tensor
+    num_times: int
+    num_moving: int
+    extent: float
+
+    def normalized(self, means: Tensor) -> Tensor:
+        """(M, 3) ``means`` in the box's own coordinates: [-1, 1] inside."""
+        return (means - self.center) / self.half_size
+
+
+class DeformationField(Protocol):
+    """Offsets of canonical Gaussians over time, the identity before training."""
+
+    learned: LearnedTensors
+    """All that is optimised."""
+
+    def offsets(self, means: Tensor, time: float) -> Offsets:
+        """What moves at ``time`` in [0, 1], for the canonical ``means`` (M, 3) of all moving Gaussians in order."""
+        ...
+
+    def penalties(self) -> dict[str, Tensor]:
+        """Differentiable regularizers of the field itself, weighted, by name."""
+        ...
+
+    def select(self, index: Tensor, is_new: Tensor) -> None:
+        """Follow a change of the moving set: row i of the new one descends from row ``index[i]`` of the old one."""
+        ...
+
+
+def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None) -> Gaussians:
+    """``gaussians`` with ``offsets`` applied to ``rows`` ((M,) long; None = all of them, in order); differentiable."""
+    changes = {"means": _added(gaussians.means, offsets.means, rows)}
+    if offsets.quats is not None:
+        own = gaussians.quats if rows is None else gaussians.quats.index_select(0, rows)
+        turned = turned_quats(own, offsets.quats)
+        changes["quats"] = turned if rows is None else gaussians.quats.index_copy(0, rows, turned)
+    if offsets.log_scales is not None:
+        changes["log_scales"] = _added(gaussians.log_scales, offsets.log_scales, rows)
+    if offsets.logit_opacities is not None:
+        changes["logit_opacities"] = _added(gaussians.logit_opacities, offsets.logit_opacities, rows)
+    if offsets.colors is not None:
+        base = _added(gaussians.sh[:, 0], offsets.colors, rows)
+        changes["sh"] = torch.cat([base[:, None], gaussians.sh[:, 1:]], dim=1)
+    return gaussians.replace(**changes)
+
+
+def turned_quats(quats: Tensor, offsets: Tensor) -> Tensor:
+    """(M, 4) the rotations ``quats`` followed by those of identity + ``offsets``: a Hamilton product, not normalised."""
+    w1, x1, y1, z1 = (offsets + offsets.new_tensor([1.0, 0.0, 0.0, 0.0])).unbind(-1)
+    w2, x2, y2, z2 = quats.unbind(-1)
+    return torch.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ],
+        dim=-1,
+    )
+
+
+def _added(x: Tensor, offset: Tensor, rows: Tensor | None) -> Tensor:
+    return x + offset if rows is None else x.index_add(0, rows, offset)

@@ -1,0 +1,44 @@
+"""From the configuration to a deformation field, new or from a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from dyngs.config import HexplaneField, MlpField, TrajectoryField
+from dyngs.deform.field import DeformationField, FieldSetup
+from dyngs.deform.hexplane import Hexplane
+from dyngs.deform.mlp import Mlp
+from dyngs.deform.trajectory import Trajectory
+
+FieldOptions = HexplaneField | MlpField | TrajectoryField
+
+
+def new_field(options: FieldOptions, setup: FieldSetup, generator: torch.Generator) -> DeformationField:
+    """An untrained field of the kind asked for: every Gaussian stays where it is."""
+    if isinstance(options, HexplaneField):
+        return Hexplane(options, setup, generator)
+    if isinstance(options, MlpField):
+        return Mlp(options, setup, generator)
+    return Trajectory(options, setup, generator)
+
+
+def field_state(field: DeformationField, setup: FieldSetup) -> dict[str, Tensor]:
+    """What ``restored_field`` needs, by name."""
+    box = torch.stack([setup.center, setup.half_size])
+    numbers = torch.tensor([setup.num_times, setup.extent], dtype=torch.float64)
+    return {f"learned.{name}": x for name, x in field.learned.state().items()} | {"box": box, "numbers": numbers}
+
+
+def restored_field(
+    options: FieldOptions, state: Mapping[str, Tensor], num_moving: int
+) -> tuple[DeformationField, FieldSetup]:
+    """The field of a checkpoint for M moving Gaussians, and its setup. Raises KeyError where ``state`` lacks something."""
+    num_times, extent = state["numbers"].tolist()
+    setup = FieldSetup(state["box"][0], state["box"][1], int(num_times), num_moving, extent)
+    field = new_field(options, setup, torch.Generator())
+    prefix = "learned."
+    field.learned.load_state({n.removeprefix(prefix): x for n, x in state.items() if n.startswith(prefix)})
+    return field, setup

@@ -1,0 +1,65 @@
+"""Planes over pairs of space and time axes with a small decoder (4DGS: Wu et al. 2024; K-Planes: Fridovich-Keil et al. 2023)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dyngs.config import HexplaneField
+from dyngs.deform.decoder import Decoder, head_sizes, split_heads
+from dyngs.deform.field import FieldSetup, Offsets
+from dyngs.deform.learned import LearnedTensors
+from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
+
+MIN_TIME_ROWS = 2
+SPACE_RANGE = (0.1, 0.5)
+"""Planes over space start uniformly in it, those with time at 1 (Wu et al.): the product does not depend on time."""
+
+
+class Hexplane:
+    """Features from six planes per level, decoded into offsets.
+
+    Time covers the planes' whole range, and the decoder's last layer starts at zero, so that the field starts as the
+    identity. Each head has as many hidden units as the trunk; the last layer may mix them (in Wu et al. it is block-diagonal).
+    """
+
+    def __init__(self, options: HexplaneField, setup: FieldSetup, generator: torch.Generator) -> None:
+        self.options, self.setup = options, setup
+        tensors: dict[str, Tensor] = {}
+        rows = time_rows(options, setup.num_times)
+        for level, multiplier in enumerate(options.levels):
+            side = options.resolution * multiplier
+            low, high = SPACE_RANGE
+            space = torch.rand((3, side, side, options.channels), generator=generator) * (high - low) + low
+            tensors[f"space{level}"] = space
+            tensors[f"time{level}"] = torch.ones(3, rows, side, options.channels)
+        hidden = [options.width] * options.depth + [options.width * len(head_sizes(options))]
+        self.decoder = Decoder(options.channels * len(options.levels), hidden, options)
+        rates = dict.fromkeys(tensors, options.lr_planes * setup.extent)
+        weights = self.decoder.start_values(generator)
+        rates |= dict.fromkeys(weights, options.lr_decoder * setup.extent)
+        self.learned = LearnedTensors(tensors | weights, rates, options.lr_decay)
+
+    @property
+    def levels(self) -> list[PlaneLevel]:
+        indices = range(len(self.options.levels))
+        return [PlaneLevel(self.learned[f"space{i}"], self.learned[f"time{i}"]) for i in indices]
+
+    def offsets(self, means: Tensor, time: float) -> Offsets:
+        """See ``DeformationField.offsets``; no gradient flows to ``means``."""
+        coords = self.setup.normalized(means.detach())
+        features = hexplane_features(coords, time, self.levels)
+        return split_heads(self.decoder(features, self.learned), self.options)
+
+    def penalties(self) -> dict[str, Tensor]:
+        options = self.options
+        weights = (options.space_smoothness, options.time_smoothness, options.time_sparsity)
+        return {"plane smoothness": plane_penalty(self.levels, weights)} if any(weights) else {}
+
+    def select(self, index: Tensor, is_new: Tensor) -> None:
+        """Nothing: no part of the field belongs to one Gaussian."""
+
+
+def time_rows(options: HexplaneField, num_times: int) -> int:
+    """Rows of the planes with time: as asked for, or half the number of training times."""
+    return options.time_resolution or max(MIN_TIME_ROWS, (num_times + 1) // 2)

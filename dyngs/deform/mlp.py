@@ -1,0 +1,50 @@
+"""A multilayer perceptron on encoded position and time (Deformable-3DGS: Yang et al. 2024)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dyngs.config import MlpField
+from dyngs.deform.decoder import Decoder, split_heads
+from dyngs.deform.field import FieldSetup, Offsets
+from dyngs.deform.learned import LearnedTensors
+
+SKIP_LAYER = 5
+"""The input is fed once more into this layer (counted from 0), where there are that many hidden ones."""
+
+
+class Mlp:
+    """Offsets by a deep network; starts as the identity, because its last layer starts at zero.
+
+    Differs from the paper's code in two small ways: time is encoded like position instead of by a network of its own, and
+    scales change in the logarithm, so that they stay positive.
+    """
+
+    def __init__(self, options: MlpField, setup: FieldSetup, generator: torch.Generator) -> None:
+        self.options, self.setup = options, setup
+        inputs = 3 * (1 + 2 * options.space_frequencies) + 1 + 2 * options.time_frequencies
+        skip = SKIP_LAYER if options.depth > SKIP_LAYER else None
+        self.decoder = Decoder(inputs, [options.width] * options.depth, options, skip=skip)
+        weights = self.decoder.start_values(generator)
+        self.learned = LearnedTensors(weights, dict.fromkeys(weights, options.lr), options.lr_decay)
+
+    def offsets(self, means: Tensor, time: float) -> Offsets:
+        """See ``DeformationField.offsets``; no gradient flows to ``means``, as in the paper."""
+        space = encoded(self.setup.normalized(means.detach()), self.options.space_frequencies)
+        moment = encoded(space.new_full((1, 1), time), self.options.time_frequencies)
+        features = torch.cat([space, moment.expand(len(space), -1)], dim=1)
+        return split_heads(self.decoder(features, self.learned), self.options)
+
+    def penalties(self) -> dict[str, Tensor]:
+        return {}
+
+    def select(self, index: Tensor, is_new: Tensor) -> None:
+        """Nothing: no part of the field belongs to one Gaussian."""
+
+
+def encoded(x: Tensor, num_frequencies: int) -> Tensor:
+    """(M, D * (1 + 2 L)) ``x`` (M, D) and its sines and cosines at L octaves (NeRF: Mildenhall et al. 2020)."""
+    octaves = 2.0 ** torch.arange(num_frequencies, dtype=x.dtype)
+    angles = (x[:, None, :] * octaves[:, None]).flatten(1)
+    return torch.cat([x, angles.sin(), angles.cos()], dim=1)

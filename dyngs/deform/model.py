@@ -1,0 +1,195 @@
+"""The dynamic model as the trainer sees it: canonical Gaussians, a field that moves some of them, and which ones.
+
+Training goes through three phases: coarse (nothing moves), fine (the field moves all Gaussians), and from the first split
+on the field moves only those whose motion can be seen; the others are frozen where they are and cost nothing more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.config import DynamicModel
+from dyngs.data.loader import Picture
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed
+from dyngs.deform.fields import field_state, new_field, restored_field
+from dyngs.deform.motion import bake_, measure_motion, select_offsets
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.static.densify import EditResult
+from dyngs.static.filters import FILTER_VARIANCE, filter_std
+from dyngs.static.model import Drawn, StaticScene
+
+BOX_MARGIN = 1.1
+SOLID = 0.05
+"""Opacity from which a Gaussian counts for the box in which things move."""
+
+
+@dataclass(frozen=True)
+class DeformSchedule:
+    """When the phases begin, in steps of this run.
+
+    Attributes:
+        fine: last step without motion.
+        splits: steps after which Gaussians that do not move are frozen.
+        steps: length of the run.
+    """
+
+    fine: int
+    splits: tuple[int, ...]
+    steps: int
+
+
+@dataclass(frozen=True)
+class Surroundings4D:
+    """What the model needs to know of its capture.
+
+    Attributes:
+        times: distinct training times in [0, 1], ascending, at least two.
+        cameras: the training cameras.
+        extent: of the scene, world units.
+    """
+
+    times: tuple[float, ...]
+    cameras: Sequence[Cameras]
+    extent: float
+
+
+class DynamicScene:
+    """Gaussians that a field moves.
+
+    Attributes:
+        field: None before the fine phase, and for good if nothing moves.
+        rows: (M,) indices of the Gaussians that it moves, ascending; None = all.
+    """
+
+    def __init__(
+        self,
+        options: DynamicModel,
+        schedule: DeformSchedule,
+        capture: Surroundings4D,
+        still: StaticScene,
+        generator: torch.Generator,
+    ) -> None:
+        self.options, self.schedule, self.capture = options, schedule, capture
+        self.field: DeformationField | None = None
+        self.rows: Tensor | None = None
+        self._still, self._generator = still, generator
+        self._setup: FieldSetup | None = None
+
+    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
+        """What is drawn for ``batch`` at its time, and the regularizers of motion; differentiable."""
+        if self.field is None:
+            return self._still.gaussians_at(parameters, batch, step)
+        means = parameters.means if self.rows is None else parameters.means.detach()[self.rows]
+        offsets = self.field.offsets(means, self._jittered(batch.time or 0.0, step))
+        moved = deformed(parameters, offsets, self.rows)
+        drawn = self._still.gaussians_at(moved, batch, step)
+        return Drawn(drawn.gaussians, drawn.penalties | self.field.penalties() | self._sparsity(offsets))
+
+    def after_step(self, parameters: Gaussians, step: int, result: EditResult | None) -> int:
+        """Rows left out for bad gradients; optimizes the field, follows ``result``, begins what begins after ``step``."""
+        self._still.after_step(parameters, step, result)
+        left_out = 0
+        if self.field is not None:
+            since = step - self.schedule.fine
+            left_out = self.field.learned.step(since, since / max(self.schedule.steps - self.schedule.fine, 1))
+            if result is not None and result.edit is not None:
+                self._follow(result.edit, self.field)
+        if step == self.schedule.fine:
+            self._begin_motion(parameters)
+        elif step in self.schedule.splits and self.field is not None:
+            self._freeze(parameters, self.field)
+        return left_out
+
+    def num_moving(self, num_gaussians: int) -> int:
+        """M of N Gaussians."""
+        if self.field is None:
+            return 0
+        return num_gaussians if self.rows is None else len(self.rows)
+
+    def state(self) -> dict[str, Tensor]:
+        state = self._still.state() | {"times": torch.tensor(self.capture.times, dtype=torch.float64)}
+        if self.field is not None and self._setup is not None:
+            state |= {f"field.{name}": x for name, x in field_state(self.field, self._setup).items()}
+            if self.rows is not None:
+                state["rows"] = self.rows
+        return state
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self._still.load_state(state)
+        self.rows = state.get("rows")
+        part = {name.removeprefix("field."): x for name, x in state.items() if name.startswith("field.")}
+        self.field = self._setup = None
+        if part:
+            num_moving = 0 if self.rows is None else len(self.rows)
+            self.field, self._setup = restored_field(self.options.deform, part, num_moving)
+
+    def _begin_motion(self, parameters: Gaussians) -> None:
+        times = self.capture.times
+        center, half_size = box_of(parameters, self.capture.extent)
+        setup = FieldSetup(center, half_size, len(times), len(parameters), self.capture.extent)
+        self._setup, self.field = setup, new_field(self.options.deform, setup, self._generator)
+
+    def _freeze(self, parameters: Gaussians, field: DeformationField) -> None:
+        """Stop moving the Gaussians whose motion is too small to be seen."""
+        now = parameters.detach()
+        rows = torch.arange(len(now)) if self.rows is None else self.rows
+        px_size = filter_std(now.means, self.capture.cameras)[rows] / math.sqrt(FILTER_VARIANCE)
+        motion = measure_motion(field, now.select(rows), self.capture.times, px_size)
+        moves = motion.pixels >= self.options.still_below
+        still = torch.nonzero(~moves)[:, 0]
+        bake_(parameters, rows[still], select_offsets(motion.mean, still))
+        kept = torch.nonzero(moves)[:, 0]
+        self.rows = rows[kept]
+        field.select(kept, torch.zeros(len(kept), dtype=torch.bool))
+        if not len(kept):
+            self.field = self._setup = self.rows = None
+
+    def _follow(self, edit: TopologyEdit, field: DeformationField) -> None:
+        """Let rows and field follow a change of the set: descendants of what moves move."""
+        if self.rows is None:
+            field.select(edit.source, edit.is_new)
+            return
+        num_old = 1 + max(int(x.max()) if len(x) else 0 for x in (edit.source, self.rows))
+        position = torch.full((num_old,), -1)
+        position[self.rows] = torch.arange(len(self.rows))
+        descent = position[edit.source]
+        self.rows = torch.nonzero(descent >= 0)[:, 0]
+        field.select(descent[self.rows], edit.is_new[self.rows])
+
+    def _jittered(self, time: float, step: int) -> float:
+        """``time`` with the annealed noise of Deformable-3DGS, against frames that overfit."""
+        if self.options.time_jitter == 0:
+            return time
+        gap = 1 / max(len(self.capture.times) - 1, 1)
+        noise = float(torch.randn((), generator=self._generator)) * self.options.time_jitter * gap
+        return min(max(time + noise * max(0.0, 1 - step / self.schedule.steps), 0.0), 1.0)
+
+    def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
+        """Mean motion: what need not move should not."""
+        if self.options.motion_sparsity == 0 or not len(offsets.means):
+            return {}
+        tiny = 1e-6 * self.capture.extent
+        length = (offsets.means.square().sum(1) + tiny**2).sqrt().mean()
+        return {"motion sparsity": length * (self.options.motion_sparsity / self.capture.extent)}
+
+
+def box_of(gaussians: Gaussians, extent: float) -> tuple[Tensor, Tensor]:
+    """Centre and half sides (3,) of the box around what is solid, a little larger; no side is zero.
+
+    The outer percent of the Gaussians on either side is left out: there the field is that of the box's border.
+    """
+    now = gaussians.detach()
+    solid = (now.opacities >= SOLID) & now.means.isfinite().all(1)
+    means = now.means[solid] if bool(solid.any()) else now.means.nan_to_num()
+    if not len(means):
+        return torch.zeros(3), torch.full((3,), extent)
+    ordered = means.sort(dim=0).values
+    low, high = ordered[int(0.01 * (len(ordered) - 1))], ordered[math.ceil(0.99 * (len(ordered) - 1))]
+    half_size = (0.5 * BOX_MARGIN * (high - low)).clamp_min(max(1e-3 * extent, 1e-6))
+    return 0.5 * (low + high), half_size

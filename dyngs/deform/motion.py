@@ -1,0 +1,89 @@
+"""How much each Gaussian moves, in pixels, and what stays of a motion that is too small to pay for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from dyngs.deform.field import DeformationField, Offsets, turned_quats
+from dyngs.gaussians import Gaussians
+
+PX_PER_OPACITY = 6.0
+"""A change of opacity, or of a colour in units of SH, by x counts as much as a motion by 6 x pixels."""
+MAX_SAMPLES = 24
+"""Times at which motion is measured at most."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What M Gaussians do over time.
+
+    Attributes:
+        pixels: (M,) farthest stray from the mean position, turning and growing of the outline included, in pixels.
+        mean: the offsets' means over time.
+    """
+
+    pixels: Tensor
+    mean: Offsets
+
+
+@torch.no_grad()
+def measure_motion(field: DeformationField, gaussians: Gaussians, times: Sequence[float], px_size: Tensor) -> Motion:
+    """Motion of M Gaussians over ``times``.
+
+    The score is max_t |x_t - mean| + s (2 |q_t - mean| + max_axis |log s_t - mean|) over the size of a pixel, s being the
+    Gaussian's longest standard deviation, plus ``PX_PER_OPACITY`` times the change of opacity and colour.
+
+    Args:
+        gaussians: the M canonical Gaussians that the field moves.
+        times: in [0, 1]; at most ``MAX_SAMPLES`` evenly chosen ones are looked at.
+        px_size: (M,) world units that one pixel covers, in the nearest training view.
+    """
+    chosen = torch.linspace(0, len(times) - 1, min(len(times), MAX_SAMPLES)).round().long().tolist()
+    samples = [field.offsets(gaussians.means, times[i]) for i in chosen]
+    mean = Offsets(**{f.name: _mean([getattr(s, f.name) for s in samples]) for f in fields(Offsets)})
+    longest = gaussians.scales.amax(1)
+    score = torch.zeros(len(gaussians))
+    for sample in samples:
+        stray = (sample.means - mean.means).norm(dim=1)
+        if sample.quats is not None and mean.quats is not None:
+            stray = stray + 2 * longest * (sample.quats - mean.quats)[:, 1:].norm(dim=1)
+        if sample.log_scales is not None and mean.log_scales is not None:
+            stray = stray + longest * (sample.log_scales - mean.log_scales).abs().amax(1)
+        pixels = stray / px_size
+        if sample.logit_opacities is not None and mean.logit_opacities is not None:
+            logits = gaussians.logit_opacities
+            change = (logits + sample.logit_opacities).sigmoid() - (logits + mean.logit_opacities).sigmoid()
+            pixels = pixels + PX_PER_OPACITY * change.abs()
+        if sample.colors is not None and mean.colors is not None:
+            pixels = pixels + PX_PER_OPACITY * (sample.colors - mean.colors).abs().amax(1)
+        score = torch.maximum(score, pixels)
+    return Motion(score, mean)
+
+
+@torch.no_grad()
+def bake_(gaussians: Gaussians, rows: Tensor, offsets: Offsets) -> None:
+    """Apply ``offsets`` to ``rows`` (R,) of ``gaussians`` for good, in place."""
+    gaussians.means.data[rows] += offsets.means
+    if offsets.quats is not None:
+        gaussians.quats.data[rows] = turned_quats(gaussians.quats.data[rows], offsets.quats)
+    if offsets.log_scales is not None:
+        gaussians.log_scales.data[rows] += offsets.log_scales
+    if offsets.logit_opacities is not None:
+        gaussians.logit_opacities.data[rows] += offsets.logit_opacities
+    if offsets.colors is not None:
+        gaussians.sh.data[rows, 0] += offsets.colors
+
+
+def select_offsets(offsets: Offsets, index: Tensor) -> Offsets:
+    """The offsets at ``index``."""
+    values = {f.name: getattr(offsets, f.name) for f in fields(Offsets)}
+    return Offsets(**{name: None if x is None else x[index] for name, x in values.items()})
+
+
+def _mean(samples: list[Tensor | None]) -> Tensor | None:
+    known = [x for x in samples if x is not None]
+    return torch.stack(known).mean(0) if known else None

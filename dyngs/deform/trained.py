@@ -1,0 +1,90 @@
+"""A trained scene: Gaussians at any time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dyngs.config import DynamicModel
+from dyngs.deform.field import DeformationField, deformed
+from dyngs.deform.fields import restored_field
+from dyngs.gaussians import Gaussians
+from dyngs.static.filters import fuse_filter
+
+
+@dataclass(frozen=True)
+class TrainedScene:
+    """What a run has learned.
+
+    Attributes:
+        gaussians: N canonical Gaussians; those of a still scene are what is drawn.
+        rows: (M,) indices of those that move, ascending.
+        field: what moves them; None where nothing moves.
+        filter_std: (N,) of Mip-Splatting's 3D filter, or None.
+        times: distinct training times in [0, 1], ascending; empty for a capture without times.
+    """
+
+    gaussians: Gaussians
+    rows: Tensor
+    field: DeformationField | None = None
+    filter_std: Tensor | None = None
+    times: tuple[float, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    @property
+    def is_still(self) -> bool:
+        """Nothing moves: ``at`` returns the same at every time."""
+        return self.field is None or len(self.rows) == 0
+
+    @property
+    def moving_share(self) -> float:
+        """M / N."""
+        return 0.0 if self.is_still else len(self.rows) / max(len(self), 1)
+
+    @property
+    def num_field_values(self) -> int:
+        """How many numbers the field holds."""
+        return 0 if self.field is None or self.is_still else sum(x.numel() for x in self.field.learned.values().values())
+
+    @torch.no_grad()
+    def at(self, time: float | None) -> Gaussians:
+        """The N Gaussians at ``time``, clamped to [0, 1]; None is 0. What is still is not computed anew."""
+        drawn = self.gaussians
+        if self.field is not None and not self.is_still:
+            moment = min(max(time or 0.0, 0.0), 1.0)
+            everything = len(self.rows) == len(drawn)
+            means = drawn.means if everything else drawn.means[self.rows]
+            drawn = deformed(drawn, self.field.offsets(means, moment), None if everything else self.rows)
+        return drawn if self.filter_std is None else fuse_filter(drawn, self.filter_std)
+
+    def part(self, which: Literal["moving", "still"]) -> TrainedScene:
+        """Only the Gaussians that move, with their field, or only those that do not."""
+        moves = torch.zeros(len(self), dtype=torch.bool)
+        moves[self.rows] = not self.is_still
+        index = torch.nonzero(moves if which == "moving" else ~moves)[:, 0]
+        std = None if self.filter_std is None else self.filter_std[index]
+        rows, field = (torch.arange(len(index)), self.field) if which == "moving" else (torch.zeros(0).long(), None)
+        return replace(self, gaussians=self.gaussians.select(index), rows=rows, field=field, filter_std=std)
+
+
+def trained_scene(gaussians: Gaussians, model_state: Mapping[str, Tensor], options: object) -> TrainedScene:
+    """The scene of a checkpoint: its Gaussians, the state of its model, and the options of that model.
+
+    Raises:
+        KeyError: the state lacks a tensor.
+    """
+    std = model_state.get("filter_std")
+    times = tuple(model_state["times"].tolist()) if "times" in model_state else ()
+    part = {name.removeprefix("field."): x for name, x in model_state.items() if name.startswith("field.")}
+    nothing = torch.zeros(0, dtype=torch.long)
+    if not part or not isinstance(options, DynamicModel):
+        return TrainedScene(gaussians, nothing, None, std, times)
+    rows = model_state.get("rows", torch.arange(len(gaussians)))
+    field, _ = restored_field(options.deform, part, len(rows))
+    return TrainedScene(gaussians, rows, field, std, times)

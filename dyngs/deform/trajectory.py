@@ -1,0 +1,58 @@
+"""A curve per Gaussian, without a network: a polynomial and a Fourier series in time.
+
+For small motion and long clips (compare Li et al. 2024, spacetime Gaussians; Lin et al. 2024, Gaussian-Flow).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from dyngs.config import TrajectoryField
+from dyngs.deform.decoder import head_sizes, split_heads
+from dyngs.deform.field import FieldSetup, Offsets
+from dyngs.deform.learned import LearnedTensors
+
+
+class Trajectory:
+    """Offsets as sums of basis functions with coefficients per Gaussian, all zero at the start."""
+
+    def __init__(self, options: TrajectoryField, setup: FieldSetup, generator: torch.Generator) -> None:
+        self.options, self.setup = options, setup
+        self.num_terms = options.polynomial + 2 * options.fourier
+        sizes = head_sizes(options)
+        tensors = {name: torch.zeros(setup.num_moving, self.num_terms, size) for name, size in sizes.items()}
+        rates = dict.fromkeys(sizes, options.lr_quats)
+        rates["means"] = options.lr_means * setup.extent
+        self.learned = LearnedTensors(tensors, rates, options.lr_decay)
+
+    def offsets(self, means: Tensor, time: float) -> Offsets:
+        """See ``DeformationField.offsets``; ``means`` do not matter."""
+        terms = basis(time, self.options.polynomial, self.options.fourier).to(means)
+        parts = [torch.einsum("b,mbd->md", terms, self.learned[name]) for name in head_sizes(self.options)]
+        return split_heads(torch.cat(parts, dim=1), self.options)
+
+    def penalties(self) -> dict[str, Tensor]:
+        return {}
+
+    def select(self, index: Tensor, is_new: Tensor) -> None:
+        for name in head_sizes(self.options):
+            self.learned.select(name, index, is_new)
+
+
+def basis(time: float, polynomial: int, fourier: int) -> Tensor:
+    """(polynomial + 2 fourier,) values at ``time`` in [0, 1], float64.
+
+    Legendre polynomials of degree 1 and up on the whole clip, then sines and cosines of whole periods, less their mean
+    over the clip (zero); amplitudes fall with frequency so that one learning rate suits all of them.
+    """
+    x = 2 * time - 1
+    legendre = [1.0, x]
+    for n in range(1, polynomial):
+        legendre.append(((2 * n + 1) * x * legendre[n] - n * legendre[n - 1]) / (n + 1))
+    values = legendre[1 : polynomial + 1]
+    for k in range(1, fourier + 1):
+        values += [math.sin(2 * math.pi * k * time) / k, math.cos(2 * math.pi * k * time) / k]
+    return torch.tensor(values, dtype=torch.float64)
