@@ -107,6 +107,7 @@ class MlpField(FieldSection):
     kind: Literal["mlp"] = "mlp"
     depth: int = Field(default=8, ge=2, description="hidden layers")
     width: int = Field(default=256, ge=1)
+    nodes: int = Field(default=0, ge=0, description="evaluate only at so many points (SC-GS); 0 = at every Gaussian")
     space_frequencies: int = Field(default=10, ge=0, le=16)
     time_frequencies: int = Field(default=6, ge=0, le=16)
     lr: Positive = 8e-4
@@ -131,6 +132,8 @@ class DynamicModel(SceneModel):
     kind: Literal["dynamic"] = "dynamic"
     deform: Annotated[HexplaneField | MlpField | TrajectoryField, Field(discriminator="kind")] = HexplaneField()
     coarse: Fraction = Field(default=0.13, description="share of the run that trains without motion")
+    first_views: Fraction = Field(default=0.1, description="share of the views, around the middle, to start with")
+    all_views_at: Fraction = Field(default=0.4, description="share of the run from which all times are trained on")
     still_below: float = Field(default=0.3, ge=0, description="px in the nearest training view; 0 = all may move")
     motion_sparsity: float = Field(default=0.01, ge=0, description="weight of the mean motion, in scene extents")
     time_jitter: float = Field(default=0.0, ge=0, description="of the step between times, annealed; 0.1 suits videos")

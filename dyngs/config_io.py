@@ -36,6 +36,7 @@ from dyngs.errors import DyngsError
 RESOLVED_NAME = "config.yaml"
 """Name of the resolved configuration inside a run folder."""
 
+_ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 _EXACT_FLOAT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
 
 
@@ -89,7 +90,10 @@ def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
 
 def save_config(config: Config, path: Path) -> None:
     """Write every value of ``config`` as YAML, atomically: ``path`` is either the old file or the new one."""
-    text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    values = config.model_dump(mode="json")
+    text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
+    if not _ODD_LINE_BREAKS.isdisjoint(text):
+        text = yaml.safe_dump(values, sort_keys=False, allow_unicode=False)  # escapes, where YAML would fold them
     write_text(path, text)
 
 
@@ -215,6 +219,8 @@ def _read_override(text: str) -> list[_Leaf]:
     loader = _PresetLoader(written)
     try:
         node = loader.get_single_node()
+        if isinstance(node, yaml.MappingNode) and not node.flow_style:
+            return [_Leaf(keys, written, written, text)]  # "10:", which only looks like a mapping
         if isinstance(node, yaml.MappingNode) and node.value:
             return [replace(leaf, origin=text) for leaf in _walk(loader, node, keys, text)]
         value = None if node is None else loader.construct_object(node, deep=True)

@@ -85,7 +85,7 @@ def run_demo(out: Path = DEFAULT_OUT, options: DemoOptions = DemoOptions()) -> D
     shot = shot_of_run(run_dir, ShotOptions("orbit", options.num_frames))
     video = folder / "orbit.mp4"
     output = OutputOptions(video=video)
-    write_path_frames(shot.gaussians, shot.cameras, None, shot.options, shot.background, output)
+    write_path_frames(shot, None, output)
     ply = export_ply(run_dir, folder / "splats.ply")
     seconds = time.perf_counter() - start
     return DemoResult(folder, capture, run_dir, pictures, pictures / "sheet.png", video, ply, report, seconds)

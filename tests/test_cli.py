@@ -13,13 +13,16 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from moving_scene import moved_x, write_moving_run
 
 import dyngs
 from dyngs.cli import doctor, main
 from dyngs.cli.train import parse_config
 from dyngs.config_io import load_config, save_config
 from dyngs.errors import DyngsError
+from dyngs.export.ply import read_ply
 
 VERBS = ("demo", "train", "eval", "render", "export", "data", "bench", "doctor")
 ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"} | {
@@ -118,7 +121,19 @@ def test_module_and_command_are_the_same() -> None:
         ("render nowhere --out x --size 0x5", "1280x720"),
         ("render nowhere --out x --frames 0", "whole number above 0"),
         ("render nowhere --out x --split test --path orbit", "not allowed with"),
+        ("render nowhere", "--out DIR (or --video FILE.mp4 with --path, --time, --times or --view)"),
+        ("render nowhere --out x --time nan", "'nan' is not a time"),
+        ("render nowhere --out x --time noon", "'noon' is not a time; write a number from 0 to 1"),
+        ("render nowhere --out x --time 0 --times 0:1:2", "not allowed with"),
+        ("render nowhere --out x --path orbit --view 3", "--view is for a camera that stands still"),
+        ("render nowhere --out x --times 0:1:2 --frames 3", "--times and --frames both say"),
         ("export nowhere", "nowhere: not a run folder"),
+        ("export nowhere --times 0:1", "'0:1' is no range of times; write START:STOP:COUNT"),
+        ("export nowhere --times 0:nan:3", "times must be finite"),
+        ("export nowhere --time inf", "'inf' is not a time"),
+        ("export nowhere --time 0 --times 0:1:2", "not allowed with"),
+        ("export nowhere --static --dynamic", "not allowed with"),
+        ("export nowhere --format tracks --static", "--static goes with --format ply"),
         ("export nowhere --format spz", "invalid choice: 'spz'"),
         ("data", "COMMAND"),
         ("data inspect nowhere", "nowhere"),
@@ -288,6 +303,113 @@ def test_export_and_render_of_the_file(run_dir: Path, tmp_path: Path, capsys: Ca
     capsys.readouterr()
     assert "has no splits" in error_line(capsys, "render", ply, "--out", tmp_path, "--split", "test")
     assert "no camera path 'circle'" in error_line(capsys, "render", ply, "--out", tmp_path, "--path", "circle")
+
+
+# ---------------------------------------------------------------------------------------------------- what moves
+
+
+@pytest.fixture(scope="module")
+def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_moving_run(tmp_path_factory.mktemp("moving"), standing=True)
+
+
+def test_eval_of_a_moving_run(moving_run: Path, capsys: Capture) -> None:
+    assert main(["eval", str(moving_run)]) == 0
+    text = capsys.readouterr().out
+    report = json.loads((moving_run / "metrics.json").read_text())
+    worst = min(report["psnr_per_time"], key=lambda at: at["psnr"])
+    for part in (f"worst at time {worst['time']:g}", "2 (40.0%)", f"{report['flicker']:.3f} of 255", "deforming"):
+        assert part in " ".join(text.replace("│", " ").split())
+    assert "flicker error" in text
+
+
+def test_eval_of_a_still_run_says_nothing_about_time(run_dir: Path, capsys: Capture) -> None:
+    assert main(["eval", str(run_dir)]) == 0
+    text = capsys.readouterr().out
+    assert not any(word in text for word in ("flicker", "moving", "deforming", "field"))
+
+
+def test_render_at_times(moving_run: Path, tmp_path: Path, capsys: Capture) -> None:
+    def pictures(name: str, *words: str) -> int:
+        assert main(["render", str(moving_run), "--out", str(tmp_path / name), *words]) == 0
+        return len(list((tmp_path / name).glob("*.png")))
+
+    assert pictures("orbit", "--path", "orbit", "--frames", "3") == 3
+    assert "note: time runs from 0 to 1 along the path" in capsys.readouterr().out
+    assert pictures("frozen", "--path", "orbit", "--frames", "3", "--time", "0.5") == 3
+    assert pictures("together", "--path", "spiral", "--times", "0:1:4") == 4
+    assert pictures("one", "--time", "0.5") == 1
+    assert pictures("many", "--times", "0:1:4", "--view", "r_001", "--size", "8x8", "--background", "black") == 4
+    assert pictures("view", "--view", "1", "--split", "train") == 1
+    assert capsys.readouterr().err == ""
+    assert pictures("clamped", "--time", "7") == 1
+    output = capsys.readouterr()
+    assert re.fullmatch(r"dyngs: warning: .*clamped\n", output.err)
+    assert "no view 'r_9'" in error_line(capsys, "render", moving_run, "--out", tmp_path, "--view", "r_9")
+    assert "no range of times" in error_line(capsys, "render", moving_run, "--out", tmp_path, "--times", "x")
+    assert "'val' has no views" in error_line(
+        capsys, "render", moving_run, "--out", tmp_path, "--split", "val", "--time", "0"
+    )
+
+
+def test_a_video_of_a_camera_that_stands_needs_no_folder(moving_run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    assert main(["render", str(moving_run), "--times", "0:1:3", "--video", str(tmp_path / "a.mp4")]) == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_times_where_nothing_moves(run_dir: Path, tmp_path: Path, capsys: Capture) -> None:
+    assert main(["render", str(run_dir), "--out", str(tmp_path / "a"), "--time", "0.5"]) == 0
+    assert "note: nothing moves in this run" in capsys.readouterr().out
+    ply = tmp_path / "splats.ply"
+    assert main(["export", str(run_dir), "--out", str(ply), "--time", "0.5"]) == 0
+    assert "note: nothing moves in this run" in capsys.readouterr().out
+    for words in (["--time", "0"], ["--times", "0:1:2"], ["--view", "0"]):
+        assert "holds one moment and no views" in error_line(capsys, "render", ply, "--out", tmp_path, *words)
+    for words in (["--dynamic"], ["--dynamic", "--format", "tracks"]):
+        assert "nothing moves in this run" in error_line(capsys, "export", run_dir, *words)
+
+
+def test_export_of_a_moving_run(moving_run: Path, tmp_path: Path, capsys: Capture) -> None:
+    def export(*words: object) -> str:
+        assert main(["export", str(moving_run), *[str(w) for w in words]]) == 0
+        return capsys.readouterr().out
+
+    def x_of(path: Path) -> list[float]:
+        return read_ply(path).gaussians.means[:, 0].tolist()
+
+    every, moving, still = (0, 1, 2, 3, 4), (1, 3), (0, 2, 4)
+    assert "note: this is time 0" in export()
+    assert x_of(moving_run / "splats.ply") == pytest.approx(moved_x(every, 0.0).tolist())
+    assert "note" not in export("--time", 0.5, "--out", tmp_path / "middle.ply")
+    assert x_of(tmp_path / "middle.ply") == pytest.approx(moved_x(every, 0.5).tolist())
+    assert "3 files" in export("--times", "0:1:3", "--out", tmp_path / "seq")
+    assert x_of(tmp_path / "seq" / "frame_0002.ply") == pytest.approx(moved_x(every, 1.0).tolist())
+    export("--times", "0:1:3", "--dynamic")
+    assert x_of(moving_run / "splats_dynamic" / "frame_0001.ply") == pytest.approx(moved_x(moving, 0.5).tolist())
+    for words, path in (
+        (["--static"], moving_run / "splats_static.ply"),
+        (["--static", "--times", "0:1:3", "--out", tmp_path / "still.ply"], tmp_path / "still.ply"),
+        (["--static", "--times", "0:1:3", "--out", tmp_path / "still"], tmp_path / "still" / "splats_static.ply"),
+    ):
+        export(*words)
+        assert x_of(path) == pytest.approx(moved_x(still, 0.0).tolist())
+    wrong = ["--times", "0:1:3", "--out", tmp_path / "a.ply"]
+    assert "--times writes a folder" in error_line(capsys, "export", moving_run, *wrong)
+
+
+def test_export_of_tracks(moving_run: Path, tmp_path: Path, capsys: Capture) -> None:
+    assert main(["export", str(moving_run), "--format", "tracks"]) == 0
+    assert "5 Gaussians, 2 of them moving, at 5 times" in capsys.readouterr().out
+    with np.load(moving_run / "tracks.npz", allow_pickle=False) as stored:
+        assert stored["times"].tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
+        assert stored["positions"].shape == (5, 5, 3)
+    words = ["--format", "tracks", "--dynamic", "--times", "0:2:3", "--out", str(tmp_path / "t.npz")]
+    assert main(["export", str(moving_run), *words]) == 0
+    assert "1 of 3 times lie outside" in capsys.readouterr().err
+    with np.load(tmp_path / "t.npz", allow_pickle=False) as stored:
+        assert stored["positions"][:, 0, 0] == pytest.approx(moved_x((1, 3), 0.0).tolist())
+        assert stored["ids"].tolist() == [1, 3]
 
 
 def test_inspect(capture: Path, tmp_path: Path, capsys: Capture) -> None:

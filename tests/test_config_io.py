@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from itertools import permutations
 from pathlib import Path
 
 import pytest
@@ -13,12 +14,16 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
+    DynamicModel,
+    HexplaneField,
     McmcStrategy,
+    MlpField,
     OptimConfig,
     RandomInit,
     RunConfig,
     StaticModel,
     TrainConfig,
+    TrajectoryField,
 )
 from dyngs.config_io import find_preset, load_config, load_resolved, packaged_preset, save_config
 from dyngs.conventions import RasterizeMode
@@ -112,6 +117,33 @@ def test_a_section_can_be_given_as_a_whole() -> None:
     assert isinstance(config.init, RandomInit)
 
 
+@pytest.mark.parametrize("order", list(permutations(["kind=dynamic", "deform.kind=mlp", "deform.width=64"])))
+def test_nested_kinds_in_any_order(order: tuple[str, ...], tmp_path: Path) -> None:
+    expected = DynamicModel(deform=MlpField(width=64))
+    overrides = [f"model.{text}" for text in order]
+    assert load_config(None, [ROOT, *overrides]).model == expected
+    preset = write(tmp_path, "model: {sh_degree: 1}\n")
+    assert load_config(preset, [ROOT, *overrides]).model == expected, "the static model's keys are dropped"
+
+
+def test_an_inner_kind_replaces_nothing_outside_it(tmp_path: Path) -> None:
+    preset = write(tmp_path, "model:\n  kind: dynamic\n  sh_degree: 1\n  deform: {channels: 8, width: 32}\n")
+    assert load_config(preset, [ROOT, "model.deform.kind=mlp"]).model == DynamicModel(sh_degree=1, deform=MlpField())
+    same = load_config(preset, [ROOT, "model.deform.kind=hexplane", "model.kind=dynamic", "model.deform.levels=[4, 2]"])
+    expected = DynamicModel(sh_degree=1, deform=HexplaneField(channels=8, width=32, levels=(4, 2)))
+    assert same.model == expected
+    assert load_config(preset, [ROOT, "model.kind=static", "model.eps2d=0.1"]).model == StaticModel(eps2d=0.1)
+
+
+def test_a_nested_section_can_be_given_as_a_whole() -> None:
+    expected = DynamicModel(sh_degree=2, deform=TrajectoryField(fourier=2))
+    whole = "model={sh_degree: 2, deform: {fourier: 2, kind: trajectory}, kind: dynamic}"
+    assert load_config(None, [ROOT, whole]).model == expected
+    split = ["model.sh_degree=2", "model.deform={fourier: 2, kind: trajectory}", "model={kind: dynamic}"]
+    assert load_config(None, [ROOT, *split]).model == expected
+    assert load_config(None, [ROOT, "model.kind=dynamic", "model={}", "model.deform={}"]).model == DynamicModel()
+
+
 @pytest.mark.parametrize("text", ["2024-01-01", "007", "yes", "1e3", "null-ish", "[x", "C:\\scans", "a b"])
 def test_names_and_paths_are_taken_as_written(text: str) -> None:
     config = load_config(None, [f"data.root={text}", f"run.name={text}"])
@@ -142,7 +174,11 @@ def test_home_is_expanded() -> None:
         ("model.rasterize_mode=antialias", ["one of classic, antialiased", "did you mean 'antialiased'"]),
         ("strategy.kind=mcm", ["strategy.kind must be one of default, mcmc", "did you mean 'mcmc'"]),
         ("strategy.noise=1", ["strategy.noise belongs to strategy.kind=mcmc, not to default"]),
+        ("model.deform.width=64", ["model.deform belongs to model.kind=dynamic, not to static"]),
+        ("model.width=64", ["unknown key 'model.width'", "did you mean 'model.deform.width'"]),
+        ("deform.width=64", ["unknown key 'deform'", "did you mean 'model.deform.width'"]),
         ("train=5", ["train is a section", "steps"]),
+        ("model=5", ["model is a section", "sh_degree", "deform"]),
         ("train.steps.x=5", ["train.steps"]),
         ("train.steps", ["section.key=value"]),
         ("=5", ["section.key=value"]),
@@ -151,6 +187,29 @@ def test_home_is_expanded() -> None:
 def test_wrong_overrides_are_named_with_what_is_allowed(override: str, parts: list[str]) -> None:
     message = refusal(None, ROOT, override)
     assert override in message
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("model.deform.kind=mpl", ["model.deform.kind must be one of hexplane, mlp, traj", "did you mean 'mlp'"]),
+        ("model.deform.chanels=5", ["unknown key 'model.deform.chanels'", "did you mean 'model.deform.channels'"]),
+        ("model.defrom.width=5", ["unknown key 'model.defrom'", "did you mean 'model.deform.width'"]),
+        ("model.defrom.kind=mlp", ["unknown key 'model.defrom'", "did you mean 'model.deform.kind'"]),
+        ("model.deform.fourier=5", ["model.deform.fourier belongs to model.deform.kind=trajectory, not to hexplane"]),
+        ("model.deform.channels=0", ["model.deform.channels must be an integer >= 1, not 0"]),
+        ("model.deform.levels=[1, 0]", ["model.deform.levels must be a non-empty list of integers >= 1, not [1, 0]"]),
+        ("model.deform.levels=2", ["model.deform.levels must be a non-empty list of integers >= 1, not 2"]),
+        ("model.deform.levels=[]", ["model.deform.levels must be a non-empty list of integers >= 1, not []"]),
+        ("model.deform=mlp", ["model.deform is a section", "kind", "polynomial"]),
+        ("model.dynamic=1", ["unknown key 'model.dynamic'"]),
+    ],
+)
+def test_wrong_nested_overrides_are_named_with_what_is_allowed(override: str, parts: list[str]) -> None:
+    message = refusal(None, ROOT, "model.kind=dynamic", override)
+    assert message.startswith(f"{override}: ")
     for part in parts:
         assert part in message
 
@@ -167,6 +226,9 @@ def test_wrong_overrides_are_named_with_what_is_allowed(override: str, parts: li
         ("train.steps: 5\n", 1, "nested"),
         ("? [a]\n: 1\n", 1, "keys must be plain words"),
         ("run: {seed: -1}\n", 1, "run.seed must be an integer >= 0"),
+        ("model:\n  deform:\n    width: 5\n", 3, "model.deform belongs to model.kind=dynamic"),
+        ("model:\n  kind: dynamic\n  deform:\n    levels:\n      - x\n", 4, "list of integers >= 1, not ['x']"),
+        ("model:\n  kind: dynamic\n  deform:\n    kind: mlp\n    widht: 5\n", 5, "did you mean 'model.deform.width'"),
     ],
 )
 def test_wrong_files_are_named_with_the_line(text: str, line: int, part: str, tmp_path: Path) -> None:
@@ -214,7 +276,14 @@ configs = st.builds(
         root=st.text("abc: #'\"~-é", min_size=1).map(lambda s: Path("x" + s)),
         longest_side=st.none() | st.integers(1, 9999),
     ),
-    model=st.builds(StaticModel, rasterize_mode=st.sampled_from(RasterizeMode), filter_3d=st.booleans()),
+    model=st.builds(StaticModel, rasterize_mode=st.sampled_from(RasterizeMode), filter_3d=st.booleans())
+    | st.builds(
+        DynamicModel,
+        coarse=fractions,
+        deform=st.builds(HexplaneField, levels=st.lists(st.integers(1, 9), min_size=1).map(tuple), lr_planes=rates)
+        | st.builds(MlpField, lr=rates, move_scales=st.booleans())
+        | st.builds(TrajectoryField, rigidity=rates),
+    ),
     init=st.builds(RandomInit, half_extent=rates),
     strategy=st.builds(McmcStrategy, noise=rates) | st.builds(DefaultStrategy, prune_opacity=fractions),
     optim=st.builds(OptimConfig, lr_means=rates, eps=rates),
@@ -230,6 +299,13 @@ def test_what_is_saved_comes_back(config: Config, tmp_path_factory: pytest.TempP
     save_config(config, folder / "config.yaml")
     assert load_resolved(folder) == config
     assert [f.name for f in folder.iterdir()] == ["config.yaml"]
+
+
+@pytest.mark.parametrize("name", ["a\x85b", "\u2028", "\u2029é", "é", "a\nb", "\ufeff", "😀"])
+def test_odd_names_come_back(name: str, tmp_path: Path) -> None:
+    config = load_config(None, [ROOT]).model_copy(update={"run": RunConfig(name=name)})
+    save_config(config, tmp_path / "config.yaml")
+    assert load_resolved(tmp_path) == config
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:

@@ -5,6 +5,8 @@
 namespace nb = nanobind;
 
 namespace dyngs {
+void bind_planes(nb::module_& module);
+void bind_perceptron(nb::module_& module);
 void bind_rasterizer(nb::module_& module);
 void bind_train(nb::module_& module);
 
@@ -25,6 +27,8 @@ const char* best_isa() {
 
 NB_MODULE(DYNGS_MODULE, module) {
   module.def("best_isa", dyngs::best_isa);
+  dyngs::bind_planes(module);
+  dyngs::bind_perceptron(module);
   dyngs::bind_rasterizer(module);
   dyngs::bind_train(module);
 }

@@ -1,4 +1,4 @@
-"""``dyngs bench``: how fast the kernels are on this machine."""
+"""``dyngs bench``: how fast the kernels and the training steps are on this machine."""
 
 from __future__ import annotations
 
@@ -10,27 +10,59 @@ from dyngs.errors import DyngsError
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``bench`` to the commands."""
-    parser = commands.add_parser("bench", help="measure the speed of the rasterizer (dyngs bench rasterize)")
+    parser = commands.add_parser("bench", help="measure the speed of the rasterizer or of a deformation field")
     stages = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
     raster = stages.add_parser("rasterize", help="projection, binning and blending, forward and backward")
     raster.add_argument("--points", type=Path, metavar="NPZ", help="means3d, colors, viewmats, Ks, width, height")
     raster.add_argument("--threads", type=int, nargs="+", metavar="N", help="default: 1 and all cores")
     raster.add_argument("--repeats", type=int, default=30, metavar="N", help="medians are taken over (default 30)")
-    raster.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
-    raster.set_defaults(run=run)
+    raster.set_defaults(run=run_rasterize)
+    deform = stages.add_parser("deform", help="the field's share of a training step, with and without the static split")
+    deform.add_argument("run_dir", type=Path, nargs="?", metavar="RUN", help="a dynamic run; default: random Gaussians")
+    deform.add_argument("--kind", choices=("hexplane", "mlp", "trajectory"), default="hexplane", help="without RUN")
+    deform.add_argument("--gaussians", type=int, default=50_000, metavar="N", help="without RUN (default 50000)")
+    deform.add_argument("--moving", type=float, default=0.1, metavar="SHARE", help="without RUN (default 0.1)")
+    deform.add_argument("--threads", type=int, metavar="N", help="default: all cores")
+    deform.add_argument("--repeats", type=int, default=10, metavar="N", help="rounds of five steps each (default 10)")
+    deform.set_defaults(run=run_deform)
+    for one in (raster, deform):
+        one.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Measure and print the table."""
+def run_rasterize(arguments: argparse.Namespace) -> int:
+    """Measure the rasterizer and print the table."""
     if arguments.repeats < 1 or min(arguments.threads or [1]) < 1:
         raise DyngsError("--repeats and --threads must be at least 1")
     import torch
 
-    from dyngs.bench import bench_rasterize, format_report, garden_workload, random_workload, write_report
+    from dyngs.bench.rasterize import bench_rasterize, format_report, garden_workload, random_workload, write_report
 
     threads = arguments.threads or [1, torch.get_num_threads()]
     workload = garden_workload(arguments.points) if arguments.points else random_workload()
     report = bench_rasterize(workload, sorted(set(threads)), arguments.repeats)
+    print(format_report(report))
+    if arguments.json:
+        write_report(report, arguments.json)
+    return 0
+
+
+def run_deform(arguments: argparse.Namespace) -> int:
+    """Measure training steps of a dynamic model and print the table."""
+    if min(arguments.repeats, arguments.gaussians, arguments.threads or 1) < 1 or not 0 < arguments.moving <= 1:
+        raise DyngsError("--repeats, --gaussians and --threads must be at least 1, --moving above 0 and at most 1")
+    from tempfile import TemporaryDirectory
+
+    import torch
+
+    from dyngs.bench.deform import bench_deform, format_report, load_of_run, synthetic_load, write_report
+
+    threads = arguments.threads or torch.get_num_threads()
+    with TemporaryDirectory() as folder:
+        if arguments.run_dir is not None:
+            load = load_of_run(arguments.run_dir)
+        else:
+            load = synthetic_load(Path(folder), arguments.gaussians, arguments.moving, arguments.kind)
+        report = bench_deform(load, threads, arguments.repeats)
     print(format_report(report))
     if arguments.json:
         write_report(report, arguments.json)

@@ -7,6 +7,9 @@ from pathlib import Path
 
 from dyngs.errors import DyngsError
 
+SYNTHETIC_SCENES = ("still", "spin", "wave", "merge", "room")
+"""The scenes of ``dyngs data synth``: named here because the parser must not import numpy."""
+
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``data`` and its own commands to the commands."""
@@ -24,7 +27,8 @@ def _add_inspect(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         description="Report views, sizes, intrinsics, times, points, masks, and everything suspicious.",
     )
     parser.add_argument("path", type=Path, metavar="PATH", help="capture folder")
-    parser.add_argument("--format", choices=("auto", "blender", "nerfstudio", "colmap"), default="auto")
+    formats = ("auto", "blender", "nerfstudio", "colmap", "nerfies", "llff", "camera_folders")
+    parser.add_argument("--format", choices=formats, default="auto")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw cameras and points into this picture")
     parser.add_argument("--deep", action="store_true", help="decode every picture in full (slow)")
     parser.set_defaults(run=run_inspect)
@@ -47,14 +51,19 @@ def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
 def _add_synth(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "synth",
-        help="write the embedded synthetic scene as a capture",
-        description="Ray trace the embedded scene into a capture in the layout of NeRF-synthetic.",
+        help="write an embedded synthetic scene as a capture",
+        description="Ray trace an embedded scene into a capture in the layout of NeRF-synthetic, or of D-NeRF if it "
+        "moves. still: a still life. spin: a turning die and a rolling ball. wave: a rippling cloth. merge: balls that "
+        "appear, merge and vanish. room: video of fixed cameras of a still room in which one ball hops.",
     )
-    parser.add_argument("scene", choices=("still",), help="which scene")
+    parser.add_argument("scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES))
     parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
     parser.add_argument("--size", type=int, default=128, metavar="PX", help="width and height (default 128)")
-    parser.add_argument("--views", type=int, default=48, metavar="N", help="training views (default 48)")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--views", type=int, default=48, metavar="N", help="training views, of room times (default 48)")
+    parser.add_argument("--cameras", type=int, metavar="N", help="training cameras of room (default 8)")
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="another one places the cameras differently (default 0)"
+    )
     parser.set_defaults(run=run_synth)
 
 
@@ -91,13 +100,21 @@ def run_sfm(arguments: argparse.Namespace) -> int:
 
 def run_synth(arguments: argparse.Namespace) -> int:
     """Write the capture and say how to train on it."""
-    from dyngs.data.synthetic import StillOptions, write_still_capture
+    from dyngs.data import synthetic
 
     out: Path = arguments.out
-    if arguments.size < 1 or arguments.views < 1:
-        raise DyngsError("--size and --views must be at least 1")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DyngsError(f"{out} exists already; name a new folder for the capture")
-    write_still_capture(out, StillOptions(size=arguments.size, num_train=arguments.views, seed=arguments.seed))
-    print(f"written: {out}\nnext:    dyngs train configs/static.yaml data.root={out}")
+    if arguments.size < 1 or arguments.views < 1 or arguments.seed < 0:
+        raise DyngsError("--size and --views must be at least 1, --seed at least 0")
+    if arguments.cameras is not None and (arguments.scene != "room" or arguments.cameras < 1):
+        raise DyngsError("--cameras must be at least 1, and is for the scene room only")
+    synthetic.require_new_folder(out)
+    size, seed = arguments.size, arguments.seed
+    if arguments.scene == "still":
+        synthetic.write_still_capture(out, synthetic.StillOptions(size=size, num_train=arguments.views, seed=seed))
+    else:
+        cameras = 8 if arguments.cameras is None else arguments.cameras
+        options = synthetic.DynamicOptions(size=size, num_times=arguments.views, num_cameras=cameras, seed=seed)
+        synthetic.write_dynamic_capture(arguments.scene, out, options)
+    preset = "static" if arguments.scene == "still" else "dynamic"
+    print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={out}")
     return 0

@@ -54,9 +54,34 @@ def report_table(report: EvalReport) -> Table:
     ):
         reason = escape(report.reasons.get(name, "not measured"))
         table.add_row(label, reason if value is None else f"{value:.4f}")
+    for label, value in _rows_over_time(report):
+        table.add_row(label, escape(value))
+    field = f", {report.field_mb:.1f} of them the field" if report.num_moving else ""
+    deforming = f", {report.deform_share:.0%} of the time deforming" if report.num_moving else ""
     table.add_row("picture size", f"{report.width}x{report.height} on {report.background}")
     table.add_row("Gaussians", f"{report.num_gaussians:,}")
-    table.add_row("model", f"{report.model_mb:.1f} MB")
-    table.add_row("rendering", f"{report.fps:.1f} frames/s")
+    if report.num_moving:
+        table.add_row("moving", f"{report.num_moving:,} ({report.moving_share:.1%})")
+    table.add_row("model", f"{report.model_mb:.1f} MB{field}")
+    table.add_row("rendering", f"{report.fps:.1f} frames/s{deforming}")
     table.add_row("training", f"{report.step:,} steps in {report.seconds_train:.0f} s")
     return table
+
+
+def _rows_over_time(report: EvalReport) -> list[tuple[str, str]]:
+    """Labels and values of what only a capture with times has."""
+    if not report.psnr_per_time:
+        return []
+    values = [at.psnr for at in report.psnr_per_time]
+    worst = min(report.psnr_per_time, key=lambda at: at.psnr)
+    low, mean, high = min(values), sum(values) / len(values), max(values)
+    spread = f"min {low:.2f}, mean {mean:.2f}, max {high:.2f} dB; worst at time {worst.time:g}"
+    rows = [(f"PSNR at {len(values)} times", spread)]
+    for label, name, value in (
+        ("flicker", "flicker", report.flicker),
+        ("flicker error", "flicker_error", report.flicker_error),
+    ):
+        reason = report.reasons.get(name, "not measured")
+        known = "0 (nothing moves)" if name == "flicker" and not report.num_moving else f"{value or 0:.3f} of 255"
+        rows.append((label, reason if value is None else known))
+    return rows

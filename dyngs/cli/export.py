@@ -4,25 +4,103 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dyngs.cli.render import moment, say
+from dyngs.errors import DyngsError
+
+if TYPE_CHECKING:
+    from dyngs.export.run import Part
+    from dyngs.train.checkpoint import LoadedRun
+
+_EPILOG = """\
+examples:
+  dyngs export runs/bench                                         runs/bench/splats.ply
+  dyngs export runs/dance --time 0.5 --out middle.ply             one moment
+  dyngs export runs/dance --times 0:1:30 --out frames             frame_0000.ply ... for players of sequences
+  dyngs export runs/dance --static --out stage.ply                only what never moves
+  dyngs export runs/dance --format tracks --dynamic               where everything that moves is, as .npz
+"""
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``export`` to the commands."""
     parser = commands.add_parser(
         "export",
-        help="write a run as a file for other programs",
-        description="Write the Gaussians of a run as the standard 3DGS .ply, which viewers and editors read.",
+        help="write a run as files for other programs",
+        description="Write the Gaussians of a run as the standard 3DGS .ply, which viewers and editors read, or the "
+        "tracks of their centres.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("run_dir", type=Path, metavar="RUN", help="folder that `dyngs train` wrote")
-    parser.add_argument("--format", choices=("ply",), default="ply")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="default RUN/splats.ply")
+    parser.add_argument("--format", choices=("ply", "tracks"), default="ply")
+    parser.add_argument(
+        "--out", type=Path, metavar="PATH", help="a file, or the folder of a sequence (default: splats... in RUN)"
+    )
+    when = parser.add_mutually_exclusive_group()
+    when.add_argument("--time", type=moment, metavar="T", help="this moment, from 0 to 1 (default 0)")
+    when.add_argument("--times", metavar="A:B:N", help="N moments from A to B (tracks: default those of training)")
+    part = parser.add_mutually_exclusive_group()
+    part.add_argument("--static", action="store_true", help="only the Gaussians that never move")
+    part.add_argument("--dynamic", action="store_true", help="only the Gaussians that move")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the file and say how large it is."""
-    from dyngs.export.run import export_ply
+    """Write the files and say how large they are."""
+    from dyngs.train.checkpoint import load_run
 
-    path = export_ply(arguments.run_dir, arguments.out or arguments.run_dir / "splats.ply")
-    print(f"written: {path} ({path.stat().st_size / 1e6:.1f} MB)")
+    if arguments.format == "tracks" and arguments.static:
+        raise DyngsError("--static goes with --format ply; what never moves has no tracks")
+    times = _times(arguments)
+    loaded = load_run(arguments.run_dir)
+    if loaded.scene.is_still and times is not None:
+        say(("nothing moves in this run: it is the same at all times",))
+    write = _export_tracks if arguments.format == "tracks" else _export_ply
+    files = write(arguments, loaded, times)
+    size = sum(path.stat().st_size for path in files) / 1e6
+    where = files[0] if len(files) == 1 else f"{len(files)} files, {files[0]} to {files[-1].name}"
+    print(f"written: {where} ({size:.1f} MB)")
     return 0
+
+
+def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
+    """The times asked for, within [0, 1]; None where none is."""
+    from dyngs.train.temporal import clamped_times
+    from dyngs.view.paths import parse_times
+
+    if arguments.times is None and arguments.time is None:
+        return None
+    inside, warnings = clamped_times((arguments.time,) if arguments.times is None else parse_times(arguments.times))
+    say((), warnings)
+    return inside
+
+
+def _export_ply(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...] | None) -> list[Path]:
+    """The files written: a sequence where things move at several times, one file otherwise."""
+    from dyngs.export.run import write_moment, write_moments
+
+    part: Part = "still" if arguments.static else "moving" if arguments.dynamic else "all"
+    stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
+    out: Path | None = arguments.out
+    if arguments.times is None or arguments.static:
+        if out is not None and out.suffix.lower() != ".ply" and (out.is_dir() or arguments.times is not None):
+            out = out / f"{stem}.ply"
+        if times is None and not arguments.static and not loaded.scene.is_still:
+            say(("this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence",))
+        time = 0.0 if times is None else times[0]
+        return [write_moment(loaded, out or arguments.run_dir / f"{stem}.ply", time, part)]
+    if out is not None and out.suffix.lower() == ".ply":
+        raise DyngsError(f"{out}: --times writes a folder of files; give --out DIR, or --time for one file")
+    return write_moments(loaded, out or arguments.run_dir / stem, times or (), part)
+
+
+def _export_tracks(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...] | None) -> list[Path]:
+    from dyngs.export.tracks import tracks_of, write_tracks
+
+    part = "moving" if arguments.dynamic else "all"
+    tracks = tracks_of(loaded.scene, times or loaded.scene.times or (0.0,), loaded.info.world_offset, part=part)
+    count, moments, _ = tracks.positions.shape
+    say((f"{count:,} Gaussians, {int(tracks.moving.sum()):,} of them moving, at {moments} times",))
+    return [write_tracks(arguments.out or arguments.run_dir / "tracks.npz", tracks)]

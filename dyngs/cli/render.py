@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
-    from dyngs.view.shots import Shot
+    from dyngs.view.frames import Shot
 
 _EPILOG = """\
 examples:
   dyngs render runs/bench --out pictures                          the test views and a contact sheet
   dyngs render runs/bench --out frames --path orbit --video orbit.mp4
+  dyngs render runs/dance --path orbit --time 0.5 --video frozen.mp4       the camera moves, the scene does not
+  dyngs render runs/dance --times 0:1:60 --view 3 --video standing.mp4     the scene moves, the camera does not
   dyngs render splats.ply --path spiral --video spiral.mp4 --up=-y --size 1280x720
 """
 
@@ -25,7 +29,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = commands.add_parser(
         "render",
         help="pictures and videos of a run or a .ply",
-        description="Render the views of a split beside their truth, or the frames of a camera path.",
+        description="Render the views of a split beside their truth, the frames of a camera path, or moments in time.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -34,12 +38,18 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--split", choices=("test", "val", "train"), help="render these views (default for a run: test)")
     what.add_argument("--path", metavar="PATH", help="orbit (default for a .ply), spiral, or a .json file of cameras")
+    when = parser.add_mutually_exclusive_group()
+    when.add_argument("--time", type=moment, metavar="T", help="everything at this time, from 0 to 1")
+    when.add_argument("--times", metavar="A:B:N", help="N times from A to B, one per picture")
+    parser.add_argument(
+        "--view", metavar="NAME|N", help="whose camera stands still where there is no --path (default: the first view)"
+    )
     parser.add_argument("--video", type=Path, metavar="FILE.mp4", help="write a video too")
-    parser.add_argument("--frames", type=_count, default=120, metavar="N", help="of orbit and spiral (default 120)")
+    parser.add_argument("--frames", type=_count, metavar="N", help="of orbit and spiral (default 120)")
     parser.add_argument("--fps", type=float, metavar="F", help="of the video (default 30, or what the .json says)")
     parser.add_argument("--depth", action="store_true", help="write depth too: colours (.png) and world units (.exr)")
     parser.add_argument("--alpha", action="store_true", help="write opacity too")
-    parser.add_argument("--size", type=_size, metavar="WxH", help="of the frames of a path, in pixels")
+    parser.add_argument("--size", type=_size, metavar="WxH", help="of the pictures of a path, in pixels")
     parser.add_argument("--background", choices=("white", "black"), help="of a path (default: that of training)")
     parser.add_argument(
         "--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="z", help="of a .ply; --up=-y suits many COLMAP ones"
@@ -68,14 +78,25 @@ def _checked(arguments: argparse.Namespace) -> argparse.Namespace:
     is_file = arguments.source.is_file()
     if is_file and arguments.split:
         raise DyngsError(f"{arguments.source}: a file has no splits; use --path orbit, spiral or FILE.json")
-    if arguments.out is None and (arguments.video is None or not (is_file or arguments.path)):
-        raise DyngsError("say where to write: --out DIR (or --video FILE.mp4 with --path)")
+    if arguments.view is not None and arguments.path:
+        raise DyngsError("--view is for a camera that stands still and --path for one that moves; give one of them")
+    if arguments.times is not None and arguments.frames is not None:
+        raise DyngsError("--times and --frames both say how many pictures there are; give one of them")
+    is_shot = is_file or arguments.path or _stands_still(arguments)
+    if arguments.out is None and (arguments.video is None or not is_shot):
+        raise DyngsError("say where to write: --out DIR (or --video FILE.mp4 with --path, --time, --times or --view)")
     if not arguments.source.exists():
         raise DyngsError(f"{arguments.source}: no such run or file; give a folder that `dyngs train` wrote, or a .ply")
     unfit = [f"--{name}" for name in ("size", "background") if getattr(arguments, name)]
-    if unfit and not (is_file or arguments.path):
+    if unfit and not is_shot:
         raise DyngsError(f"{unfit[0]} goes with --path; the views of a split keep their size and background")
     return arguments
+
+
+def _stands_still(arguments: argparse.Namespace) -> bool:
+    """One camera is asked for, at one or many times."""
+    given = (arguments.time, arguments.times, arguments.view)
+    return not arguments.path and any(x is not None for x in given)
 
 
 def _render(arguments: argparse.Namespace) -> list[Path]:
@@ -84,8 +105,8 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
 
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)
-    if arguments.source.is_file() or arguments.path:
-        return _render_path(arguments)
+    if arguments.source.is_file() or arguments.path or _stands_still(arguments):
+        return _render_shot(arguments)
     return _render_split(arguments)
 
 
@@ -96,17 +117,56 @@ def _render_split(arguments: argparse.Namespace) -> list[Path]:
     return write_split(arguments.source, arguments.split or "test", arguments.out, output)
 
 
-def _render_path(arguments: argparse.Namespace) -> list[Path]:
+def _render_shot(arguments: argparse.Namespace) -> list[Path]:
     from dyngs.view.frames import OutputOptions, write_path_frames
-    from dyngs.view.shots import ShotOptions, shot_of_ply, shot_of_run
 
+    shot = _shot(arguments)
+    say(shot.notes, shot.path.warnings)
+    output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or shot.path.fps)
+    return write_path_frames(shot, arguments.out, output)
+
+
+def _shot(arguments: argparse.Namespace) -> Shot:
+    """What the arguments ask for."""
+    from dyngs.view.paths import parse_times
+    from dyngs.view.shots import DEFAULT_FRAMES, ShotOptions, shot_of_ply, shot_of_run
+
+    times = None if arguments.time is None else (arguments.time,)
+    num_frames = arguments.frames or DEFAULT_FRAMES
+    if arguments.times is not None:
+        times = parse_times(arguments.times)
+        num_frames = len(times)
+    is_file = arguments.source.is_file()
     options = ShotOptions(
-        arguments.path or "orbit", arguments.frames, arguments.size, arguments.background, arguments.up
+        path=None if _stands_still(arguments) else arguments.path or "orbit",
+        num_frames=num_frames,
+        size=arguments.size,
+        background=arguments.background,
+        up=arguments.up,
+        times=times,
+        view=arguments.view,
+        split=arguments.split,
     )
-    source: Path = arguments.source
-    shot: Shot = shot_of_ply(source, options) if source.is_file() else shot_of_run(source, options)
-    output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or shot.fps)
-    return write_path_frames(shot.gaussians, shot.cameras, arguments.out, shot.options, shot.background, output)
+    return shot_of_ply(arguments.source, options) if is_file else shot_of_run(arguments.source, options)
+
+
+def say(notes: tuple[str, ...], warnings: tuple[str, ...] = ()) -> None:
+    """Print notes, and warnings on stderr."""
+    for note in notes:
+        print(f"note: {note}")
+    for warning in warnings:
+        print(f"dyngs: warning: {warning}", file=sys.stderr)
+
+
+def moment(text: str) -> float:
+    """The time that ``text`` names; one outside [0, 1] is clamped later, with a warning."""
+    try:
+        time = float(text)
+    except ValueError:
+        time = math.nan
+    if not math.isfinite(time):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time; write a number from 0 to 1, for instance 0.5")
+    return time
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -43,8 +43,25 @@ def run(arguments: argparse.Namespace) -> int:
     from dyngs.train.trainer import train
 
     folder = train(config, resume_from=arguments.resume)
+    for line in _about_motion(folder, config):
+        print(line)
     print(f"trained: {folder}\nnext:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/pictures")
     return 0
+
+
+def _about_motion(folder: Path, config: Config) -> list[str]:
+    """What a dynamic model found to move."""
+    from dyngs.config import DynamicModel
+    from dyngs.train.checkpoint import load_run
+
+    if not isinstance(config.model, DynamicModel):
+        return []
+    scene = load_run(folder).scene
+    if not scene.times:
+        return ["motion:  the capture has no times (or only one), so this is a static model"]
+    if scene.is_still:
+        return [f"motion:  nothing moves by {config.model.still_below:g} px or more, so this became a static model"]
+    return [f"motion:  {len(scene.rows):,} of {len(scene):,} Gaussians move ({scene.moving_share:.1%})"]
 
 
 def parse_config(words: Sequence[str], resume: Path | None) -> Config:

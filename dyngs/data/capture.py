@@ -67,7 +67,7 @@ class Capture:
 
     Attributes:
         root: the folder.
-        format: "blender", "nerfstudio" or "colmap".
+        format: name of the reader: "blender", "nerfstudio", "colmap", "nerfies", "llff" or "camera_folders".
         splits: split name to views, each tuple sorted by name; train is never empty.
         points: sparse points or None.
         world_offset: (3,) float64 added to rebased coordinates to get the file's coordinates (zero unless the scene

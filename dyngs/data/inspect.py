@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +12,12 @@ from typing import Any
 import numpy as np
 
 from dyngs.config import DataConfig
+from dyngs.data.camera_folders import calibrated_fps, find_cameras
 from dyngs.data.camera_picture import draw_cameras, matrix_fault, pose_fault
 from dyngs.data.capture import Capture, View
 from dyngs.data.focus import focus_point, share_in_front
+from dyngs.data.frame_cache import is_video_frame, planned_frames
+from dyngs.data.frame_selection import distinct_times
 from dyngs.data.images import SUFFIXES, read_header, read_picture
 from dyngs.data.poses import camera_center, inverse_rigid
 from dyngs.errors import DyngsError
@@ -51,13 +54,14 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
 
     Args:
         source: the folder, or the options by which it would be read.
-        deep: decode every picture in full instead of its header only (slow, finds truncated files).
+        deep: decode every picture in full instead of its header only, and videos to files (slow, finds truncated
+            files); otherwise frames that no earlier command has decoded are not looked at.
     """
     from dyngs.data.read import read_capture
 
     options = source if isinstance(source, DataConfig) else DataConfig(root=source)  # type: ignore[call-arg]
     try:
-        capture = read_capture(options)
+        capture = read_capture(options, decode_videos=deep)
     except DyngsError as error:
         return InspectReport(options.root, None, (), (str(error), *_loose_json_problems(options.root, str(error))))
     return report_on(capture, deep)
@@ -94,7 +98,6 @@ def _facts(capture: Capture) -> tuple[tuple[str, str], ...]:
     lenses = Counter(view.lens.model for view in views)
     focal_px = [float(f) for view in views for f in (view.intrinsics[0, 0], view.intrinsics[1, 1])]
     fov_deg = [float(np.degrees(2 * np.arctan2(0.5 * view.width, view.intrinsics[0, 0]))) for view in views]
-    times = [view.time for view in views if view.time is not None]
     centers = np.array([camera_center(view.cam_from_world) for view in views]).reshape(-1, 3)
     facts = [
         ("format", capture.format),
@@ -106,7 +109,7 @@ def _facts(capture: Capture) -> tuple[tuple[str, str], ...]:
         ("lens", _counted(lenses)),
         ("alpha", "transparent background" if capture.has_alpha else "none"),
         ("masks", str(sum(view.mask_path is not None for view in views))),
-        ("times", f"{len(set(times))} in {_range(times)}" if times else "none (a still scene)"),
+        *_time_facts(capture),
         ("points", str(len(capture.points.xyz)) if capture.points is not None else "none"),
     ]
     if len(centers):
@@ -118,6 +121,45 @@ def _facts(capture: Capture) -> tuple[tuple[str, str], ...]:
     if capture.body is not None:
         facts.append(("body", ", ".join(f"{name} {value.shape}" for name, value in capture.body.items())))
     return tuple(facts)
+
+
+def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
+    """Distinct times, their rate, cameras by times, and how much of videos is decoded."""
+    views = [view for view in _all_views(capture) if view.time is not None]
+    if not views:
+        yield "times", "none (a still scene)"
+        return
+    times = set(distinct_times(views).values())
+    yield "times", f"{len(times)} in {_range(times)}"
+    cameras: defaultdict[int, set[bytes]] = defaultdict(set)
+    for view in views:
+        cameras[view.camera_id].add(view.cam_from_world.round(9).tobytes())
+    what = "camera" + ("s" if len(cameras) > 1 else "")
+    moving = sum(len(poses) > 1 for poses in cameras.values())
+    motion = "" if not moving else " (moving)" if moving == len(cameras) else f" ({moving} moving)"
+    yield "sequence", f"{len(cameras)} {what}{motion} x {len(times)} times, {len(views)} pictures"
+    fps = _frame_rate(capture)
+    if fps:
+        yield "frame rate", f"{fps:.6g} per second"
+    frames = [view.image_path for view in views if is_video_frame(view.image_path)]
+    if frames:
+        yield "video frames", f"{sum(path.is_file() for path in frames)} of {len(frames)} are decoded already"
+
+
+def _frame_rate(capture: Capture) -> float | None:
+    """Frames per second as ``cameras.json``, the transforms file or the first video says, None if none does."""
+    root = capture.root
+    try:
+        if capture.format in ("camera_folders", "llff"):
+            fps = calibrated_fps(root) if capture.format == "camera_folders" else None
+            videos = [path for path in find_cameras(root).values() if path.is_file()]
+            return fps or (planned_frames(root, videos[0]).info.fps if videos else None)
+        names = {"blender": "transforms_train.json", "nerfstudio": "transforms.json"}
+        fields = json.loads((root / names.get(capture.format, "")).read_text(encoding="utf-8-sig"))
+        fps = fields.get("fps")
+    except (DyngsError, OSError, ValueError, AttributeError):
+        return None
+    return float(fps) if isinstance(fps, (int, float)) and fps > 0 else None
 
 
 def _split_problems(capture: Capture) -> list[str]:
@@ -181,7 +223,20 @@ def _time_problems(capture: Capture) -> list[str]:
     )
     if timed and len(timed) < len(views):
         problems.append(f"{len(views) - len(timed)} of {len(views)} views have no time")
+    if _is_still_monocular(capture):
+        count = len(set(distinct_times(timed).values()))
+        problems.append(
+            f"one camera that does not move saw all {count} times: a moving scene cannot be reconstructed in 3D from "
+            "that; move the camera or use several"
+        )
     return problems
+
+
+def _is_still_monocular(capture: Capture) -> bool:
+    """Whether all training views are of one camera in one pose, at several times."""
+    views = [view for view in capture.splits.get("train", ()) if view.time is not None]
+    poses = {view.cam_from_world.round(9).tobytes() for view in views}
+    return len(poses) == 1 and len(set(distinct_times(views).values())) > 1
 
 
 def _picture_problems(capture: Capture, deep: bool) -> list[str]:
@@ -189,7 +244,7 @@ def _picture_problems(capture: Capture, deep: bool) -> list[str]:
     unreadable, sizes, channels = [], [], Counter[int]()
     for view in _all_views(capture):
         for path in (view.image_path, view.mask_path):
-            if path is None:
+            if path is None or (is_video_frame(path) and not path.is_file()):
                 continue
             try:
                 header = read_header(path)
@@ -214,7 +269,7 @@ def _scene_problems(capture: Capture, poses: np.ndarray, views: list[View]) -> l
     problems = []
     centers = poses[:, :3, 3]
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    if len(poses) > 1 and spread < 1e-9:
+    if len(poses) > 1 and spread < 1e-9 and not _is_still_monocular(capture):
         problems.append("all cameras are at one place, so no depth can be found")
     xyz = capture.points.xyz if capture.points is not None else np.zeros((0, 3))
     finite = np.isfinite(xyz).all(axis=1)

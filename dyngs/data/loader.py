@@ -93,6 +93,11 @@ class PictureLoader:
     def __len__(self) -> int:
         return len(self._views)
 
+    @property
+    def times(self) -> tuple[float | None, ...]:
+        """Of the views, in [0, 1]; None without times."""
+        return tuple(view.time for view in self._views)
+
     def __getitem__(self, index: int) -> Picture:
         """The picture of view ``index``.
 

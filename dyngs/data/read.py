@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +9,17 @@ import numpy as np
 
 from dyngs.config import DataConfig
 from dyngs.data.blender import is_blender, read_blender
+from dyngs.data.camera_folders import CALIBRATION, is_camera_folders, read_camera_folders
 from dyngs.data.capture import Capture, PointCloud, Split, View
 from dyngs.data.colmap import MODEL_FOLDERS, is_colmap, read_colmap
+from dyngs.data.frame_cache import decode_frames, is_video_frame
+from dyngs.data.frame_selection import select_frames
 from dyngs.data.images import read_header
+from dyngs.data.llff import POSES, is_llff, read_llff
+from dyngs.data.nerfies import is_nerfies, read_nerfies
 from dyngs.data.nerfstudio import is_nerfstudio, read_nerfstudio
 from dyngs.data.rebase import rebase
+from dyngs.data.times import sequence_warnings, still_if_constant, unit_times
 from dyngs.errors import DyngsError
 
 Splits = dict[Split, tuple[View, ...]]
@@ -23,14 +28,23 @@ _READERS = {
     "blender": (is_blender, read_blender, "transforms_train.json"),
     "nerfstudio": (is_nerfstudio, read_nerfstudio, "transforms.json"),
     "colmap": (is_colmap, read_colmap, f"cameras.bin or cameras.txt in {', '.join(MODEL_FOLDERS)}"),
+    "nerfies": (is_nerfies, read_nerfies, "dataset.json and camera/"),
+    "camera_folders": (is_camera_folders, read_camera_folders, CALIBRATION),
+    "llff": (is_llff, read_llff, POSES),
 }
 
 
-def read_capture(options: DataConfig) -> Capture:
+def read_capture(options: DataConfig, decode_videos: bool = True) -> Capture:
     """The capture in ``options.root``; pictures are not decoded, only their headers are read.
 
-    Views are sorted by name. Where the format names no test set, every ``options.test_every``-th picture is one. Times
-    are brought to [0, 1], a far-away world to its origin. All three splits are present, val and test possibly empty.
+    Views are sorted by name. ``options.frames`` chooses among the times of all splits. Where the format names no test
+    set, every ``options.test_every``-th picture is one. Times are brought to [0, 1], a far-away world to its origin.
+    All three splits are present, val and test possibly empty.
+
+    Args:
+        options: where and how to read.
+        decode_videos: make picture files of the chosen frames of videos, see ``dyngs.data.frame_cache``; otherwise the
+            views may name files that do not exist yet.
 
     Raises:
         DyngsError: no such folder, no capture in it, or anything in it that cannot be right; names the file.
@@ -47,7 +61,7 @@ def read_capture(options: DataConfig) -> Capture:
         also = f"; but there is a {found[0]} capture" if found else ""
         raise DyngsError(f"{root}: no {options.format} capture, which would have {_READERS[options.format][2]}{also}")
     name = found[0] if options.format == "auto" else options.format
-    capture = _finished(_READERS[name][1](root), options)
+    capture = _finished(_READERS[name][1](root), options, decode_videos)
     if options.format == "auto" and len(found) > 1:
         note = f"read as {name}, but there is also a {found[1]} capture; data.format= chooses"
         capture = replace(capture, warnings=(note, *capture.warnings))
@@ -62,17 +76,20 @@ def hold_out(views: tuple[View, ...], test_every: int) -> tuple[tuple[View, ...]
     return tuple(view for index, view in enumerate(views) if index % test_every), test
 
 
-def _finished(capture: Capture, options: DataConfig) -> Capture:
+def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Capture:
     splits: Splits = {name: tuple(sorted(views, key=lambda view: view.name)) for name, views in capture.splits.items()}
     if not splits.get("train"):
         raise DyngsError(f"{capture.root}: the {capture.format} capture has no training views; add posed pictures")
+    splits, notes = _timed(capture.root, splits, options.frames)
     if "test" not in splits:
         splits["train"], splits["test"] = hold_out(splits["train"], options.test_every)
         if not splits["train"]:
             raise DyngsError(f"{capture.root}: data.test_every={options.test_every} leaves no training views; raise it")
     splits.setdefault("val", ())
+    if decode_videos:
+        paths = [view.image_path for views in splits.values() for view in views]
+        decode_frames(capture.root, paths, options.frame_cache_mb)
     warnings = [*capture.warnings, *_check_names(capture.root, splits), *_missing_pictures(splits)]
-    splits, notes = _with_unit_times(capture.root, splits)
     points, more = _finite_points(capture.points)
     capture = replace(
         capture,
@@ -98,7 +115,7 @@ def _check_names(root: Path, splits: Splits) -> list[str]:
 
 def _missing_pictures(splits: Splits) -> list[str]:
     paths = [view.image_path for views in splits.values() for view in views]
-    missing = [path for path in paths if not path.is_file()]
+    missing = [path for path in paths if not path.is_file() and not is_video_frame(path)]
     return [f"{len(missing)} of {len(paths)} pictures are missing, first {missing[0]}"] if missing else []
 
 
@@ -111,24 +128,13 @@ def _first_has_alpha(views: tuple[View, ...]) -> bool:
     return False
 
 
-def _with_unit_times(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
-    """The splits with times in [0, 1]: shifted and scaled over all splits where one lies outside."""
-    views = [view for kept in splits.values() for view in kept]
-    timed = [view.time for view in views if view.time is not None]
-    if not timed:
-        return splits, []
-    if len(timed) < len(views):
-        untimed = next(view.name for view in views if view.time is None)
-        raise DyngsError(f"{root}: {untimed} has no time although other pictures have; give time for all or none")
-    first, last = min(timed), max(timed)
-    if first >= 0 and last <= 1:
-        return splits, []
-    span = last - first if last > first else math.inf
-    scaled: Splits = {
-        name: tuple(replace(view, time=((view.time or 0.0) - first) / span) for view in kept)
-        for name, kept in splits.items()
-    }
-    return scaled, [f"times run from {first:g} to {last:g} and were scaled to [0, 1]"]
+def _timed(root: Path, splits: Splits, frames: str | None) -> tuple[Splits, list[str]]:
+    """The splits with their final times, reduced to the chosen ones, and warnings."""
+    splits, notes = unit_times(root, splits)
+    if frames is not None:
+        splits = select_frames(root, splits, frames)
+    splits, more = still_if_constant(splits)
+    return splits, [*notes, *more, *sequence_warnings(splits)]
 
 
 def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, list[str]]:

@@ -61,6 +61,8 @@ class DeformationField(Protocol):
 
     learned: LearnedTensors
     """All that is optimised."""
+    buffers: dict[str, Tensor]
+    """What a checkpoint must hold besides."""
 
     def offsets(self, means: Tensor, time: float) -> Offsets:
         """What moves at ``time`` in [0, 1], for the canonical ``means`` (M, 3) of all moving Gaussians in order."""
@@ -68,6 +70,10 @@ class DeformationField(Protocol):
 
     def penalties(self) -> dict[str, Tensor]:
         """Differentiable regularizers of the field itself, weighted, by name."""
+        ...
+
+    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
+        """Continue to the times in ``soon``, which are trained on next, what was learned for those in ``seen``."""
         ...
 
     def select(self, index: Tensor, is_new: Tensor) -> None:

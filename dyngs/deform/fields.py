@@ -29,7 +29,9 @@ def field_state(field: DeformationField, setup: FieldSetup) -> dict[str, Tensor]
     """What ``restored_field`` needs, by name."""
     box = torch.stack([setup.center, setup.half_size])
     numbers = torch.tensor([setup.num_times, setup.extent], dtype=torch.float64)
-    return {f"learned.{name}": x for name, x in field.learned.state().items()} | {"box": box, "numbers": numbers}
+    state = {f"learned.{name}": x for name, x in field.learned.state().items()}
+    state |= {f"buffers.{name}": x for name, x in field.buffers.items()}
+    return state | {"box": box, "numbers": numbers}
 
 
 def restored_field(
@@ -39,6 +41,11 @@ def restored_field(
     num_times, extent = state["numbers"].tolist()
     setup = FieldSetup(state["box"][0], state["box"][1], int(num_times), num_moving, extent)
     field = new_field(options, setup, torch.Generator())
-    prefix = "learned."
-    field.learned.load_state({n.removeprefix(prefix): x for n, x in state.items() if n.startswith(prefix)})
+    field.learned.load_state(part_of(state, "learned."))
+    field.buffers = part_of(state, "buffers.")
     return field, setup
+
+
+def part_of(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors whose names start with ``prefix``, without it."""
+    return {name.removeprefix(prefix): x for name, x in state.items() if name.startswith(prefix)}

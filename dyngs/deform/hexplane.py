@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -25,6 +27,7 @@ class Hexplane:
 
     def __init__(self, options: HexplaneField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup
+        self.buffers: dict[str, Tensor] = {}
         tensors: dict[str, Tensor] = {}
         rows = time_rows(options, setup.num_times)
         for level, multiplier in enumerate(options.levels):
@@ -55,6 +58,15 @@ class Hexplane:
         options = self.options
         weights = (options.space_smoothness, options.time_smoothness, options.time_sparsity)
         return {"plane smoothness": plane_penalty(self.levels, weights)} if any(weights) else {}
+
+    @torch.no_grad()
+    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
+        """Copy the outermost rows of time that have been trained to those that will be next."""
+        for level in self.levels:
+            planes, last = level.time.data, level.time.shape[1] - 1
+            old_low, old_high = math.floor(seen[0] * last), math.ceil(seen[1] * last)
+            planes[:, max(math.floor(soon[0] * last), 0) : max(old_low, 0)] = planes[:, max(old_low, 0), None]
+            planes[:, min(old_high, last) + 1 : min(math.ceil(soon[1] * last), last) + 1] = planes[:, min(old_high, last), None]
 
     def select(self, index: Tensor, is_new: Tensor) -> None:
         """Nothing: no part of the field belongs to one Gaussian."""

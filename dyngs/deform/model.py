@@ -17,7 +17,8 @@ from dyngs.camera import Cameras
 from dyngs.config import DynamicModel
 from dyngs.data.loader import Picture
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed
-from dyngs.deform.fields import field_state, new_field, restored_field
+from dyngs.deform.fields import field_state, new_field, part_of, restored_field
+from dyngs.deform.window import TimeWindow
 from dyngs.deform.motion import bake_, measure_motion, select_offsets
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.static.densify import EditResult
@@ -34,12 +35,14 @@ class DeformSchedule:
     """When the phases begin, in steps of this run.
 
     Attributes:
-        fine: last step without motion.
+        fine: last step without motion; from then on the window of times grows.
+        full: step from which all times are trained on.
         splits: steps after which Gaussians that do not move are frozen.
         steps: length of the run.
     """
 
     fine: int
+    full: int
     splits: tuple[int, ...]
     steps: int
 
@@ -49,7 +52,7 @@ class Surroundings4D:
     """What the model needs to know of its capture.
 
     Attributes:
-        times: distinct training times in [0, 1], ascending, at least two.
+        times: of the training views, in [0, 1], ascending; at least two differ.
         cameras: the training cameras.
         extent: of the scene, world units.
     """
@@ -65,6 +68,8 @@ class DynamicScene:
     Attributes:
         field: None before the fine phase, and for good if nothing moves.
         rows: (M,) indices of the Gaussians that it moves, ascending; None = all.
+        times: distinct training times, ascending.
+        window: which of them are trained on.
     """
 
     def __init__(
@@ -76,10 +81,16 @@ class DynamicScene:
         generator: torch.Generator,
     ) -> None:
         self.options, self.schedule, self.capture = options, schedule, capture
+        self.times = tuple(sorted(set(capture.times)))
+        self.window = TimeWindow.around_middle(capture.times, options.first_views, schedule.fine, schedule.full)
         self.field: DeformationField | None = None
         self.rows: Tensor | None = None
         self._still, self._generator = still, generator
         self._setup: FieldSetup | None = None
+
+    def trains_on(self, time: float | None, step: int) -> bool:
+        """Whether ``time`` lies in the window of ``step``."""
+        return self.window.holds(time or 0.0, step)
 
     def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
         """What is drawn for ``batch`` at its time, and the regularizers of motion; differentiable."""
@@ -102,8 +113,10 @@ class DynamicScene:
                 self._follow(result.edit, self.field)
         if step == self.schedule.fine:
             self._begin_motion(parameters)
-        elif step in self.schedule.splits and self.field is not None:
-            self._freeze(parameters, self.field)
+        elif self.field is not None:
+            self.field.extend(self.window.bounds(step), self.window.bounds(step + 1))
+            if step in self.schedule.splits:
+                self._freeze(parameters, self.field)
         return left_out
 
     def num_moving(self, num_gaussians: int) -> int:
@@ -113,7 +126,7 @@ class DynamicScene:
         return num_gaussians if self.rows is None else len(self.rows)
 
     def state(self) -> dict[str, Tensor]:
-        state = self._still.state() | {"times": torch.tensor(self.capture.times, dtype=torch.float64)}
+        state = self._still.state() | {"times": torch.tensor(self.times, dtype=torch.float64)}
         if self.field is not None and self._setup is not None:
             state |= {f"field.{name}": x for name, x in field_state(self.field, self._setup).items()}
             if self.rows is not None:
@@ -123,16 +136,15 @@ class DynamicScene:
     def load_state(self, state: dict[str, Tensor]) -> None:
         self._still.load_state(state)
         self.rows = state.get("rows")
-        part = {name.removeprefix("field."): x for name, x in state.items() if name.startswith("field.")}
+        part = part_of(state, "field.")
         self.field = self._setup = None
         if part:
             num_moving = 0 if self.rows is None else len(self.rows)
             self.field, self._setup = restored_field(self.options.deform, part, num_moving)
 
     def _begin_motion(self, parameters: Gaussians) -> None:
-        times = self.capture.times
         center, half_size = box_of(parameters, self.capture.extent)
-        setup = FieldSetup(center, half_size, len(times), len(parameters), self.capture.extent)
+        setup = FieldSetup(center, half_size, len(self.times), len(parameters), self.capture.extent)
         self._setup, self.field = setup, new_field(self.options.deform, setup, self._generator)
 
     def _freeze(self, parameters: Gaussians, field: DeformationField) -> None:
@@ -140,7 +152,7 @@ class DynamicScene:
         now = parameters.detach()
         rows = torch.arange(len(now)) if self.rows is None else self.rows
         px_size = filter_std(now.means, self.capture.cameras)[rows] / math.sqrt(FILTER_VARIANCE)
-        motion = measure_motion(field, now.select(rows), self.capture.times, px_size)
+        motion = measure_motion(field, now.select(rows), self.times, px_size)
         moves = motion.pixels >= self.options.still_below
         still = torch.nonzero(~moves)[:, 0]
         bake_(parameters, rows[still], select_offsets(motion.mean, still))
@@ -166,7 +178,7 @@ class DynamicScene:
         """``time`` with the annealed noise of Deformable-3DGS, against frames that overfit."""
         if self.options.time_jitter == 0:
             return time
-        gap = 1 / max(len(self.capture.times) - 1, 1)
+        gap = 1 / max(len(self.times) - 1, 1)
         noise = float(torch.randn((), generator=self._generator)) * self.options.time_jitter * gap
         return min(max(time + noise * max(0.0, 1 - step / self.schedule.steps), 0.0), 1.0)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyngs.config import DynamicModel
 from dyngs.deform.field import DeformationField, deformed
-from dyngs.deform.fields import restored_field
+from dyngs.deform.fields import part_of, restored_field
 from dyngs.gaussians import Gaussians
 from dyngs.static.filters import fuse_filter
 
@@ -81,7 +81,7 @@ def trained_scene(gaussians: Gaussians, model_state: Mapping[str, Tensor], optio
     """
     std = model_state.get("filter_std")
     times = tuple(model_state["times"].tolist()) if "times" in model_state else ()
-    part = {name.removeprefix("field."): x for name, x in model_state.items() if name.startswith("field.")}
+    part = part_of(model_state, "field.")
     nothing = torch.zeros(0, dtype=torch.long)
     if not part or not isinstance(options, DynamicModel):
         return TrainedScene(gaussians, nothing, None, std, times)

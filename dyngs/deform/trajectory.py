@@ -21,6 +21,7 @@ class Trajectory:
 
     def __init__(self, options: TrajectoryField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup
+        self.buffers: dict[str, Tensor] = {}
         self.num_terms = options.polynomial + 2 * options.fourier
         sizes = head_sizes(options)
         tensors = {name: torch.zeros(setup.num_moving, self.num_terms, size) for name, size in sizes.items()}
@@ -36,6 +37,9 @@ class Trajectory:
 
     def penalties(self) -> dict[str, Tensor]:
         return {}
+
+    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
+        """Nothing: the field continues by itself."""
 
     def select(self, index: Tensor, is_new: Tensor) -> None:
         for name in head_sizes(self.options):

@@ -1,22 +1,117 @@
-"""A run as a file for other programs."""
+"""A run as .ply files for other programs: whole, only what moves, only what stays; at one moment or at many."""
 
 from __future__ import annotations
 
+import os
+import shutil
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Literal
 
+from dyngs.deform.trained import TrainedScene
+from dyngs.errors import DyngsError
 from dyngs.export.ply import write_ply
-from dyngs.train.checkpoint import load_run
+from dyngs.train.checkpoint import LoadedRun, load_run
+
+Part = Literal["all", "moving", "still"]
 
 
 def export_ply(run_dir: Path, path: Path) -> Path:
-    """``path`` of the .ply written from a run's newest checkpoint; a 3D filter is fused, the header names the mode.
+    """``path`` of the .ply written from a run's newest checkpoint, at time 0; see ``write_moment``.
 
     Raises:
         DyngsError: no such run, no checkpoint, or the file cannot be written.
     """
-    run = load_run(run_dir)
+    return write_moment(load_run(run_dir), path)
+
+
+def write_moment(run: LoadedRun, path: Path, time: float = 0.0, part: Part = "all") -> Path:
+    """``path`` of the .ply written; a 3D filter is fused, the header names the mode, and the time where things move.
+
+    Args:
+        run: a trained model.
+        path: of the file; replaced when the new one is complete.
+        time: in [0, 1].
+        part: all Gaussians, or only those that move or that do not.
+
+    Raises:
+        DyngsError: the part is empty, or the file cannot be written.
+    """
+    return _write(run, scene_part(run.scene, part), path, time)
+
+
+def write_moments(run: LoadedRun, folder: Path, times: Sequence[float], part: Part = "all") -> list[Path]:
+    """Paths of the numbered files written, one per time: ``frame_0000.ply`` and so on, a sequence for players.
+
+    All are written into a hidden folder first and appear together at the end, so that an export that fails leaves no
+    sequence behind that only looks complete.
+
+    Args:
+        run: a trained model.
+        folder: where to; made where it is missing. Files of an earlier sequence of the same length are replaced.
+        times: T >= 1, in [0, 1].
+        part: as in ``write_moment``.
+
+    Raises:
+        DyngsError: the part is empty, the folder holds other .ply files, or the files cannot be written.
+    """
+    scene = scene_part(run.scene, part)
+    names = frame_names(len(times))
+    _require_no_others(folder, names)
+    is_new = not folder.exists()
+    staging = folder / f".frames.{os.getpid()}"
+    try:
+        for name, time in zip(names, times, strict=True):
+            _write(run, scene, staging / name, time)
+        for name in names:
+            os.replace(staging / name, folder / name)
+        staging.rmdir()
+    except OSError as error:
+        raise DyngsError(f"cannot write the sequence {folder}: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+        if is_new:
+            with suppress(OSError):
+                folder.rmdir()  # only succeeds if nothing came of it
+    return [folder / name for name in names]
+
+
+def frame_names(count: int) -> list[str]:
+    """``frame_0000.ply`` and so on: at least four digits, and as many as keep names in order of frames."""
+    digits = max(4, len(str(count - 1)))
+    return [f"frame_{i:0{digits}d}.ply" for i in range(count)]
+
+
+def scene_part(scene: TrainedScene, part: Part) -> TrainedScene:
+    """The part of a scene. Raises DyngsError where there is none."""
+    if part == "all":
+        return scene
+    found = scene.part(part)
+    if not len(found):
+        empty = "every Gaussian of this run moves: it has no still part"
+        raise DyngsError("nothing moves in this run: it has no dynamic part" if part == "moving" else empty)
+    return found
+
+
+def _write(run: LoadedRun, scene: TrainedScene, path: Path, time: float) -> Path:
     model = run.config.model
-    comments = (f"step: {run.step}",)
+    comments = [f"step: {run.step}"] if scene.is_still else [f"step: {run.step}", f"dyngs time {time!r}"]
     return write_ply(
-        path, run.scene.at(0.0), model.rasterize_mode, comments, eps2d=model.eps2d, world_offset=run.info.world_offset
+        path, scene.at(time), model.rasterize_mode, comments, eps2d=model.eps2d, world_offset=run.info.world_offset
     )
+
+
+def _require_no_others(folder: Path, names: Sequence[str]) -> None:
+    """Nothing, if a player that takes all .ply files of ``folder`` for frames would be right.
+
+    Raises:
+        DyngsError: names a file that is not among ``names``, or says that the folder is none.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise DyngsError(f"{folder}: is a file, but a sequence needs a folder")
+    others = sorted(f.name for f in folder.glob("*.ply") if f.name not in names)
+    if others:
+        raise DyngsError(
+            f"{folder}: holds other .ply files ({others[0]}), which players would take for frames; give an empty folder"
+        )

@@ -38,6 +38,10 @@ class StaticScene:
         self._cameras = filter_cameras
         self._filter_std: Tensor | None = None
 
+    def trains_on(self, time: float | None, step: int) -> bool:
+        """Every picture, always."""
+        return True
+
     def gaussians_at(self, parameters: Gaussians, batch: object, step: int) -> Drawn:
         """What is drawn; ``batch`` and ``step`` are of no matter here."""
         if not self._cameras:

@@ -88,8 +88,8 @@ def training_cameras(views: Sequence[View], options: DataConfig) -> list[Cameras
 
 
 def training_times(capture: Capture) -> tuple[float, ...]:
-    """Distinct times of the training views in [0, 1], ascending; empty without times."""
-    return tuple(sorted({view.time for view in capture.splits["train"] if view.time is not None}))
+    """Times of the training views in [0, 1], ascending; empty without times."""
+    return tuple(sorted(view.time for view in capture.splits["train"] if view.time is not None))
 
 
 def _model(config: Config, capture: Capture, extent: float, generator: torch.Generator) -> Model:
@@ -98,7 +98,7 @@ def _model(config: Config, capture: Capture, extent: float, generator: torch.Gen
     cameras = training_cameras(capture.splits["train"], config.data)
     still = StaticScene(cameras, filter_steps(config.strategy, steps)) if model.filter_3d else StaticScene()
     times = training_times(capture)
-    if not isinstance(model, DynamicModel) or len(times) < 2:
+    if not isinstance(model, DynamicModel) or len(set(times)) < 2:
         return still
     surroundings = Surroundings4D(times, cameras, extent)
     return DynamicScene(model, deform_schedule(model, steps), surroundings, still, generator)

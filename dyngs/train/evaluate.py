@@ -14,23 +14,27 @@ from statistics import fmean, median
 import torch
 from torch import Tensor
 
-from dyngs.config import SceneModel
+from dyngs.config import DynamicModel, SceneModel
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.write import write_text
-from dyngs.errors import DyngsError
 from dyngs.deform.trained import TrainedScene
+from dyngs.errors import DyngsError
 from dyngs.rendering import RenderOptions, render
-from dyngs.train.checkpoint import load_run
+from dyngs.train.checkpoint import LoadedRun, load_run
 from dyngs.train.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
+from dyngs.train.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
 
 _BACKGROUNDS = {"white": 1.0, "black": 0.0}
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Metrics of one view; None where a metric cannot be had (``EvalReport.reasons`` says why)."""
+    """Metrics of one view; None where a metric cannot be had (``EvalReport.reasons`` says why).
+
+    ``render_seconds`` holds ``deform_seconds``; ``time`` is None for a still capture.
+    """
 
     name: str
     width: int
@@ -40,6 +44,8 @@ class ViewScore:
     flip: float | None
     lpips: float | None
     render_seconds: float
+    deform_seconds: float
+    time: float | None = None
 
 
 @dataclass(frozen=True)
@@ -53,8 +59,15 @@ class EvalReport:
         psnr, ssim, flip, lpips: means over the views of the per-view values.
         lpips_net: backbone that LPIPS uses, or would use.
         num_gaussians: N.
-        model_mb: float32 parameters of all Gaussians in 1e6 bytes; an exported .ply adds 12 bytes per Gaussian.
-        fps: one over the median time of rendering one view, after a warm-up; loading and metrics not counted.
+        num_moving, moving_share: M and M / N.
+        model_mb: float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12 bytes per
+            Gaussian.
+        field_mb: of these, the field's.
+        fps: one over the median time of drawing one view, after a warm-up: deformation and rendering; loading and
+            metrics not counted.
+        deform_share: median share of that time that the deformation takes.
+        psnr_per_time: mean PSNR at each distinct time; empty for a still capture.
+        flicker, flicker_error: see ``dyngs.train.temporal``.
         seconds_train, step: how long and how far the run was trained.
         reasons: metric name to why it is None.
         notes: anything else that a reader of the numbers should know.
@@ -72,10 +85,17 @@ class EvalReport:
     lpips: float | None
     lpips_net: str
     num_gaussians: int
+    num_moving: int
+    moving_share: float
     model_mb: float
+    field_mb: float
     fps: float
+    deform_share: float
     seconds_train: float
     step: int
+    flicker: float | None = None
+    flicker_error: float | None = None
+    psnr_per_time: tuple[TimeScore, ...] = ()
     reasons: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     per_view: tuple[ViewScore, ...] = ()
@@ -100,16 +120,18 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
     run = load_run(run_dir)
     capture = read_capture(run.config.data)
     views = split_views(capture, split)
-    choice = run.config.data.background
-    background, colour = evaluation_background(choice, capture.has_alpha)
-    notes = ["trained on random backgrounds, evaluated on black"] if choice == "random" else []
+    background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
+    drawing = Drawing(run.scene, render_options(run.config.model), colour)
     lpips = load_lpips(lpips_net)
     with _num_threads(threads):
         loader = PictureLoader(views, run.config.data)
         pictures = (loader[i] for i in range(len(loader)))
-        scores, reasons = score_views(run.scene, pictures, render_options(run.config.model), colour, lpips)
-    if len({(s.width, s.height) for s in scores}) > 1:
-        notes.append("views differ in size; width and height are those of the first")
+        scores, reasons = score_views(run.scene, pictures, drawing.options, colour, lpips)
+        temporal = {
+            "flicker": flicker_of_split(drawing, loader, views),
+            "flicker_error": flicker_error(drawing, loader, views),
+        }
+    reasons |= {name: measured.reason for name, measured in temporal.items() if measured.reason is not None}
     report = EvalReport(
         split=split,
         num_views=len(scores),
@@ -122,12 +144,19 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
         lpips=_mean([s.lpips for s in scores]),
         lpips_net=lpips_net,
         num_gaussians=len(run.scene),
+        num_moving=0 if run.scene.is_still else len(run.scene.rows),
+        moving_share=run.scene.moving_share,
         model_mb=parameter_megabytes(run.scene),
+        field_mb=4e-6 * run.scene.num_field_values,
         fps=1 / median(s.render_seconds for s in scores),
+        deform_share=median(s.deform_seconds / s.render_seconds for s in scores),
         seconds_train=run.seconds_train,
         step=run.step,
+        flicker=temporal["flicker"].value,
+        flicker_error=temporal["flicker_error"].value,
+        psnr_per_time=psnr_per_time((s.time, s.psnr) for s in scores),
         reasons=reasons,
-        notes=tuple(notes),
+        notes=_notes(run, scores),
         per_view=tuple(scores),
     )
     write_text(report_path(run_dir, split), report.to_json())
@@ -159,7 +188,7 @@ def score_views(
     for picture in pictures:
         if not scores:
             _timed_render(scene, picture, options, background)  # the warm-up
-        rendered, seconds = _timed_render(scene, picture, options, background)
+        rendered, seconds, deform_seconds = _timed_render(scene, picture, options, background)
         if not rendered.isfinite().all():
             raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
         truth, mask = picture.composite(background), picture.mask
@@ -176,6 +205,8 @@ def score_views(
             flip=optional["flip"].value,
             lpips=optional["lpips"].value,
             render_seconds=seconds,
+            deform_seconds=deform_seconds,
+            time=picture.time,
         )
         _require_finite(score, mask)
         scores.append(score)
@@ -215,13 +246,27 @@ def parameter_megabytes(scene: TrainedScene) -> float:
 
 def _timed_render(
     scene: TrainedScene, picture: Picture, options: RenderOptions, background: Tensor
-) -> tuple[Tensor, float]:
-    """(H, W, 3) rendered picture and the seconds that it took, the deformation included."""
+) -> tuple[Tensor, float, float]:
+    """(H, W, 3) rendered picture, the seconds that it took, and those of them that the deformation took."""
     with torch.no_grad():
         start = time.perf_counter()
-        rendering = render(scene.at(picture.time), picture.cameras, options, background=background)
-        seconds = time.perf_counter() - start
-    return rendering.rgb[0], seconds
+        gaussians = scene.at(picture.time)
+        deformed = time.perf_counter()
+        rendering = render(gaussians, picture.cameras, options, background=background)
+        end = time.perf_counter()
+    return rendering.rgb[0], end - start, deformed - start
+
+
+def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
+    """What a reader of the numbers should know."""
+    notes = []
+    if run.config.data.background == "random":
+        notes.append("trained on random backgrounds, evaluated on black")
+    if isinstance(run.config.model, DynamicModel) and run.scene.is_still:
+        notes.append("the model is dynamic, but nothing moves in it: it is drawn as fast as a static one")
+    if len({(s.width, s.height) for s in scores}) > 1:
+        notes.append("views differ in size; width and height are those of the first")
+    return tuple(notes)
 
 
 def _require_finite(score: ViewScore, mask: Tensor | None) -> None:

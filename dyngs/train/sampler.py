@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -14,13 +16,19 @@ class ViewSampler:
         self._order = torch.zeros(0, dtype=torch.long)
         self._position = 0
 
-    def next(self, generator: torch.Generator) -> int:
-        """Index of the next view; ``generator`` is drawn from once per epoch."""
-        if self._position >= len(self._order):
-            self._order = torch.randperm(self.num_views, generator=generator)
-            self._position = 0
-        self._position += 1
-        return int(self._order[self._position - 1])
+    def next(self, generator: torch.Generator, wanted: Callable[[int], bool]) -> int:
+        """Index of the next view that is ``wanted``, of which there must be one; others are passed over.
+
+        ``generator`` is drawn from once per epoch.
+        """
+        while True:
+            if self._position >= len(self._order):
+                self._order = torch.randperm(self.num_views, generator=generator)
+                self._position = 0
+            self._position += 1
+            index = int(self._order[self._position - 1])
+            if wanted(index):
+                return index
 
     def state(self) -> dict[str, Tensor]:
         return {"order": self._order, "position": torch.tensor([self._position])}

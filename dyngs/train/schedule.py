@@ -17,7 +17,7 @@ RESET_SHARE = 0.2
 """Of a short run, between resets."""
 MAX_GROWTH = 0.25
 FILTER_EVERY = 100
-FIRST_SPLIT, LAST_SPLIT, SPLIT_GAP = 0.3, 0.7, 0.05
+FIRST_SPLIT, LAST_SPLIT, SPLIT_GAP = 0.45, 0.7, 0.05
 """When a dynamic model freezes what does not move, in shares of the run."""
 
 
@@ -87,4 +87,5 @@ def deform_schedule(model: DynamicModel, steps: int) -> DeformSchedule:
     fine = min(max(1, round(model.coarse * steps)), steps)
     shares = [FIRST_SPLIT + i * SPLIT_GAP for i in range(round((LAST_SPLIT - FIRST_SPLIT) / SPLIT_GAP) + 1)]
     splits = sorted({round(share * steps) for share in shares}) if model.still_below > 0 else []
-    return DeformSchedule(fine, tuple(step for step in splits if step > fine), steps)
+    full = max(fine, round(model.all_views_at * steps))
+    return DeformSchedule(fine, full, tuple(step for step in splits if step > full), steps)

@@ -26,6 +26,10 @@ from dyngs.train.schedule import active_sh_degree, means_rate
 class Model(Protocol):
     """What turns the parameters stored per Gaussian into the Gaussians of a picture."""
 
+    def trains_on(self, time: float | None, step: int) -> bool:
+        """Whether a picture of ``time`` may be trained on in ``step``; at each step some may."""
+        ...
+
     def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
         """What is drawn for ``batch`` in ``step``; differentiable in ``parameters`` and in what the model learns."""
         ...
@@ -98,7 +102,8 @@ class Trainer:
             DyngsError: the loss is not finite; says which term, and leaves the parameters as they were.
         """
         config, step = self.config, self.done + 1
-        picture = self.pictures[self.sampler.next(self.generator)]
+        times = self.pictures.times
+        picture = self.pictures[self.sampler.next(self.generator, lambda i: self.model.trains_on(times[i], step))]
         background = self._background_colour()
         parameters = self.optimizer.parameters
         drawn = self.model.gaussians_at(parameters, picture, step)

@@ -1,4 +1,4 @@
-"""Turns Gaussians into pictures: the views of a split beside their truth, or the frames of a camera path."""
+"""Turns a scene into pictures: the views of a split beside their truth, or the frames of a camera path."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from dyngs.camera import Cameras
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.write import to_uint8, write_image
+from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.export.ply import SplatFile
 from dyngs.gaussians import Gaussians
@@ -22,6 +23,7 @@ from dyngs.rendering import RenderOptions, render
 from dyngs.train.checkpoint import load_run
 from dyngs.train.evaluate import evaluation_background, render_options, split_views
 from dyngs.train.metrics import psnr
+from dyngs.view.paths import CameraPath
 from dyngs.view.sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
 from dyngs.view.video import VideoWriter
 
@@ -62,56 +64,78 @@ class Frame:
     depth: np.ndarray | None
 
 
-def render_frames(
-    gaussians: Gaussians, cameras: Cameras, options: RenderOptions = DEFAULT_OPTIONS, background: Tensor | None = None
-) -> Iterator[Frame]:
-    """The pictures that the cameras see, one at a time and without gradients: memory does not grow with their number.
+@dataclass(frozen=True)
+class Shot:
+    """A scene, and the cameras and times at which it is seen.
+
+    Attributes:
+        scene: what is drawn.
+        path: F cameras in the order of the video; without times, all see time 0.
+        options: how the scene wants to be drawn.
+        background: (3,) colour; None is black.
+        notes: lines for people, about what was chosen for them.
+    """
+
+    scene: TrainedScene
+    path: CameraPath
+    options: RenderOptions = DEFAULT_OPTIONS
+    background: Tensor | None = None
+    notes: tuple[str, ...] = ()
+
+
+def render_frame(
+    gaussians: Gaussians, camera: Cameras, options: RenderOptions = DEFAULT_OPTIONS, background: Tensor | None = None
+) -> Frame:
+    """The picture that one camera sees, without gradients.
 
     Args:
         gaussians: N Gaussians.
-        cameras: V cameras.
+        camera: one camera.
         options: how to draw; ``depth`` other than "none" fills ``Frame.depth``.
         background: (3,) colour; None is black.
     """
-    for i in range(len(cameras)):
-        with torch.no_grad():
-            rendering = render(gaussians, cameras.select(i), options, background=background)
-        depth = None if rendering.depth is None else rendering.depth[0].cpu().numpy()
-        yield Frame(rendering.rgb[0].clamp(0, 1).cpu().numpy(), rendering.alpha[0].cpu().numpy(), depth)
+    with torch.no_grad():
+        rendering = render(gaussians, camera, options, background=background)
+    depth = None if rendering.depth is None else rendering.depth[0].cpu().numpy()
+    return Frame(rendering.rgb[0].clamp(0, 1).cpu().numpy(), rendering.alpha[0].cpu().numpy(), depth)
 
 
-def write_path_frames(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    out_dir: Path | None,
-    options: RenderOptions = DEFAULT_OPTIONS,
-    background: Tensor | None = None,
-    output: OutputOptions = OutputOptions(),
-) -> list[Path]:
-    """Paths of the files written for a camera path: ``frame_0000.png`` and so on, and the video if one is asked for.
+def shot_frames(shot: Shot) -> Iterator[Frame]:
+    """The pictures of a shot, one at a time: memory does not grow with their number.
+
+    The scene is deformed anew only where the time differs from that of the picture before.
+    """
+    times = shot.path.times
+    gaussians, moment = None, None
+    for i in range(len(shot.path)):
+        time = None if times is None or shot.scene.is_still else times[i]
+        if gaussians is None or time != moment:
+            gaussians, moment = shot.scene.at(time), time
+        yield render_frame(gaussians, shot.path.cameras.select(i), shot.options, shot.background)
+
+
+def write_path_frames(shot: Shot, out_dir: Path | None, output: OutputOptions = OutputOptions()) -> list[Path]:
+    """Paths of the files written for a shot: ``frame_0000.png`` and so on, and the video if one is asked for.
 
     Args:
-        gaussians: N Gaussians.
-        cameras: V >= 1 cameras, in the order of the video.
+        shot: F >= 1 cameras and times, in the order of the video.
         out_dir: folder for the pictures; None writes only the video.
-        options: how to draw.
-        background: (3,) colour; None is black.
         output: depth, alpha, video. The colours of depth share one range over the whole path.
 
     Raises:
         DyngsError: no cameras, nothing to write, or a file cannot be written.
     """
-    if len(cameras) == 0:
+    if len(shot.path) == 0:
         raise DyngsError("the camera path has no cameras")
     if out_dir is None and output.video is None:
         raise DyngsError("nothing to write: give a folder for the pictures or a video file")
-    options = _with_depth(options, output)
+    shot = replace(shot, options=_with_depth(shot.options, output))
     limits = None
     if output.depth and out_dir is not None:
-        limits = _shared_depth_limits(render_frames(gaussians, _sample(cameras), options, background))
-    digits = max(4, len(str(len(cameras) - 1)))
+        limits = _shared_depth_limits(shot_frames(replace(shot, path=_sample(shot.path))))
+    digits = max(4, len(str(len(shot.path) - 1)))
     with _FrameWriter(out_dir, output, limits) as writer:
-        for i, frame in enumerate(render_frames(gaussians, cameras, options, background)):
+        for i, frame in enumerate(shot_frames(shot)):
             writer.write(f"frame_{i:0{digits}d}", frame)
     return writer.written
 
@@ -142,7 +166,7 @@ def write_split(run_dir: Path, split: str, out_dir: Path, output: OutputOptions 
     with _FrameWriter(out_dir, output) as writer:
         for i, stem in enumerate(file_stems([view.name for view in views])):
             picture = loader[i]
-            frame = next(render_frames(run.scene.at(picture.time), picture.cameras, options, background))
+            frame = render_frame(run.scene.at(picture.time), picture.cameras, options, background)
             writer.write(stem, frame)
             if i in shown:
                 truth = picture.composite(background)
@@ -233,10 +257,12 @@ def _with_depth(options: RenderOptions, output: OutputOptions) -> RenderOptions:
     return replace(options, depth="expected" if output.depth else "none")
 
 
-def _sample(cameras: Cameras) -> Cameras:
-    """At most 8 of the cameras, evenly spread."""
-    index = torch.linspace(0, len(cameras) - 1, min(len(cameras), _DEPTH_SAMPLES)).round().long()
-    return replace(cameras, cam_from_world=cameras.cam_from_world[index], intrinsics=cameras.intrinsics[index])
+def _sample(path: CameraPath) -> CameraPath:
+    """At most 8 of the frames, evenly spread."""
+    index = torch.linspace(0, len(path) - 1, min(len(path), _DEPTH_SAMPLES)).round().long()
+    poses, intrinsics = path.cameras.cam_from_world[index], path.cameras.intrinsics[index]
+    cameras = replace(path.cameras, cam_from_world=poses, intrinsics=intrinsics)
+    return replace(path, cameras=cameras, times=path.times and tuple(path.times[i] for i in index.tolist()))
 
 
 def _shared_depth_limits(frames: Iterator[Frame]) -> tuple[float, float]:

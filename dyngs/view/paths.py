@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,10 @@ from dyngs.data.focus import focus_point, share_in_front
 from dyngs.data.poses import cam_from_opengl, checked_pose
 from dyngs.data.write import write_text
 from dyngs.errors import DyngsError
+from dyngs.view.keyframes import Keyframes, interpolate_keyframes
+
+_MAX_FRAMES = 100_000
+"""More pictures than this are taken for a slip of the pen."""
 
 
 @dataclass(frozen=True)
@@ -26,14 +31,64 @@ class CameraPath:
         cameras: F cameras.
         fps: pictures per second.
         times: (F,) scene times in [0, 1], or None for a still scene.
+        warnings: lines for people, about what was changed in what they gave.
     """
 
     cameras: Cameras
     fps: float = 30.0
     times: tuple[float, ...] | None = None
+    warnings: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+
+def with_times(path: CameraPath, times: Sequence[float]) -> CameraPath:
+    """The same cameras at other scene times.
+
+    Args:
+        path: F cameras.
+        times: F scene times; those outside [0, 1] are clamped, with a warning.
+
+    Raises:
+        DyngsError: another number of times than cameras, or a time that is not finite.
+    """
+    if len(times) != len(path):
+        raise DyngsError(f"the camera path has {len(path)} cameras, but there are {len(times)} times; give as many")
+    clamped, warnings = _clamped(times, "times")
+    return replace(path, times=clamped, warnings=path.warnings + warnings)
+
+
+def frozen_path(camera: Cameras, times: Sequence[float], fps: float = 30.0) -> CameraPath:
+    """One camera that stands still while the scene moves.
+
+    Args:
+        camera: one camera.
+        times: F >= 1 scene times, as in ``with_times``.
+        fps: pictures per second.
+    """
+    if len(camera) != 1:
+        raise ValueError(f"a frozen path is seen by one camera, got {len(camera)}")
+    poses, intrinsics = (x.expand(len(times), *x.shape[1:]).clone() for x in (camera.cam_from_world, camera.intrinsics))
+    return with_times(CameraPath(Cameras(poses, intrinsics, camera.width, camera.height), fps), times)
+
+
+def parse_times(text: str) -> tuple[float, ...]:
+    """The scene times of ``START:STOP:COUNT``: COUNT of them, evenly spaced, with both ends; one is START.
+
+    Raises:
+        DyngsError: if ``text`` is anything else.
+    """
+    wanted = "write START:STOP:COUNT, for instance 0:1:60 for 60 evenly spaced times"
+    try:
+        start, stop, count = (kind(part) for kind, part in zip((float, float, int), text.split(":"), strict=True))
+    except ValueError:
+        raise DyngsError(f"{text!r} is no range of times; {wanted}") from None
+    if not (math.isfinite(start) and math.isfinite(stop)):
+        raise DyngsError(f"{text!r}: times must be finite; {wanted}")
+    if not 1 <= count <= _MAX_FRAMES:
+        raise DyngsError(f"{text!r}: the count must be from 1 to {_MAX_FRAMES}; {wanted}")
+    return tuple(np.linspace(start, stop, int(count)).tolist())
 
 
 def orbit_path(cameras: Cameras, num_frames: int, turns: float = 1.0) -> Cameras:
@@ -194,26 +249,27 @@ def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
         document = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise DyngsError(f"cannot read the camera path {file}: {error.strerror or error}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DyngsError(f"{file} is not a JSON file ({error}); see docs/camera_paths.md for the format") from error
-    if not isinstance(document, dict) or not isinstance(document.get("frames"), list) or not document["frames"]:
-        raise DyngsError(f"{file}: a camera path needs a non-empty list 'frames'; see docs/camera_paths.md")
+    if not isinstance(document, dict):
+        raise DyngsError(f"{file}: a camera path is a JSON object with a list 'frames'; see docs/camera_paths.md")
+    given = [name for name in ("frames", "keyframes") if name in document]
+    if len(given) != 1 or not isinstance(document[given[0]], list) or not document[given[0]]:
+        raise DyngsError(f"{file}: a camera path needs one non-empty list, 'frames' or 'keyframes'; see docs")
     width, height = (int(_number(document, key, str(file), low=1, high=65536)) for key in ("width", "height"))
     fps = _number(document, "fps", str(file), low=1e-3, high=1000, default=30.0)
-    poses, matrices, times = [], [], []
-    for i, frame in enumerate(document["frames"]):
-        where = f"{file}: frames[{i}]"
-        if not isinstance(frame, dict):
-            raise DyngsError(f"{where} must be an object with 'cam_from_world' or 'transform_matrix'")
-        poses.append(_read_pose(frame, where))
-        matrices.append(_read_intrinsics(document, frame, (width, height), where))
-        times.append(_number(frame, "time", where, low=0, high=1) if "time" in frame else None)
-    known = [t for t in times if t is not None]
-    if known and len(known) < len(times):
-        raise DyngsError(f"{file}: frames[{times.index(None)}] has no 'time', others have; give it to all or to none")
-    cam_from_world = torch.from_numpy(_rebased(np.stack(poses), world_offset, sign=1.0)).float()
-    cameras = Cameras(cam_from_world, torch.from_numpy(np.stack(matrices)).float(), width, height)
-    return CameraPath(cameras, fps, tuple(known) or None)
+    poses, intrinsics, times = _read_cameras(document, given[0], (width, height), file)
+    poses = _rebased(poses, world_offset, sign=1.0)
+    if given[0] == "keyframes":
+        keys, num_frames = _read_keyframes(document, Keyframes(poses, intrinsics, np.zeros(0), times), fps, file)
+        made = interpolate_keyframes(keys, np.arange(num_frames) / fps)
+        poses, intrinsics, times = made.cam_from_world, made.intrinsics, made.times
+    cameras = Cameras(torch.from_numpy(poses).float(), torch.from_numpy(intrinsics).float(), width, height)
+    path = CameraPath(cameras, fps)
+    if times is None:
+        return path
+    clamped, warnings = _clamped(times.tolist(), str(file))
+    return replace(path, times=clamped, warnings=warnings)
 
 
 @dataclass(frozen=True)
@@ -252,6 +308,89 @@ def _rebased(cam_from_world: np.ndarray, world_offset: np.ndarray | None, sign: 
     if world_offset is not None:
         moved[:, :3, 3] += sign * moved[:, :3, :3] @ world_offset
     return moved
+
+
+def _read_cameras(
+    document: dict[str, Any], name: str, size: tuple[int, int], file: Path
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """(F, 4, 4) world-to-camera poses, (F, 3, 3) intrinsics and (F,) times, if any, of the list ``name``."""
+    poses, matrices = [], []
+    for i, frame in enumerate(document[name]):
+        where = f"{file}: {name}[{i}]"
+        if not isinstance(frame, dict):
+            raise DyngsError(f"{where} must be an object with 'cam_from_world' or 'transform_matrix'")
+        poses.append(_read_pose(frame, where))
+        matrices.append(_read_intrinsics(document, frame, size, where))
+    times = _numbers_of_all(document, name, "time", (-1e9, 1e9), file)
+    return np.stack(poses), np.stack(matrices), times
+
+
+def _numbers_of_all(
+    document: dict[str, Any], name: str, key: str, limits: tuple[float, float], file: Path
+) -> np.ndarray | None:
+    """(F,) the numbers at ``key`` in each object of the list ``name``; None if none has it."""
+    frames = document[name]
+    without = [i for i, frame in enumerate(frames) if key not in frame]
+    if without and len(without) < len(frames):
+        raise DyngsError(f"{file}: {name}[{without[0]}] has no '{key}', others have; give it to all or to none")
+    low, high = limits
+    found = [
+        _number(frame, key, f"{file}: {name}[{i}]", low=low, high=high) for i, frame in enumerate(frames) if not without
+    ]
+    return np.array(found) if found else None
+
+
+def _read_keyframes(document: dict[str, Any], keys: Keyframes, fps: float, file: Path) -> tuple[Keyframes, int]:
+    """``keys`` with their seconds and period, and the number of frames, from 'at', 'num_frames', 'seconds', 'loop'."""
+    loop, count = document.get("loop", False), len(keys.cam_from_world)
+    if not isinstance(loop, bool):
+        raise DyngsError(f"{file}: 'loop' is {loop!r}; it must be true or false")
+    at = _numbers_of_all(document, "keyframes", "at", (0, 1e6), file)
+    if at is not None and (np.diff(at) <= 0).any():
+        i = int(np.argmax(np.diff(at) <= 0)) + 1
+        raise DyngsError(f"{file}: keyframes[{i}] is 'at' {at[i]:g} s, not after the one before; put them in order")
+    num_frames = _read_num_frames(document, fps, file)
+    if at is None:
+        intervals = count if loop else max(count - 1, 1)
+        length = float(intervals) if num_frames is None else (num_frames - (not loop)) / fps
+        at = np.arange(count) * ((length or 1.0) / intervals)
+    span = float(at[-1] - at[0])
+    if not loop:
+        period, shown = None, num_frames or round(at[-1] * fps) + 1
+    else:
+        period = num_frames / fps if num_frames else span * count / (count - 1) if count > 1 else 1.0
+        shown = num_frames or max(1, round(period * fps))
+        if period <= span:
+            raise DyngsError(f"{file}: the loop takes {period:g} s, but its keyframes {span:g} s; make it longer")
+    if shown > _MAX_FRAMES:
+        raise DyngsError(f"{file}: would be {shown} frames; at most {_MAX_FRAMES}: lower 'at', 'seconds' or 'fps'")
+    return replace(keys, seconds=at, period=period), shown
+
+
+def _read_num_frames(document: dict[str, Any], fps: float, file: Path) -> int | None:
+    """The number of frames by 'num_frames' or 'seconds'; None where neither is given."""
+    if "num_frames" in document and "seconds" in document:
+        raise DyngsError(f"{file}: 'num_frames' and 'seconds' both say how long the video is; give one of them")
+    if "seconds" in document:
+        return max(1, round(_number(document, "seconds", str(file), low=1e-3, high=1e6) * fps))
+    if "num_frames" not in document:
+        return None
+    number = _number(document, "num_frames", str(file), low=1, high=_MAX_FRAMES)
+    if number != int(number):
+        raise DyngsError(f"{file}: 'num_frames' is {number:g}; it must be a whole number")
+    return int(number)
+
+
+def _clamped(times: Sequence[float], where: str) -> tuple[tuple[float, ...], tuple[str, ...]]:
+    """``times`` within [0, 1], and a line about it if any was not."""
+    if not all(math.isfinite(t) for t in times):
+        raise DyngsError(f"{where}: scene times must be finite numbers in [0, 1]")
+    outside = [t for t in times if not 0 <= t <= 1]
+    clamped = tuple(min(max(float(t), 0.0), 1.0) for t in times)
+    if not outside:
+        return clamped, ()
+    extremes = f"from {min(times):g} to {max(times):g}"
+    return clamped, (f"{where}: {len(outside)} of {len(times)} scene times lie outside [0, 1] ({extremes}); clamped",)
 
 
 def _read_pose(frame: dict[str, Any], where: str) -> np.ndarray:

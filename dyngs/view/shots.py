@@ -1,4 +1,4 @@
-"""What a camera path shows: the Gaussians of a run or a file, cameras around them, and how they want to be drawn."""
+"""What a camera path shows: a run or a file, cameras around it and the times that they see, and how to draw it."""
 
 from __future__ import annotations
 
@@ -7,107 +7,158 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import DataConfig
-from dyngs.data.capture import Capture
-from dyngs.data.loader import PictureLoader
+from dyngs.data.capture import Capture, View
 from dyngs.data.read import read_capture
+from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.export.ply import read_ply
-from dyngs.gaussians import Gaussians
-from dyngs.rendering import RenderOptions
-from dyngs.train.checkpoint import load_run
-from dyngs.train.evaluate import evaluation_background, render_options
-from dyngs.view.frames import splat_options
-from dyngs.view.paths import CameraPath, frame_orbit_for_points, orbit_path, read_path, spiral_path
+from dyngs.train.assemble import training_cameras
+from dyngs.train.checkpoint import LoadedRun, load_run
+from dyngs.train.evaluate import evaluation_background, render_options, split_views
+from dyngs.view.frames import Shot, file_stems, splat_options
+from dyngs.view.paths import (
+    CameraPath,
+    frame_orbit_for_points,
+    frozen_path,
+    orbit_path,
+    read_path,
+    spiral_path,
+    with_times,
+)
 
+DEFAULT_FRAMES = 120
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _DEFAULT_SIZE = (960, 720)
 
 
 @dataclass(frozen=True)
 class ShotOptions:
-    """Which cameras to place.
+    """Which cameras to place, and when they look.
 
     Attributes:
-        path: "orbit", "spiral", or a JSON file of cameras (docs/camera_paths.md).
+        path: "orbit", "spiral", a JSON file of cameras (docs/camera_paths.md), or None: one camera that stands still.
         num_frames: of orbit and spiral.
         size: width and height in pixels; None keeps that of the pictures, of the JSON, or 960x720 for a bare file.
         background: "white" or "black"; None is that of training, black for a bare file.
         up: axis of a bare file's world that points up, for instance "z" or "-y".
+        times: scene times of the frames; a single one holds for all. None: those of the JSON; otherwise that of the
+            view for a camera that stands still, from 0 to 1 along a path.
+        view: whose camera it is that stands still: a view's name, the name of its picture, or its number from 0.
+        split: of that view; None is test, or val or train where there is none.
     """
 
-    path: str = "orbit"
-    num_frames: int = 120
+    path: str | None = "orbit"
+    num_frames: int = DEFAULT_FRAMES
     size: tuple[int, int] | None = None
     background: str | None = None
     up: str = "z"
-
-
-@dataclass(frozen=True)
-class Shot:
-    """All that ``write_path_frames`` needs.
-
-    Attributes:
-        gaussians: N Gaussians.
-        cameras: F cameras in the order of the video.
-        options: how the Gaussians want to be drawn.
-        background: (3,) colour.
-        fps: of the video.
-    """
-
-    gaussians: Gaussians
-    cameras: Cameras
-    options: RenderOptions
-    background: Tensor
-    fps: float
+    times: tuple[float, ...] | None = None
+    view: str | None = None
+    split: str | None = None
 
 
 def shot_of_run(run_dir: Path, options: ShotOptions) -> Shot:
-    """A path around the scene of a run, placed by its training cameras.
+    """The scene of a run along a path placed by its training cameras, or before one of its cameras.
 
     Raises:
-        DyngsError: no such run, its capture is gone, or a broken path file.
+        DyngsError: no such run or view, its capture is gone, a broken path file, or times that do not fit its frames.
     """
     run = load_run(run_dir)
     capture = read_capture(run.config.data)
     _, background = evaluation_background(options.background or run.config.data.background, capture.has_alpha)
-    file = _path_file(options)
-    if file is not None:
-        path = read_path(file, capture.world_offset)
-    else:
-        around = training_cameras(capture, run.config.data)
-        place = orbit_path if options.path == "orbit" else spiral_path
-        path = CameraPath(place(around, options.num_frames))
-    cameras = path.cameras if options.size is None else resize_cameras(path.cameras, *options.size)
-    return Shot(run.scene.at(0.0), cameras, render_options(run.config.model), background, path.fps)
+    path = _standing_path(run, capture, options) if options.path is None else _moving_path(run, capture, options)
+    notes: tuple[str, ...] = ()
+    if run.scene.is_still and options.times is not None:
+        notes = ("nothing moves in this run: it looks the same at all times",)
+    elif not run.scene.is_still and path.times is None:
+        path = with_times(path, np.linspace(0, 1, len(path)).tolist())
+        notes = ("time runs from 0 to 1 along the path; --time or --times choose other moments",)
+    if options.size is not None:
+        path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
+    return Shot(run.scene, path, render_options(run.config.model), background, notes)
 
 
 def shot_of_ply(file: Path, options: ShotOptions) -> Shot:
     """A path around the Gaussians of a .ply, placed by their extent; non-finite Gaussians are left out.
 
     Raises:
-        DyngsError: not a splat file, or a broken path file.
+        DyngsError: not a splat file, a broken path file, or times, which a file does not have.
     """
+    if options.path is None or options.times is not None or options.view is not None:
+        raise DyngsError(f"{file}: a .ply holds one moment and no views; leave out --time, --times and --view")
     splat = read_ply(file, nonfinite="skip")
-    path_file = _path_file(options)
+    path_file = _path_file(options.path)
     if path_file is not None:
         path = read_path(path_file, np.asarray(splat.world_offset))
     else:
         path = CameraPath(_around_points(splat.gaussians.means.numpy(), options))
-    cameras = path.cameras if options.size is None else resize_cameras(path.cameras, *options.size)
+    if options.size is not None:
+        path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     _, background = evaluation_background(options.background or "black", has_alpha=False)
-    return Shot(splat.gaussians, cameras, splat_options(splat), background, path.fps)
+    scene = TrainedScene(splat.gaussians, torch.zeros(0, dtype=torch.long))
+    return Shot(scene, path, splat_options(splat), background)
 
 
-def training_cameras(capture: Capture, data: DataConfig) -> Cameras:
+def cameras_for_paths(capture: Capture, data: DataConfig) -> Cameras:
     """The V training cameras, all with the first one's size and intrinsics as loaded (downscaled, undistorted)."""
     views = capture.splits["train"]
-    first = PictureLoader(views[:1], data)[0].cameras
+    (first,) = training_cameras(views[:1], data)
     poses = torch.from_numpy(np.stack([view.cam_from_world for view in views])).float()
     return Cameras(poses, first.intrinsics.expand(len(views), 3, 3).clone(), first.width, first.height)
+
+
+def view_to_show(capture: Capture, name: str | None = None, split: str | None = None) -> View:
+    """The view called ``name``, the first one by default.
+
+    Args:
+        capture: with at least one view.
+        name: a view's name, the name of its picture among those of ``dyngs render RUN``, or its number in the split,
+            from 0; a name goes before a number.
+        split: "test", "val" or "train"; None looks for a name in all of them, for a number in the first that has views.
+
+    Raises:
+        DyngsError: no such view, or no such split.
+    """
+    order = [s for s in ("test", "val", "train") if capture.splits.get(s)] if split is None else [split]
+    candidates = [split_views(capture, s) for s in order]
+    if name is None:
+        return candidates[0][0]
+    for views in candidates:
+        for view, stem in zip(views, file_stems([view.name for view in views]), strict=True):
+            if name in (view.name, stem):
+                return view
+    first = candidates[0]
+    if name.isascii() and name.isdigit() and int(name) < len(first):
+        return first[int(name)]
+    raise DyngsError(
+        f"{capture.root}: no view {name!r}; the split {order[0]} has {len(first)} views: {first[0].name} (0) to "
+        f"{first[-1].name} ({len(first) - 1})"
+    )
+
+
+def _standing_path(run: LoadedRun, capture: Capture, options: ShotOptions) -> CameraPath:
+    """One camera of the capture at ``options.times``, or at its own time."""
+    view = view_to_show(capture, options.view, options.split)
+    (camera,) = training_cameras([view], run.config.data)
+    return frozen_path(camera, (view.time or 0.0,) if options.times is None else options.times)
+
+
+def _moving_path(run: LoadedRun, capture: Capture, options: ShotOptions) -> CameraPath:
+    """The path that ``options`` name, with ``options.times`` if there are any."""
+    path = options.path or "orbit"
+    file = _path_file(path)
+    if file is not None:
+        found = read_path(file, capture.world_offset)
+    else:
+        place = orbit_path if path == "orbit" else spiral_path
+        found = CameraPath(place(cameras_for_paths(capture, run.config.data), options.num_frames))
+    if options.times is None:
+        return found
+    times = options.times * len(found) if len(options.times) == 1 else options.times
+    return with_times(replace(found, warnings=()), times)
 
 
 def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
@@ -134,10 +185,10 @@ def _around_points(means: np.ndarray, options: ShotOptions) -> Cameras:
     return spiral_path(arc, options.num_frames)
 
 
-def _path_file(options: ShotOptions) -> Path | None:
-    """The JSON file that ``options.path`` names, None for a path with a name."""
-    if options.path in ("orbit", "spiral"):
+def _path_file(path: str) -> Path | None:
+    """The JSON file that ``path`` names, None for a path with a name."""
+    if path in ("orbit", "spiral"):
         return None
-    if not options.path.endswith(".json"):
-        raise DyngsError(f"no camera path {options.path!r}; use orbit, spiral, or a .json file (docs/camera_paths.md)")
-    return Path(options.path)
+    if not path.endswith(".json"):
+        raise DyngsError(f"no camera path {path!r}; use orbit, spiral, or a .json file (docs/camera_paths.md)")
+    return Path(path)

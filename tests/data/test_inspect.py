@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from tiny_captures import edit_json, write_cameras_json, write_video
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, PointCloud, View
@@ -150,6 +151,77 @@ def test_no_capture_at_all_is_a_problem_not_an_error(tmp_path: Path, content: st
     assert report.capture is None
     assert not report.ok
     assert str(tmp_path) in format_report(report)
+
+
+def _sequence(root: Path, cameras: int, times: int) -> Capture:
+    """Cameras at rest that see all times, the first one for testing."""
+    good = _capture(root, max(cameras, 2))
+    views = [view for split in ("test", "train") for view in good.splits[split]][:cameras]  # type: ignore[index]
+    seen = [
+        [
+            replace(
+                view, name=f"c{i}/{time}", image_path=root / f"c{i}_{time}.png", time=time / (times - 1), camera_id=i
+            )
+            for time in range(times)
+        ]
+        for i, view in enumerate(views)
+    ]
+    for view in (view for same in seen for view in same):
+        write_image(view.image_path, np.zeros((24, 32, 3), np.uint8))
+    test = seen[0] if cameras > 1 else seen[0][:1]
+    train = [view for same in seen[1:] for view in same] if cameras > 1 else seen[0][1:]
+    return good.replace(splits={"train": tuple(train), "test": tuple(test)})
+
+
+def test_cameras_by_times(tmp_path: Path) -> None:
+    report = report_on(_sequence(tmp_path, 4, 3))
+    assert report.ok, report.problems
+    facts = dict(report.facts)
+    assert facts["times"] == "3 in 0 to 1"
+    assert facts["sequence"] == "4 cameras x 3 times, 12 pictures"
+    assert "frame rate" not in facts
+    moving = _with_view(_sequence(tmp_path, 4, 3), cam_from_world=np.eye(4))
+    assert dict(report_on(moving).facts)["sequence"].startswith("4 cameras (1 moving) x 3 times")
+
+
+def test_one_camera_at_rest_cannot_show_a_moving_scene(tmp_path: Path) -> None:
+    report = report_on(_sequence(tmp_path, 1, 5))
+    assert [line for line in report.problems if "cannot be reconstructed" in line]
+    assert not any("at one place" in line for line in report.problems), "said already"
+    assert not any("cannot be" in line for line in report_on(_sequence(tmp_path, 3, 5)).problems)
+    moved = _with_view(_sequence(tmp_path, 1, 5), cam_from_world=_capture(tmp_path).splits["train"][2].cam_from_world)
+    assert not any("cannot be reconstructed" in line for line in report_on(moved).problems)
+
+
+def test_videos_are_not_decoded_to_be_inspected(tmp_path: Path) -> None:
+    write_cameras_json(tmp_path, ("cam00", "cam01", "cam02", "cam03"), test=["cam00"])
+    for i in range(4):
+        write_video(tmp_path / f"cam0{i}.mp4", 3, fps=25)
+    before = sorted(tmp_path.iterdir())
+    report = inspect_capture(tmp_path)
+    assert report.ok, report.problems
+    facts = dict(report.facts)
+    assert (facts["frame rate"], facts["sequence"]) == ("25 per second", "4 cameras x 3 times, 12 pictures")
+    assert facts["video frames"] == "0 of 12 are decoded already"
+    assert sorted(tmp_path.iterdir()) == before
+    edit_json(tmp_path / "cameras.json", lambda content: content.update(fps=24))
+    report = inspect_capture(tmp_path, deep=True)
+    assert report.ok, report.problems
+    assert dict(report.facts)["frame rate"] == "24 per second"
+    assert dict(report.facts)["video frames"] == "12 of 12 are decoded already"
+
+
+def test_the_rate_in_a_transforms_file(blender_root: Path) -> None:
+    for split in ("train", "test"):
+        edit_json(
+            blender_root / f"transforms_{split}.json",
+            lambda content: content.update(
+                fps=15, frames=[{**frame, "time": i / 16} for i, frame in enumerate(content["frames"])]
+            ),
+        )
+    facts = dict(inspect_capture(blender_root).facts)
+    assert facts["frame rate"] == "15 per second"
+    assert facts["sequence"] == "1 camera (moving) x 16 times, 18 pictures"
 
 
 def test_drawing_shows_cameras_and_points(tmp_path: Path) -> None:

@@ -4,7 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_captures import edit_json, write_colmap
+from tiny_captures import (
+    edit_json,
+    write_cameras_json,
+    write_colmap,
+    write_folder,
+    write_nerfies,
+    write_poses_bounds,
+    write_video,
+)
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
@@ -12,6 +20,8 @@ from dyngs.data.loader import PictureLoader
 from dyngs.data.poses import camera_center
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
+
+CAMERAS = ("cam00", "cam01", "cam02")
 
 
 def read(root: Path, **options: object) -> Capture:
@@ -82,7 +92,8 @@ def test_no_such_folder(tmp_path: Path) -> None:
 def test_nothing_recognised_lists_what_was_looked_for(tmp_path: Path) -> None:
     with pytest.raises(DyngsError) as caught:
         read(tmp_path)
-    for wanted in ("transforms_train.json", "transforms.json", "cameras.bin", "sparse/0"):
+    files = ("transforms_train.json", "transforms.json", "cameras.bin", "sparse/0")
+    for wanted in (*files, "dataset.json", "poses_bounds.npy", "cameras.json"):
         assert wanted in str(caught.value)
 
 
@@ -156,6 +167,100 @@ def test_time_for_some_is_an_error(blender_root: Path) -> None:
         read(blender_root)
 
 
+@pytest.mark.parametrize("time", [float("nan"), float("inf"), "0.5", [1], True])
+def test_a_time_that_is_no_number_names_its_frame(blender_root: Path, time: object) -> None:
+    set_times(blender_root, "train", [0.5] * 16)
+    edit_json(blender_root / "transforms_train.json", lambda c: c["frames"][3].update(time=time))
+    with pytest.raises(DyngsError, match=r"frame 3 \(\./train/r_3\): 'time' must be a finite number"):
+        read(blender_root)
+
+
+def test_one_time_for_all_is_a_still_scene(blender_root: Path) -> None:
+    set_times(blender_root, "train", [0.5] * 16)
+    set_times(blender_root, "test", [0.5] * 2)
+    capture = read(blender_root)
+    assert {view.time for view in capture.splits["train"]} == {None}
+    assert capture.warnings == ("all pictures have time 0.5: treated as a still scene",)
+
+
+def test_order_of_times_does_not_matter(blender_root: Path) -> None:
+    set_times(blender_root, "train", [(7 * i % 16) / 15 for i in range(16)])
+    set_times(blender_root, "test", [1.0, 0.0])
+    capture = read(blender_root)
+    assert {view.name: view.time for view in capture.splits["test"]} == {"test/r_0": 1.0, "test/r_1": 0.0}
+    assert capture.warnings == ()
+
+
+def test_frames_of_any_format_with_times(blender_root: Path) -> None:
+    """Chosen over the times of all splits, before anything is held out."""
+    set_times(blender_root, "train", [float(i) for i in range(16)])
+    set_times(blender_root, "test", [2.5, 12.0])
+    capture = read(blender_root, frames="2:6")  # 2, 2.5, 3, 4
+    assert {view.name: view.time for views in capture.splits.values() for view in views} == {
+        "train/r_2": 0.0,
+        "test/r_0": pytest.approx(0.25),
+        "train/r_3": pytest.approx(0.5),
+        "train/r_4": 1.0,
+    }
+    (blender_root / "transforms_test.json").unlink()
+    capture = read(blender_root, frames="::2", test_every=4)
+    assert names(capture, "test") == ["train/r_0", "train/r_2"]
+    assert len(names(capture, "train")) == 6
+
+
+@pytest.mark.parametrize(("frames", "line"), [("1-2", "start:stop:step"), ("5:5", "picks none of"), ("0:9:0", "step")])
+def test_bad_choices_of_frames(blender_root: Path, frames: str, line: str) -> None:
+    set_times(blender_root, "train", [i / 15 for i in range(16)])
+    set_times(blender_root, "test", [0.5, 0.5])
+    with pytest.raises(DyngsError, match=rf"data\.frames.*{line}"):
+        read(blender_root, frames=frames)
+
+
+def test_frames_of_a_still_scene(blender_root: Path) -> None:
+    with pytest.raises(DyngsError, match=r"data\.frames=0:5 picks times, but the capture has none"):
+        read(blender_root, frames="0:5")
+
+
+@pytest.mark.parametrize("form", ["nerfies", "llff", "camera_folders"])
+def test_dynamic_formats_are_recognised_and_load(tmp_path: Path, form: str) -> None:
+    if form == "nerfies":
+        write_nerfies(tmp_path)
+    else:
+        if form == "llff":
+            write_poses_bounds(tmp_path, len(CAMERAS))
+        else:
+            write_cameras_json(tmp_path, CAMERAS)
+        for name in CAMERAS:
+            write_folder(tmp_path / name, range(2))
+    for options in ({}, {"format": form}):
+        capture = read(tmp_path, **options)
+        assert capture.format == form
+        loader = PictureLoader(capture.splits["train"], DataConfig(root=tmp_path, downscale=2))
+        assert loader[0].rgb_premultiplied.shape == (6, 8, 3)
+        assert loader[0].time == capture.splits["train"][0].time
+    with pytest.raises(DyngsError, match=f"no colmap capture.*but there is a {form} capture"):
+        read(tmp_path, format="colmap")
+
+
+@pytest.mark.parametrize("form", ["nerfies", "llff", "camera_folders"])
+def test_a_folder_given_relative_to_where_we_are(tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = tmp_path / "deep" / "capture"
+    root.mkdir(parents=True)
+    if form == "nerfies":
+        write_nerfies(root)
+    elif form == "llff":
+        write_poses_bounds(root, len(CAMERAS))
+    else:
+        write_cameras_json(root, CAMERAS)
+    for name in CAMERAS if form != "nerfies" else ():
+        write_video(root / f"{name}.mp4", 2)
+    monkeypatch.chdir(tmp_path)
+    for written in ("deep/capture", "deep/../deep/capture"):
+        capture = read(Path(written))
+        assert all(view.image_path.is_file() for views in capture.splits.values() for view in views)
+        assert not any("missing" in warning for warning in capture.warnings)
+
+
 def test_far_world_is_rebased(nerfstudio_root: Path) -> None:
     """Georeferenced capture: the offset is kept, the cameras come to the origin."""
 
@@ -177,6 +282,7 @@ def test_far_world_is_rebased(nerfstudio_root: Path) -> None:
         ("fox", "nerfstudio", (43, 0, 7), False, 0),
         ("colmap_small", "colmap", (67, 0, 10), False, 0),
         ("orbits", "blender", (100, 10, 20), True, 100),
+        ("flag", "blender", (100, 10, 20), True, 100),
         ("stage", "blender", (192, 0, 24), False, 24),
     ],
 )
@@ -188,3 +294,9 @@ def test_real_captures(shared: Path, name: str, form: str, counts: tuple, alpha:
     for views in capture.splits.values():
         assert [view.name for view in views] == sorted(view.name for view in views)
         PictureLoader(views, DataConfig.model_validate({"root": shared / name}))
+
+
+def test_part_of_a_real_sequence(shared: Path) -> None:
+    capture = read(shared / "stage", frames="6:12")
+    assert (len(capture.splits["train"]), len(capture.splits["test"]), capture.warnings) == (48, 6, ())
+    assert sorted({view.time for view in capture.splits["test"]}) == pytest.approx([i / 5 for i in range(6)], abs=1e-4)

@@ -10,25 +10,31 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from moving_scene import Sliding, camera, moving_scene, still_scene, write_moving_run
 
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig
 from dyngs.config_io import RESOLVED_NAME, save_config
 from dyngs.conventions import RasterizeMode
 from dyngs.data.synthetic import StillOptions, write_still_capture
+from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.export.ply import SplatFile, read_ply, write_ply
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, render
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.view.frames import (
+    DEFAULT_OPTIONS,
     OutputOptions,
+    Shot,
     file_stems,
-    render_frames,
+    render_frame,
+    shot_frames,
     splat_options,
     write_path_frames,
     write_split,
 )
+from dyngs.view.paths import CameraPath, frozen_path
 from dyngs.view.video import read_frames
 
 
@@ -51,6 +57,14 @@ def cameras_around(count: int, width: int = 24, height: int = 18, distance: floa
         poses[i, 2, 3] = distance
     intrinsics = torch.tensor([[24.0, 0, width / 2], [0, 24, height / 2], [0, 0, 1]]).repeat(count, 1, 1)
     return Cameras(poses, intrinsics, width, height)
+
+
+def balls_shot(
+    cameras: Cameras, options: RenderOptions = DEFAULT_OPTIONS, background: torch.Tensor | None = None
+) -> Shot:
+    """The two balls seen by ``cameras``."""
+    scene = TrainedScene(two_balls(), torch.zeros(0, dtype=torch.long))
+    return Shot(scene, CameraPath(cameras), options, background)
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -78,7 +92,7 @@ def test_frames_are_the_renders_one_by_one() -> None:
     gaussians, cameras = two_balls(), cameras_around(3)
     options, background = RenderOptions(depth="expected"), torch.tensor([0.1, 0.2, 0.9])
     together = render(gaussians, cameras, options, background=background)
-    frames = list(render_frames(gaussians, cameras, options, background))
+    frames = list(shot_frames(balls_shot(cameras, options, background)))
     assert len(frames) == 3
     for i, frame in enumerate(frames):
         np.testing.assert_allclose(frame.rgb, together.rgb[i].clamp(0, 1), atol=1e-6)
@@ -92,30 +106,30 @@ def test_frames_are_the_renders_one_by_one() -> None:
     assert red[1] < 0.2
     assert frames[0].depth is not None
     assert abs(frames[0].depth[9, 9] - 4) < 0.01
-    assert next(render_frames(gaussians, cameras)).depth is None
+    assert next(shot_frames(balls_shot(cameras))).depth is None
 
 
 def test_frames_are_drawn_lazily() -> None:
-    frames = render_frames(two_balls(), cameras_around(3))
+    frames = shot_frames(balls_shot(cameras_around(3)))
     next(frames)
     frames.close()  # type: ignore[attr-defined]
 
 
 def test_path_writes_numbered_pictures(tmp_path) -> None:
-    written = write_path_frames(two_balls(), cameras_around(3), tmp_path / "out")
+    written = write_path_frames(balls_shot(cameras_around(3)), tmp_path / "out")
     assert names(tmp_path / "out") == ["frame_0000.png", "frame_0001.png", "frame_0002.png"]
     assert [p.name for p in written] == names(tmp_path / "out")
-    frame = next(render_frames(two_balls(), cameras_around(3)))
+    frame = next(shot_frames(balls_shot(cameras_around(3))))
     np.testing.assert_allclose(read_image(written[0]), frame.rgb, atol=0.5 / 255 + 1e-6)
 
 
 def test_path_writes_depth_alpha_and_video(tmp_path) -> None:
-    gaussians, cameras = two_balls(), cameras_around(4)
+    cameras = cameras_around(4)
     output = OutputOptions(depth=True, alpha=True, video=tmp_path / "v" / "path.mp4", fps=12)
-    written = write_path_frames(gaussians, cameras, tmp_path / "out", output=output)
+    written = write_path_frames(balls_shot(cameras), tmp_path / "out", output)
     assert len(written) == 4 * 4 + 1
     assert all(p.is_file() for p in written)
-    frame = next(render_frames(gaussians, cameras, RenderOptions(depth="expected")))
+    frame = next(shot_frames(balls_shot(cameras, RenderOptions(depth="expected"))))
     depth = read_image(tmp_path / "out" / "frame_0000_depth.exr")
     assert depth.shape == (18, 24, 1)
     np.testing.assert_array_equal(depth[..., 0], frame.depth)
@@ -130,15 +144,15 @@ def test_path_writes_depth_alpha_and_video(tmp_path) -> None:
 
 def test_path_to_a_video_alone(tmp_path) -> None:
     output = OutputOptions(video=tmp_path / "path.mp4", depth=True)
-    assert write_path_frames(two_balls(), cameras_around(2), None, output=output) == [tmp_path / "path.mp4"]
+    assert write_path_frames(balls_shot(cameras_around(2)), None, output) == [tmp_path / "path.mp4"]
     assert names(tmp_path) == ["path.mp4"]
 
 
 def test_path_with_nothing_to_do(tmp_path) -> None:
     with pytest.raises(DyngsError, match="nothing to write"):
-        write_path_frames(two_balls(), cameras_around(1), None)
+        write_path_frames(balls_shot(cameras_around(1)), None)
     with pytest.raises(DyngsError, match="no cameras"):
-        write_path_frames(two_balls(), cameras_around(0), tmp_path)
+        write_path_frames(balls_shot(cameras_around(0)), tmp_path)
 
 
 def test_depth_colours_share_one_range_along_a_path(tmp_path) -> None:
@@ -146,10 +160,45 @@ def test_depth_colours_share_one_range_along_a_path(tmp_path) -> None:
     near, far = cameras_around(1, distance=3.0), cameras_around(1, distance=6.0)
     poses = torch.cat([near.cam_from_world, far.cam_from_world])
     cameras = Cameras(poses, near.intrinsics.repeat(2, 1, 1), 24, 18)
-    write_path_frames(two_balls(), cameras, tmp_path, output=OutputOptions(depth=True))
+    write_path_frames(balls_shot(cameras), tmp_path, OutputOptions(depth=True))
     a, b = (read_image(tmp_path / f"frame_000{i}_depth.png") for i in range(2))
     assert a[9, 8, 0] > 3 * a[9, 8, 2]  # the near ball is red, the far one blue
     assert b[9, 10, 2] > b[9, 10, 0]
+
+
+def test_each_frame_shows_the_scene_at_its_time() -> None:
+    scene, times = moving_scene(Sliding()), (0.0, 0.3, 1.0)
+    frames = list(shot_frames(Shot(scene, frozen_path(camera(), times))))
+    for frame, time in zip(frames, times, strict=True):
+        np.testing.assert_array_equal(frame.rgb, render_frame(scene.at(time), camera()).rgb)
+    assert np.abs(frames[0].rgb - frames[2].rgb).max() > 0.1
+
+
+def test_equal_times_deform_once() -> None:
+    motion = Sliding()
+    shot = Shot(moving_scene(motion), frozen_path(camera(), (0.5, 0.5, 0.5, 0.7, 0.7)))
+    assert len(list(shot_frames(shot))) == 5
+    assert motion.calls == 2
+
+
+def test_what_never_moves_looks_the_same_at_all_times() -> None:
+    frames = list(shot_frames(Shot(still_scene(), frozen_path(camera(), (0.0, 0.5, 1.0)))))
+    assert all(np.array_equal(frame.rgb, frames[0].rgb) for frame in frames)
+
+
+def test_depth_of_a_moving_path_shares_one_range(tmp_path) -> None:
+    """Of 20 frames 8 are looked at beforehand, each at its own time."""
+    shot = Shot(moving_scene(Sliding()), frozen_path(camera(), np.linspace(0, 1, 20).tolist()))
+    written = write_path_frames(shot, tmp_path, OutputOptions(depth=True))
+    assert len(written) == 60
+
+
+def test_views_of_a_moving_run_are_drawn_at_their_own_times(tmp_path) -> None:
+    run_dir = write_moving_run(tmp_path, standing=True)
+    write_split(run_dir, "test", tmp_path / "out")
+    a, b, c = (read_image(tmp_path / "out" / f"r_00{i}.png") for i in range(3))
+    assert np.abs(a - b).max() > 10 / 255
+    assert np.abs(b - c).max() > 10 / 255
 
 
 def test_split_of_a_run(tmp_path) -> None:
@@ -177,8 +226,8 @@ def test_exported_file_is_drawn_like_the_run(tmp_path) -> None:
     splat = read_ply(write_ply(tmp_path / "a.ply", two_balls(), RasterizeMode.ANTIALIASED, eps2d=0.1))
     options = splat_options(splat)
     assert (options.mode, options.eps2d) == (RasterizeMode.ANTIALIASED, 0.1)
-    wanted = next(render_frames(two_balls(), cameras_around(1), options))
-    got = next(render_frames(splat.gaussians, cameras_around(1), options))
+    wanted = render_frame(two_balls(), cameras_around(1), options)
+    got = render_frame(splat.gaussians, cameras_around(1), options)
     np.testing.assert_array_equal(got.rgb, wanted.rgb)
     assert splat_options(SplatFile(two_balls())) == RenderOptions()
 

@@ -9,13 +9,26 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from moving_scene import TEST_TIMES, TRAIN_TIMES, write_moving_run
 
 from dyngs.camera import Cameras
+from dyngs.config import DataConfig
 from dyngs.conventions import RasterizeMode
+from dyngs.data.capture import Capture
+from dyngs.data.loader import PictureLoader
+from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.export.ply import write_ply
 from dyngs.gaussians import Gaussians
-from dyngs.view.shots import ShotOptions, resize_cameras, shot_of_ply
+from dyngs.view.paths import CameraPath, write_path
+from dyngs.view.shots import (
+    ShotOptions,
+    cameras_for_paths,
+    resize_cameras,
+    shot_of_ply,
+    shot_of_run,
+    view_to_show,
+)
 
 sizes = st.integers(1, 400)
 
@@ -50,21 +63,122 @@ def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) 
     shot = shot_of_ply(file, ShotOptions(path, num_frames=5, size=(80, 60), up=up))
     axis = np.zeros(3)
     axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
-    means = torch.cat([shot.gaussians.means, torch.ones(len(shot.gaussians), 1)], dim=1)
+    means = torch.cat([shot.scene.gaussians.means, torch.ones(len(shot.scene), 1)], dim=1)
     for i in range(5):
-        in_camera = (shot.cameras.cam_from_world[i] @ means.T).T[:, :3]
-        pixels = (shot.cameras.intrinsics[i] @ in_camera.T).T
+        in_camera = (shot.path.cameras.cam_from_world[i] @ means.T).T[:, :3]
+        pixels = (shot.path.cameras.intrinsics[i] @ in_camera.T).T
         pixels = pixels[:, :2] / pixels[:, 2:]
         inside = (in_camera[:, 2] > 0) & (pixels >= 0).all(dim=1) & (pixels <= torch.tensor([80, 60])).all(dim=1)
         assert inside.float().mean() > 0.9
-        picture_up = -shot.cameras.cam_from_world[i, 1, :3].numpy()
+        picture_up = -shot.path.cameras.cam_from_world[i, 1, :3].numpy()
         assert picture_up @ axis > 0.5
     assert shot.options.mode is RasterizeMode.ANTIALIASED
     assert shot.options.eps2d == 0.1
+    assert shot.background is not None
     assert torch.equal(shot.background, torch.zeros(3))
+    assert (shot.path.times, shot.notes) == (None, ())
+    assert shot.scene.is_still
 
 
 def test_an_unknown_path_is_named(tmp_path: Path) -> None:
     file = write_ply(tmp_path / "a.ply", some_gaussians())
     with pytest.raises(DyngsError, match="no camera path 'circle'"):
         shot_of_ply(file, ShotOptions("circle"))
+
+
+@pytest.mark.parametrize("options", [ShotOptions(times=(0.5,)), ShotOptions(None), ShotOptions(view="0")])
+def test_a_file_has_neither_times_nor_views(options: ShotOptions, tmp_path: Path) -> None:
+    file = write_ply(tmp_path / "a.ply", some_gaussians())
+    with pytest.raises(DyngsError, match=r"a \.ply holds one moment and no views"):
+        shot_of_ply(file, options)
+
+
+@pytest.fixture(scope="module")
+def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_moving_run(tmp_path_factory.mktemp("moving"))
+
+
+@pytest.fixture(scope="module")
+def still_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_moving_run(tmp_path_factory.mktemp("still"), moves=False)
+
+
+def capture_of(run_dir: Path) -> Capture:
+    return read_capture(DataConfig.model_validate({"root": run_dir.parent / "capture"}))
+
+
+@pytest.mark.parametrize("path", ["orbit", "spiral"])
+def test_time_runs_along_a_path_unless_told_otherwise(path: str, moving_run: Path, still_run: Path) -> None:
+    shot = shot_of_run(moving_run, ShotOptions(path, 5))
+    assert shot.path.times == (0.0, 0.25, 0.5, 0.75, 1.0)
+    assert len(shot.notes) == 1
+    assert "from 0 to 1" in shot.notes[0]
+    frozen = shot_of_run(moving_run, ShotOptions(path, 5, times=(0.4,)))
+    assert frozen.path.times == (0.4,) * 5
+    assert torch.equal(frozen.path.cameras.cam_from_world, shot.path.cameras.cam_from_world)
+    together = shot_of_run(moving_run, ShotOptions(path, 3, times=(1.0, 0.5, 0.0)))
+    assert together.path.times == (1.0, 0.5, 0.0)
+    assert (frozen.notes, together.notes) == ((), ())
+    still = shot_of_run(still_run, ShotOptions(path, 3))
+    assert (still.path.times, still.notes) == (None, ())
+
+
+def test_times_of_a_still_run_are_accepted_with_a_note(still_run: Path) -> None:
+    shot = shot_of_run(still_run, ShotOptions("orbit", 3, times=(0.0, 0.5, 1.0)))
+    assert len(shot.path) == 3
+    assert "nothing moves" in shot.notes[0]
+
+
+def test_times_outside_are_clamped_with_one_warning(moving_run: Path) -> None:
+    for options in (ShotOptions("orbit", 3, times=(-1.0, 0.5, 9.0)), ShotOptions(None, times=(-1.0, 0.5, 9.0))):
+        shot = shot_of_run(moving_run, options)
+        assert shot.path.times == (0.0, 0.5, 1.0)
+        assert len(shot.path.warnings) == 1
+        assert "clamped" in shot.path.warnings[0]
+
+
+def test_times_of_a_file_are_overridden(moving_run: Path, tmp_path: Path) -> None:
+    cameras = cameras_for_paths(capture_of(moving_run), DataConfig(root=moving_run.parent / "capture"))
+    file = tmp_path / "path.json"
+    write_path(file, CameraPath(cameras, 12.0, (0.1, 0.2, 0.3, 0.4, 0.5)))
+    own = shot_of_run(moving_run, ShotOptions(str(file)))
+    assert own.path.times == pytest.approx((0.1, 0.2, 0.3, 0.4, 0.5))
+    assert (own.path.fps, own.notes) == (12.0, ())
+    assert shot_of_run(moving_run, ShotOptions(str(file), times=(0.7,))).path.times == (0.7,) * 5
+    given = (0.0, 0.0, 1.0, 1.0, 0.5)
+    assert shot_of_run(moving_run, ShotOptions(str(file), times=given)).path.times == given
+    with pytest.raises(DyngsError, match="5 cameras, but there are 3 times"):
+        shot_of_run(moving_run, ShotOptions(str(file), times=(0.0, 0.5, 1.0)))
+
+
+def test_a_camera_that_stands_still(moving_run: Path) -> None:
+    capture = capture_of(moving_run)
+    wanted = PictureLoader(capture.splits["test"], DataConfig(root=capture.root))[1]
+    shot = shot_of_run(moving_run, ShotOptions(None, times=(0.0, 0.5, 1.0), view="1"))
+    assert shot.path.times == (0.0, 0.5, 1.0)
+    assert (shot.path.cameras.width, shot.path.cameras.height) == (16, 16)
+    for i in range(3):
+        torch.testing.assert_close(shot.path.cameras.cam_from_world[i], wanted.cameras.cam_from_world[0])
+        torch.testing.assert_close(shot.path.cameras.intrinsics[i], wanted.cameras.intrinsics[0])
+    assert shot_of_run(moving_run, ShotOptions(None, view="1")).path.times == (TEST_TIMES[1],)
+    assert shot_of_run(moving_run, ShotOptions(None, split="train", view="1")).path.times == (TRAIN_TIMES[1],)
+    small = shot_of_run(moving_run, ShotOptions(None, times=(0.5,), size=(8, 4))).path.cameras
+    assert (len(small), small.width, small.height) == (1, 8, 4)
+
+
+def test_views_are_found_by_name_picture_and_number(moving_run: Path) -> None:
+    capture = capture_of(moving_run)
+    test, train = capture.splits["test"], capture.splits["train"]
+    assert view_to_show(capture) is test[0]
+    assert view_to_show(capture, test[2].name) is test[2]
+    assert view_to_show(capture, "r_002") is test[2]
+    assert view_to_show(capture, "2") is test[2]
+    assert view_to_show(capture, train[3].name) is train[3]  # no split given: names are looked for in all
+    assert view_to_show(capture, "r_004") is train[4]
+    assert view_to_show(capture, "4", "train") is train[4]
+    assert view_to_show(capture.replace(splits={"train": train, "test": ()})) is train[0]
+    for name, split in (("9", None), ("r_9", None), ("-1", None), (train[0].name, "test")):
+        with pytest.raises(DyngsError, match=rf"no view '{name}'; the split test has 3 views: .*\(0\) to .*\(2\)"):
+            view_to_show(capture, name, split)
+    with pytest.raises(DyngsError, match="'val' has no views"):
+        view_to_show(capture, None, "val")

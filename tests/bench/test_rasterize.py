@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.bench import STAGES, bench_rasterize, format_report, garden_workload, random_workload, write_report
+from dyngs.bench.rasterize import STAGES, bench_rasterize, format_report, garden_workload, random_workload, write_report
 from dyngs.cli import main
 from dyngs.errors import DyngsError
 from dyngs.ops.projection import ProjectionOptions

@@ -1,0 +1,194 @@
+"""What a deformation field costs in training, and what the static split saves."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from dyngs.config import Config, DataConfig, DynamicModel, RandomInit
+from dyngs.data.synthetic import DynamicOptions, write_dynamic_capture
+from dyngs.data.write import write_text
+from dyngs.deform.field import FieldSetup
+from dyngs.deform.fields import new_field
+from dyngs.deform.model import DynamicScene
+from dyngs.errors import DyngsError
+from dyngs.ops.native import active_isa, kernel_threads
+from dyngs.train.assemble import assemble
+from dyngs.train.checkpoint import latest_checkpoint, load_run
+from dyngs.train.step import Trainer
+
+VARIANTS = ("nothing moves", "what moves, moves", "everything moves")
+STEPS_PER_ROUND = 5
+FIELD_STAGES = ("field forward", "field backward", "field penalties", "field Adam")
+
+
+@dataclass(frozen=True)
+class DeformLoad:
+    """What is measured: a configuration, and which of its Gaussians move.
+
+    Attributes:
+        config: of a dynamic model.
+        run_dir: start from this run's checkpoint; None = untrained Gaussians.
+        moving_share: of an untrained load.
+    """
+
+    config: Config
+    run_dir: Path | None = None
+    moving_share: float = 0.1
+
+
+@dataclass(frozen=True)
+class DeformReport:
+    """Medians, milliseconds, of whole training steps taken in turn, and of the field's own stages.
+
+    Attributes:
+        steps: variant to the time of a step.
+        stages: stage to its time for the moving Gaussians alone.
+        field_share: of a step in which what moves, moves.
+    """
+
+    isa: str
+    threads: int
+    kind: str
+    num_gaussians: int
+    num_moving: int
+    steps: dict[str, float]
+    stages: dict[str, float]
+
+    @property
+    def field_share(self) -> float:
+        moving, still = self.steps[VARIANTS[1]], self.steps[VARIANTS[0]]
+        return max(0.0, 1 - still / moving)
+
+
+def load_of_run(run_dir: Path) -> DeformLoad:
+    """The load of a trained dynamic run. Raises DyngsError if it has no field."""
+    run = load_run(run_dir)
+    if not isinstance(run.config.model, DynamicModel) or run.scene.is_still:
+        raise DyngsError(f"{run_dir}: nothing moves in this run; give one of a dynamic model, or none")
+    return DeformLoad(run.config, run_dir)
+
+
+def synthetic_load(folder: Path, num_gaussians: int, moving_share: float, kind: str) -> DeformLoad:
+    """A load without a run: random Gaussians before a small room, which is written into ``folder``."""
+    write_dynamic_capture("room", folder, DynamicOptions(size=200, num_times=4, num_cameras=3, samples=1))
+    config = Config.model_validate(
+        {
+            "data": DataConfig(root=folder),
+            "model": {"kind": "dynamic", "deform": {"kind": kind}},
+            "init": RandomInit(num_random=num_gaussians),
+        }
+    )
+    return DeformLoad(config, None, moving_share)
+
+
+def bench_deform(load: DeformLoad, threads: int, rounds: int) -> DeformReport:
+    """Step times of the three variants, taken in turn so that noise hits them alike.
+
+    Raises:
+        DyngsError: the run's capture is gone.
+    """
+    with kernel_threads(threads):
+        trainers = {name: _trainer(load, name) for name in VARIANTS}
+        samples: dict[str, list[float]] = {name: [] for name in VARIANTS}
+        for number in range(rounds + 1):
+            for name, trainer in trainers.items():
+                for _ in range(STEPS_PER_ROUND):
+                    seconds = _seconds(trainer.step)
+                    if number:  # the first round warms up
+                        samples[name].append(seconds)
+        trainer = trainers[VARIANTS[1]]
+        num_gaussians = len(trainer.optimizer.parameters)
+        return DeformReport(
+            isa=active_isa(),
+            threads=threads,
+            kind=_options(load.config).deform.kind,
+            num_gaussians=num_gaussians,
+            num_moving=trainer.model.num_moving(num_gaussians),
+            steps={name: 1e3 * statistics.median(samples[name]) for name in VARIANTS},
+            stages=_field_stages(trainer, rounds),
+        )
+
+
+def format_report(report: DeformReport) -> str:
+    """The report as text."""
+    share = report.num_moving / max(report.num_gaussians, 1)
+    lines = [
+        f"{report.kind}: {report.num_gaussians:,} Gaussians, {report.num_moving:,} ({share:.1%}) move; "
+        f"{report.threads} thread(s), instruction set {report.isa}",
+        f"{'training step':<24}{'median ms':>10}{'steps/s':>10}",
+    ]
+    lines += [f"{name:<24}{ms:10.2f}{1e3 / ms:10.1f}" for name, ms in report.steps.items()]
+    lines += [f"{name:<24}{ms:10.2f}" for name, ms in report.stages.items()]
+    faster = report.steps[VARIANTS[2]] / report.steps[VARIANTS[1]]
+    lines.append(f"the field takes {report.field_share:.0%} of a step; the static split makes steps {faster:.2f}x faster")
+    return "\n".join(lines)
+
+
+def write_report(report: DeformReport, path: Path) -> None:
+    """Write the figures as JSON."""
+    write_text(path, json.dumps(asdict(report) | {"field_share": report.field_share}, indent=2) + "\n")
+
+
+def _options(config: Config) -> DynamicModel:
+    if not isinstance(config.model, DynamicModel):
+        raise DyngsError("bench deform needs model.kind=dynamic")
+    return config.model
+
+
+def _trainer(load: DeformLoad, variant: str) -> Trainer:
+    """A trainer at the end of its run, its schedules over, in which the right Gaussians move."""
+    trainer = assemble(load.config)
+    model = trainer.model
+    if not isinstance(model, DynamicScene):
+        raise DyngsError(f"{load.config.data.root}: a capture without times; nothing can move in it")
+    if load.run_dir is not None:
+        trainer.restore(latest_checkpoint(load.run_dir))
+    trainer.done = load.config.train.steps
+    rows = model.rows
+    if load.run_dir is None:
+        num_gaussians = len(trainer.optimizer.parameters)
+        rows = torch.arange(round(load.moving_share * num_gaussians))
+    if variant == VARIANTS[0]:
+        model.field = None
+    elif variant == VARIANTS[2] or rows is None or load.run_dir is None:
+        model.rows = None if variant == VARIANTS[2] else rows
+        moving = len(trainer.optimizer.parameters) if model.rows is None else len(model.rows)
+        setup = FieldSetup(torch.zeros(3), torch.ones(3), len(model.times), moving, trainer.extent)
+        model.field = new_field(_options(load.config).deform, setup, torch.Generator().manual_seed(0))
+    return trainer
+
+
+def _field_stages(trainer: Trainer, rounds: int) -> dict[str, float]:
+    """Milliseconds of the field's own stages."""
+    model = trainer.model
+    if not isinstance(model, DynamicScene) or model.field is None:
+        return dict.fromkeys(FIELD_STAGES, 0.0)
+    field = model.field
+    means = trainer.optimizer.parameters.means.detach()
+    means = means if model.rows is None else means[model.rows]
+    samples: dict[str, list[float]] = {name: [] for name in FIELD_STAGES}
+    for number in range(rounds + 1):
+        start = time.perf_counter()
+        offsets = field.offsets(means, 0.37)
+        outputs = [x for x in vars(offsets).values() if x is not None]
+        forward = time.perf_counter() - start
+        backward = _seconds(lambda o=outputs: torch.autograd.backward(o, [torch.ones_like(x) for x in o]))
+        penalty = _seconds(lambda: [p.backward() for p in field.penalties().values()])
+        adam = _seconds(lambda: field.learned.step(10**6, 1.0))
+        if number:
+            for name, seconds in zip(FIELD_STAGES, (forward, backward, penalty, adam), strict=True):
+                samples[name].append(seconds)
+    return {name: 1e3 * statistics.median(values) for name, values in samples.items()}
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start

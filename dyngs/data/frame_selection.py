@@ -1,0 +1,79 @@
+"""Part of a sequence: ``data.frames`` as a Python slice over the capture's times."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from dyngs.data.capture import Split, View
+from dyngs.errors import DyngsError
+
+Splits = dict[Split, tuple[View, ...]]
+
+SAME_TIME = 1e-6
+"""Times in [0, 1] that lie no farther apart are one time (files of one capture are often rounded differently)."""
+
+
+def parse_frames(text: str) -> slice:
+    """The slice that ``text`` writes: ``start:stop`` or ``start:stop:step``, whole numbers, each of which may lack.
+
+    Raises:
+        DyngsError: anything else, or a step of 0.
+    """
+    if not re.fullmatch(r"\s*([-+]?\d+)?\s*:\s*([-+]?\d+)?\s*(:\s*([-+]?\d+)?\s*)?", text, re.ASCII):
+        raise DyngsError(f"data.frames={text!r}: write start:stop or start:stop:step in whole numbers, such as 0:100:2")
+    numbers = [int(part) if part.strip() else None for part in text.split(":")]
+    if len(numbers) == 3 and numbers[2] == 0:
+        raise DyngsError(f"data.frames={text!r}: the step must not be 0")
+    return slice(*numbers)
+
+
+def select_frames(root: Path, splits: Splits, frames: str) -> Splits:
+    """The views whose time the slice ``frames`` picks from all distinct times of all splits, in order.
+
+    The first time picked becomes 0 and the last one 1; a single one becomes 0.
+
+    Args:
+        root: the capture, for messages.
+        splits: every view with a time in [0, 1], or none with one.
+        frames: see ``parse_frames``.
+
+    Raises:
+        DyngsError: a bad slice, one that picks nothing or nothing to train on, or views without times.
+    """
+    part = parse_frames(frames)
+    views = [view for kept in splits.values() for view in kept]
+    if any(view.time is None for view in views):
+        raise DyngsError(f"{root}: data.frames={frames} picks times, but the capture has none; remove data.frames")
+    distinct = distinct_times(views)
+    times = sorted(set(distinct.values()))
+    picked = sorted(times[part])
+    if not picked:
+        raise DyngsError(f"{root}: data.frames={frames} picks none of the capture's {len(times)} times")
+    span = picked[-1] - picked[0]
+    new = {time: (time - picked[0]) / span if span else 0.0 for time in picked}
+    unit = {written: new[time] for written, time in distinct.items() if time in new}
+    selected: Splits = {
+        name: tuple(replace(view, time=unit[view.time]) for view in kept if view.time in unit)
+        for name, kept in splits.items()
+    }
+    if splits.get("train") and not selected["train"]:
+        raise DyngsError(
+            f"{root}: data.frames={frames} picks {len(picked)} of {len(times)} times, none of them with training views"
+        )
+    return selected
+
+
+def distinct_times(views: Iterable[View]) -> dict[float, float]:
+    """Every time that a view has, to the first of those that count as the same time."""
+    distinct: dict[float, float] = {}
+    before = first = -math.inf
+    for time in sorted({view.time for view in views if view.time is not None}):
+        if time - before > SAME_TIME:
+            first = time
+        distinct[time] = first
+        before = time
+    return distinct

@@ -1,0 +1,338 @@
+"""A small ray tracer in numpy: painted balls, boxes and waving sheets under a soft lamp and the sky.
+
+It shares no formula with the rasterizer, so that its pictures are an independent ground truth. A scene is a tuple of
+primitives; a scene that moves is a function from time to such a tuple.
+
+Local letters: R rays (or points on surfaces), S samples per pixel side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+CAMERA_ANGLE_X = 0.6911112070083618
+"""Horizontal field of view of the NeRF-synthetic scenes, radians."""
+
+Paint = Callable[[np.ndarray], np.ndarray]
+"""Local surface points (R, 3), scaled so that the primitive spans [-1, 1], to linear albedo (R, 3)."""
+
+_MARCH_STEPS = 40
+_BISECTIONS = 18
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A ball.
+
+    Attributes:
+        center: world units.
+        radius: world units.
+        paint: of its surface.
+        gloss: strength of its highlight.
+        turn: (3, 3) rotation that takes the paint's axes to the world's.
+    """
+
+    center: tuple[float, float, float]
+    radius: float
+    paint: Paint
+    gloss: float = 0.25
+    turn: np.ndarray = field(default_factory=lambda: np.eye(3, dtype=np.float32), repr=False, compare=False)
+
+    def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """(R,) distances along unit ``directions`` from ``origins`` (R, 3), inf where the ray misses."""
+        offset = origins - _f32(self.center)
+        half_b = _dot(offset, directions)
+        discriminant = half_b**2 - _dot(offset, offset) + self.radius**2
+        distance = -half_b - np.sqrt(np.maximum(discriminant, 0.0))
+        return np.where((discriminant > 0) & (distance > 1e-4), distance, np.float32(np.inf))
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """(R, 3) surface points in the paint's axes."""
+        return self.normals(points) @ _f32(self.turn)
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """(R, 3) unit normals at surface points."""
+        return (points - _f32(self.center)) / np.float32(self.radius)
+
+    def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(R,) share of the cosine-weighted sky that the ball hides: the form factor of a sphere."""
+        offset = _f32(self.center) - points
+        distance = np.sqrt(np.maximum(_dot(offset, offset), 1e-12))
+        cosine = np.maximum(_dot(normals, offset) / distance, 0.0)
+        return cosine * np.minimum(self.radius / distance, 1.0) ** 2
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box turned by ``yaw`` radians about the vertical."""
+
+    center: tuple[float, float, float]
+    half_extents: tuple[float, float, float]
+    paint: Paint
+    yaw: float = 0.0
+    gloss: float = 0.1
+
+    def _axes(self) -> np.ndarray:
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
+
+    def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """(R,) distances along unit ``directions`` from ``origins`` (R, 3), inf where the ray misses."""
+        start = (origins - _f32(self.center)) @ self._axes().T
+        towards = directions @ self._axes().T
+        enter, leave = _through_box(start, towards, _f32(self.half_extents))
+        return np.where((enter < leave) & (enter > 1e-4), enter, np.float32(np.inf))
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """(R, 3) surface points in the box's axes, each divided by the half extent."""
+        turned = (points - _f32(self.center)) @ self._axes().T
+        return turned / _f32(self.half_extents)
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """(R, 3) unit normals at surface points."""
+        local = self.local(points)
+        face = np.abs(local).argmax(axis=1)
+        side = np.sign(np.take_along_axis(local, face[:, None], axis=1)).astype(np.float32)
+        return side * self._axes()[face]
+
+    def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(R,) share of the sky hidden, as by a ball that fills the box."""
+        return Sphere(self.center, min(self.half_extents), self.paint).occlusion(points, normals)
+
+
+@dataclass(frozen=True)
+class Wave:
+    """A plane wave ``amplitude * sin(wave_vector . (u, v) + phase)``; ``wave_vector`` in radians per world unit."""
+
+    amplitude: float
+    wave_vector: tuple[float, float]
+    phase: float = 0.0
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A thin cloth, seen from both sides: its material point (u, v) lies at ``center + (u, v, height(u, v))``.
+
+    Attributes:
+        center: of the cloth at rest.
+        half_extents: of the rectangle of (u, v).
+        waves: their sum is the height; moving their phases moves the cloth, while its paint keeps to (u, v).
+        paint: gets (u, v, 0) divided by the half extents.
+        gloss: strength of its highlight.
+    """
+
+    center: tuple[float, float, float]
+    half_extents: tuple[float, float]
+    waves: tuple[Wave, ...]
+    paint: Paint
+    gloss: float = 0.05
+
+    def height(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """(R,) world units above ``center``."""
+        total = np.zeros(np.broadcast(u, v).shape, np.float32)
+        for wave in self.waves:
+            ku, kv = _f32(wave.wave_vector)
+            total += np.float32(wave.amplitude) * np.sin(ku * u + kv * v + np.float32(wave.phase))
+        return total
+
+    def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """(R,) distances along unit ``directions`` from ``origins`` (R, 3), inf where the ray misses.
+
+        Marches through the cloth's bounding box until the ray changes sides, then bisects.
+        """
+        start = np.broadcast_to(origins - _f32(self.center), directions.shape)
+        bound = _f32([*self.half_extents, sum(abs(wave.amplitude) for wave in self.waves) + 1e-3])
+        enter, leave = _through_box(start, directions, bound)
+        enter = np.maximum(enter, np.float32(1e-4))
+        distances = np.full(len(directions), np.inf, np.float32)
+        inside = np.flatnonzero(enter < leave)
+        if len(inside):
+            distances[inside] = self._crossing(start[inside], directions[inside], enter[inside], leave[inside])
+        return distances
+
+    def _crossing(self, start: np.ndarray, directions: np.ndarray, enter: np.ndarray, leave: np.ndarray) -> np.ndarray:
+        """(R,) first distance between ``enter`` and ``leave`` at which the ray pierces the cloth, or inf."""
+
+        def is_above(rays: np.ndarray, distance: np.ndarray) -> np.ndarray:
+            x, y, z = (start[rays, axis] + distance * directions[rays, axis] for axis in range(3))
+            return z > self.height(x, y)
+
+        step = (leave - enter) / np.float32(_MARCH_STEPS)
+        pending = np.arange(len(start))
+        first_side = is_above(pending, enter)
+        far = np.full(len(start), np.inf, np.float32)
+        for k in range(1, _MARCH_STEPS + 1):
+            distance = enter[pending] + np.float32(k) * step[pending]
+            crossed = is_above(pending, distance) != first_side[pending]
+            far[pending[crossed]] = distance[crossed]
+            pending = pending[~crossed]
+        hit = np.flatnonzero(np.isfinite(far))
+        high, low = far[hit], far[hit] - step[hit]
+        for _ in range(_BISECTIONS):
+            middle = np.float32(0.5) * (low + high)
+            before = is_above(hit, middle) == first_side[hit]
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        far[hit] = high
+        return far
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """(R, 3) material coordinates (u, v, 0), each divided by the half extent."""
+        flat = (points - _f32(self.center))[:, :2] / _f32(self.half_extents)
+        return np.concatenate([flat, np.zeros_like(flat[:, :1])], axis=1)
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """(R, 3) unit normals of the upper side at surface points."""
+        u, v, _ = (points - _f32(self.center)).T
+        normals = np.stack([np.zeros_like(u), np.zeros_like(u), np.ones_like(u)], axis=-1)
+        for wave in self.waves:
+            ku, kv = _f32(wave.wave_vector)
+            slope = np.float32(wave.amplitude) * np.cos(ku * u + kv * v + np.float32(wave.phase))
+            normals[:, 0] -= slope * ku
+            normals[:, 1] -= slope * kv
+        return _unit(normals)
+
+    def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(R,) share of the sky hidden: the form factor, for a point on its axis, of a level disk of equal area."""
+        offset = _f32(self.center) - points
+        squared = np.maximum(_dot(offset, offset), 1e-12)
+        cosines = np.maximum(_dot(normals, offset), 0.0) * np.abs(offset[:, 2]) / squared
+        spread = np.float32(4.0 * self.half_extents[0] * self.half_extents[1] / np.pi)
+        return cosines * spread / (squared + spread)
+
+
+Primitive = Sphere | Box | Sheet
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Primitives, z up, lit by a sky and one square lamp.
+
+    Attributes:
+        primitives: what there is.
+        lamp: centre of the lamp.
+        lamp_size: side of the lamp, world units; it softens the shadows.
+        faint: a neighbour that hides no more than this share of a point's sky hides nothing, which leaves what is far
+            from a moving thing exactly as it is.
+    """
+
+    primitives: tuple[Primitive, ...]
+    lamp: tuple[float, float, float] = (2.2, -2.6, 4.4)
+    lamp_size: float = 0.9
+    faint: float = 0.0
+    _sky: tuple[float, float, float] = field(default=(0.46, 0.50, 0.56), repr=False)
+    _ground: tuple[float, float, float] = field(default=(0.20, 0.17, 0.15), repr=False)
+    _lamplight: tuple[float, float, float] = field(default=(0.80, 0.74, 0.66), repr=False)
+
+
+def render_scene(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3) -> np.ndarray:
+    """(size, size, 4) uint8 picture: sRGB with straight alpha, transparent background.
+
+    Sample (a, b) of every pixel sees the lamp at place (a, b) of its grid, so shadows are soft and agree between views.
+
+    Args:
+        scene: what to draw.
+        world_from_cam: (4, 4) OpenGL camera-to-world pose.
+        size: width and height in pixels; the field of view is ``CAMERA_ANGLE_X``.
+        samples: S, per pixel side.
+    """
+    color = np.zeros((size * size, 3), np.float32)
+    hits = np.zeros(size * size, np.float32)
+    lamps = scene.lamp_size * ((np.arange(samples) + 0.5) / samples - 0.5)
+    origin = world_from_cam[:3, 3].astype(np.float32)
+    for a in range(samples):
+        for b in range(samples):
+            directions = _pixel_rays(world_from_cam, size, (a + 0.5) / samples, (b + 0.5) / samples)
+            lamp = _f32(scene.lamp) + _f32([lamps[a], lamps[b], 0.0])
+            hit, rgb = _trace(scene, origin, directions, lamp)
+            color[hit] += rgb
+            hits[hit] += 1.0
+    straight = color / np.maximum(hits, 1.0)[:, None]
+    rgba = np.concatenate([straight, hits[:, None] / samples**2], axis=1)
+    return (rgba * 255.0 + 0.5).astype(np.uint8).reshape(size, size, 4)
+
+
+def _trace(scene: Scene, origin: np.ndarray, directions: np.ndarray, lamp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the rays that hit something, and what they see there: (R_hit,), sRGB (R_hit, 3)."""
+    distances = np.stack([p.intersect(origin[None], directions) for p in scene.primitives])
+    nearest = distances.argmin(axis=0)
+    distance = distances.min(axis=0)
+    hit = np.flatnonzero(np.isfinite(distance))
+    nearest, directions = nearest[hit], directions[hit]
+    points = origin + distance[hit, None] * directions
+    rgb = np.zeros((len(hit), 3), np.float32)
+    for index, primitive in enumerate(scene.primitives):
+        here = np.flatnonzero(nearest == index)
+        if len(here):
+            rgb[here] = _shade(scene, primitive, points[here], directions[here], lamp)
+    return hit, _srgb(rgb)
+
+
+def _shade(
+    scene: Scene, primitive: Primitive, points: np.ndarray, directions: np.ndarray, lamp: np.ndarray
+) -> np.ndarray:
+    """(R, 3) linear radiance: sky light less what neighbours hide, Lambert and Blinn-Phong light of the lamp."""
+    normals = primitive.normals(points)
+    if isinstance(primitive, Sheet):  # its upper side, whichever is seen
+        normals = np.where(_dot(normals, directions)[:, None] > 0, -normals, normals)
+    to_lamp = _unit(lamp - points)
+    facing = np.maximum(_dot(normals, to_lamp), 0.0)
+    lit = facing > 0
+    above = points + 2e-3 * normals
+    open_sky = np.ones(len(points), np.float32)
+    for other in scene.primitives:
+        if other is primitive:
+            continue
+        hidden = np.maximum(other.occlusion(points, normals) - scene.faint, 0.0) / (1.0 - scene.faint)
+        open_sky *= 1.0 - hidden
+        seen = np.flatnonzero(lit)
+        lit[seen] = np.isinf(other.intersect(above[seen], to_lamp[seen]))
+    upward = (0.5 + 0.5 * normals[:, 2:]).astype(np.float32)
+    ambient = upward * _f32(scene._sky) + (1 - upward) * _f32(scene._ground)
+    direct = np.where(lit, 1.0, 0.0)[:, None] * _f32(scene._lamplight)
+    rgb = primitive.paint(primitive.local(points)) * (ambient * open_sky[:, None] + direct * facing[:, None])
+    if primitive.gloss == 0:
+        return rgb
+    shine = np.maximum(_dot(normals, _unit(to_lamp - directions)), 0.0) ** 60 * primitive.gloss
+    return rgb + direct * shine[:, None]
+
+
+def _pixel_rays(world_from_cam: np.ndarray, size: int, sub_x: float, sub_y: float) -> np.ndarray:
+    """(size * size, 3) float32 unit directions in the world through one place of every pixel, row by row."""
+    focal = 0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X)
+    x = (np.arange(size) + sub_x - 0.5 * size) / focal
+    y = (np.arange(size) + sub_y - 0.5 * size) / focal
+    grid_x, grid_y = np.meshgrid(x, y)
+    local = np.stack([grid_x, -grid_y, -np.ones_like(grid_x)], axis=-1).reshape(-1, 3)
+    return _unit(local @ world_from_cam[:3, :3].T).astype(np.float32)
+
+
+def _through_box(start: np.ndarray, directions: np.ndarray, bound: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances (R,) at which rays enter and leave the box of half extents ``bound`` (3,); enter > leave: a miss."""
+    inverse = 1.0 / np.where(np.abs(directions) < 1e-9, np.float32(1e-9), directions)
+    reach = np.abs(inverse) * bound
+    middle = -start * inverse
+    x, y, z = (middle - reach).T
+    enter = np.maximum(np.maximum(x, y), z)
+    x, y, z = (middle + reach).T
+    return enter, np.minimum(np.minimum(x, y), z)
+
+
+def _f32(values: Sequence[float] | np.ndarray) -> np.ndarray:
+    return np.asarray(values, np.float32)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("...i,...i->...", a, b)
+
+
+def _unit(a: np.ndarray) -> np.ndarray:
+    return a / np.sqrt(_dot(a, a))[..., None]
+
+
+def _srgb(linear: np.ndarray) -> np.ndarray:
+    """Linear light to display values in [0, 1] (IEC 61966-2-1)."""
+    x = np.clip(linear, 0.0, 1.0)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-6), 1 / 2.4) - 0.055)

@@ -1,0 +1,112 @@
+"""Checks of the times of views, and bringing them to [0, 1]. Their order in the files does not matter."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+from dyngs.data.capture import Split, View
+from dyngs.errors import DyngsError
+
+Splits = dict[Split, tuple[View, ...]]
+
+_MAX_NAMED = 5
+
+
+def unit_times(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
+    """The splits with times in [0, 1], shifted and scaled over all splits where one lies outside, and warnings.
+
+    Times that are all equal are left as they are, see ``still_if_constant``.
+
+    Raises:
+        DyngsError: a time that is no finite number, or some views with and some without a time; names the view.
+    """
+    views = _all(splits)
+    for view in views:
+        number = view.time is None or (isinstance(view.time, (int, float)) and not isinstance(view.time, bool))
+        if not number or (view.time is not None and not math.isfinite(view.time)):
+            raise DyngsError(f"{root}: the time of {view.name} must be a finite number, got {view.time!r:.40}")
+    timed = [view.time for view in views if view.time is not None]
+    if not timed:
+        return splits, []
+    if len(timed) < len(views):
+        untimed = next(view.name for view in views if view.time is None)
+        raise DyngsError(f"{root}: {untimed} has no time although other pictures have; give time for all or none")
+    first, last = min(timed), max(timed)
+    if (first >= 0 and last <= 1) or first == last:
+        return splits, []
+    scaled: Splits = {
+        name: tuple(replace(view, time=((view.time or 0.0) - first) / (last - first)) for view in kept)
+        for name, kept in splits.items()
+    }
+    return scaled, [f"times run from {first:g} to {last:g} and were scaled to [0, 1]"]
+
+
+def still_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
+    """The splits without times, and a warning, if several pictures all have one time; a lone one is kept in [0, 1]."""
+    times = {view.time for view in _all(splits)}
+    if len(times) != 1 or times == {None}:
+        return splits, []
+    time = times.pop() or 0.0
+    if len(_all(splits)) == 1:
+        return _with_time(splits, time if 0 <= time <= 1 else 0.0), []
+    return _with_time(splits, None), [f"all pictures have time {time:g}: treated as a still scene"]
+
+
+def sequence_warnings(splits: Splits) -> list[str]:
+    """What is suspicious about cameras and times: pictures that only differ by chance, cameras that lack frames."""
+    views = [view for view in _all(splits) if view.time is not None]
+    return [*_repeated(views), *_frame_counts(views)]
+
+
+def _repeated(views: list[View]) -> list[str]:
+    """One camera, one pose, one time, but several pictures."""
+    pictures: defaultdict[tuple[int, float | None, bytes], dict[Path, View]] = defaultdict(dict)
+    for view in views:
+        pictures[view.camera_id, view.time, view.cam_from_world.round(9).tobytes()].setdefault(view.image_path, view)
+    doubled = [list(same.values()) for same in pictures.values() if len(same) > 1]
+    if not doubled:
+        return []
+    first, second = doubled[0][:2]
+    return [
+        f"{sum(map(len, doubled))} pictures share camera, pose and time with another one, first {first.name} and "
+        f"{second.name} at time {first.time:g}; are their times right?"
+    ]
+
+
+def _frame_counts(views: list[View]) -> list[str]:
+    cameras: defaultdict[int, list[View]] = defaultdict(list)
+    for view in views:
+        cameras[view.camera_id].append(view)
+    counts = {camera: len({view.image_path for view in seen}) for camera, seen in cameras.items()}
+    if len(set(counts.values())) < 2 or max(counts.values()) < 2:
+        return []
+    usual = max(Counter(counts.values()).items(), key=lambda item: (item[1], item[0]))[0]
+    odd = [camera for camera in sorted(counts) if counts[camera] != usual]
+    labels = _camera_labels(cameras)
+    named = ", ".join(f"{labels[camera]} has {counts[camera]}" for camera in odd[:_MAX_NAMED])
+    more = f" ({len(odd) - _MAX_NAMED} more cameras differ)" if len(odd) > _MAX_NAMED else ""
+    return [f"cameras have different numbers of frames: {named} frames, others {usual}{more}"]
+
+
+def _camera_labels(cameras: dict[int, list[View]]) -> dict[int, str]:
+    """Each camera's folder if it has one of its own, else its number."""
+    folders = {camera: {view.name.rpartition("/")[0] for view in seen} for camera, seen in cameras.items()}
+    firsts = {camera: min(names) for camera, names in folders.items()}
+    own = Counter(firsts.values())
+    return {
+        camera: firsts[camera]
+        if len(folders[camera]) == 1 and own[firsts[camera]] == 1 and firsts[camera]
+        else f"camera {camera}"
+        for camera in cameras
+    }
+
+
+def _all(splits: Splits) -> list[View]:
+    return [view for kept in splits.values() for view in kept]
+
+
+def _with_time(splits: Splits, time: float | None) -> Splits:
+    return {name: tuple(replace(view, time=time) for view in kept) for name, kept in splits.items()}

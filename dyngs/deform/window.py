@@ -1,0 +1,54 @@
+"""The part of a clip that training sees: it starts around the middle and grows until it is all.
+
+Motion over a whole clip may be far larger than the thing that moves. From the few pictures around one moment a sharp
+canonical form can be had, and a field that has followed it so far needs little to follow it a little farther.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+MIN_VIEWS = 12
+MIDDLE = 0.5
+
+
+@dataclass(frozen=True)
+class TimeWindow:
+    """Which times are trained on at a step.
+
+    Attributes:
+        strays: |time - 0.5| of all training views, ascending.
+        first: views in the window at the start, as a share of all.
+        opens, full: steps between which the window grows evenly, in views, to all of them.
+    """
+
+    strays: tuple[float, ...]
+    first: float
+    opens: int
+    full: int
+
+    @staticmethod
+    def around_middle(times: Sequence[float], first: float, opens: int, full: int) -> TimeWindow:
+        """The window over the times of all training views."""
+        return TimeWindow(tuple(sorted(abs(time - MIDDLE) for time in times)), first, opens, full)
+
+    def reach(self, step: int) -> float:
+        """Largest |time - 0.5| in the window at ``step``; 0.5 once it is full."""
+        start = min(len(self.strays), max(MIN_VIEWS, math.ceil(self.first * len(self.strays))))
+        progress = (step - self.opens) / max(self.full - self.opens, 1)
+        if progress >= 1 or start == len(self.strays):
+            return MIDDLE
+        count = start + int(max(progress, 0.0) * (len(self.strays) - start))
+        return self.strays[count - 1]
+
+    def bounds(self, step: int) -> tuple[float, float]:
+        """First and last time in the window at ``step``; [0, 1] once it is full."""
+        reach = self.reach(step)
+        return MIDDLE - reach, MIDDLE + reach
+
+    def holds(self, time: float, step: int) -> bool:
+        """Whether ``time`` is trained on at ``step``."""
+        # Not by ``bounds``: their rounding may shut out the very times that the window ends with.
+        return abs(time - MIDDLE) <= self.reach(step)

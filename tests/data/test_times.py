@@ -1,0 +1,115 @@
+"""Checks of times, one fault at a time."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_captures import opengl_pose
+
+from dyngs.data.capture import Split, View
+from dyngs.data.times import sequence_warnings, still_if_constant, unit_times
+from dyngs.errors import DyngsError
+
+ROOT = Path("capture")
+
+
+def view(name: str, time: object, camera: int = 0, pose: np.ndarray | None = None) -> View:
+    place = opengl_pose(float(camera)) if pose is None else pose
+    return View(name, ROOT / f"{name}.png", place, np.eye(3), 4, 4, camera_id=camera, time=time)  # type: ignore[arg-type]
+
+
+def train(*views: View) -> dict[Split, tuple[View, ...]]:
+    return {"train": views}
+
+
+def times_of(splits: dict[Split, tuple[View, ...]], split: Split = "train") -> list[float | None]:
+    return [kept.time for kept in splits[split]]
+
+
+@pytest.mark.parametrize("time", [math.nan, math.inf, -math.inf, "0.5", True])
+def test_no_number(time: object) -> None:
+    with pytest.raises(DyngsError, match="time of b must be a finite number"):
+        unit_times(ROOT, train(view("a", 0.0), view("b", time)))
+
+
+def test_missing_in_some() -> None:
+    with pytest.raises(DyngsError, match="b has no time although other pictures have"):
+        unit_times(ROOT, train(view("a", 0.0), view("b", None)))
+
+
+@given(st.lists(st.integers(-50, 50).map(float), min_size=2, max_size=8, unique=True), st.integers(0, 6))
+def test_scaled_over_all_splits(times: list[float], cut: int) -> None:
+    """Whatever the order: one affine map for all splits, onto [0, 1] unless that is where they were."""
+    views = [view(f"v{i}", time) for i, time in enumerate(times)]
+    cut = min(cut, len(views) - 1)
+    splits, notes = unit_times(ROOT, {"train": tuple(views[cut:]), "test": tuple(views[:cut])})
+    found = times_of(splits, "test") + times_of(splits)
+    low, high = min(times), max(times)
+    if low >= 0 and high <= 1:
+        assert (found, notes) == (times, [])
+    else:
+        assert found == pytest.approx([(time - low) / (high - low) for time in times])
+        assert notes == [f"times run from {low:g} to {high:g} and were scaled to [0, 1]"]
+
+
+def test_without_times() -> None:
+    splits = train(view("a", None), view("b", None))
+    assert unit_times(ROOT, splits) == (splits, [])
+    assert still_if_constant(splits) == (splits, [])
+    assert sequence_warnings(splits) == []
+
+
+@pytest.mark.parametrize("time", [0.0, 0.25, 7.0])
+def test_constant_times_are_a_still_scene(time: float) -> None:
+    splits, notes = unit_times(ROOT, train(view("a", time), view("b", time)))
+    assert notes == []
+    still, notes = still_if_constant(splits)
+    assert times_of(still) == [None, None]
+    assert notes == [f"all pictures have time {time:g}: treated as a still scene"]
+
+
+@pytest.mark.parametrize(("time", "kept"), [(0.25, 0.25), (1.0, 1.0), (7.0, 0.0)])
+def test_a_single_picture_is_fine(time: float, kept: float) -> None:
+    splits, notes = unit_times(ROOT, train(view("a", time)))
+    splits, more = still_if_constant(splits)
+    assert (times_of(splits), notes, more) == ([kept], [], [])
+
+
+def test_pictures_that_differ_by_chance() -> None:
+    views = [view("a", 0.0), view("b", 0.5), view("c", 0.5), view("d", 1.0)]
+    (warning,) = sequence_warnings({"train": tuple(views[:2]), "test": tuple(views[2:])})
+    assert "2 pictures share camera, pose and time with another one, first b and c at time 0.5" in warning
+
+
+def test_pictures_that_may_share_a_time() -> None:
+    """Other cameras, other poses of one camera, and the same file listed twice are no repetitions."""
+    poses = [opengl_pose(angle) for angle in (0.0, 1.0)]
+    moving = [view("a", 0.0, pose=poses[0]), view("b", 0.0, pose=poses[1]), view("c", 1.0, pose=poses[1])]
+    assert sequence_warnings(train(*moving)) == []
+    several = [view(f"{camera}/{time}", time, camera, poses[0]) for camera in (0, 1) for time in (0.0, 1.0)]
+    assert sequence_warnings({"train": tuple(several), "test": (several[0],)}) == []
+
+
+def rig(counts: list[int], folder: str = "cam{:02d}/") -> dict[Split, tuple[View, ...]]:
+    """Cameras with so many frames each; the first one is for testing."""
+    views = [
+        tuple(view(f"{folder.format(camera)}{camera}_{frame}", frame / 30, camera) for frame in range(count))
+        for camera, count in enumerate(counts)
+    ]
+    return {"train": tuple(v for kept in views[1:] for v in kept), "test": views[0]}
+
+
+def test_different_numbers_of_frames() -> None:
+    assert sequence_warnings(rig([5, 5, 5])) == []
+    assert sequence_warnings(rig([1, 1, 1])) == []
+    (warning,) = sequence_warnings(rig([24, 24, 24, 22]))
+    assert warning == "cameras have different numbers of frames: cam03 has 22 frames, others 24"
+    (warning,) = sequence_warnings(rig([20, 24, 24, 22], folder="images/"))
+    assert "camera 0 has 20, camera 3 has 22 frames, others 24" in warning
+    (warning,) = sequence_warnings(rig([3] * 9 + list(range(4, 12))))
+    assert "(3 more cameras differ)" in warning

@@ -1,0 +1,128 @@
+"""Offsets change what they are named after, only there, and only where they should."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import weights
+from scipy.spatial.transform import Rotation
+from tiny_fields import KINDS, TIMES, cloud, stirred_field, tiny_field, tiny_setup
+from torch import Tensor
+
+from dyngs.deform.field import Offsets, deformed, turned_quats
+from dyngs.gaussians import Gaussians
+
+SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "colors": (3,)}
+
+
+def some_offsets(count: int, dtype: torch.dtype = torch.float32, seed: int = 1) -> Offsets:
+    generator = torch.Generator().manual_seed(seed)
+    values = {k: 0.3 * torch.randn((count, *s), generator=generator, dtype=dtype) for k, s in SHAPES.items()}
+    return Offsets(**values)
+
+
+def rotations(quats: Tensor) -> Rotation:
+    return Rotation.from_quat(quats.double().roll(-1, 1).numpy())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("everything", [True, False])
+def test_every_field_starts_as_the_identity(kind: str, everything: bool) -> None:
+    """Bitwise, at any time, whatever it may move."""
+    gaussians, field = cloud(), tiny_field(kind, everything=everything)
+    for time in TIMES:
+        moved = deformed(gaussians, field.offsets(gaussians.means, time))
+        for name, x in gaussians.tensors().items():
+            assert torch.equal(getattr(moved, name), x), (name, time)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_field_moves_just_the_attributes_it_may(kind: str) -> None:
+    gaussians = cloud()
+    for everything in (True, False):
+        field = stirred_field(kind, everything=everything)
+        moved = deformed(gaussians, field.offsets(gaussians.means, 0.37))
+        changed = {name for name, x in gaussians.tensors().items() if not torch.equal(getattr(moved, name), x)}
+        assert changed == ({"means", "quats", "log_scales", "logit_opacities", "sh"} if everything else {"means"})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_reach_all_that_is_learned(kind: str) -> None:
+    """After some training; before it the last layer is zero, and it alone learns in the first step."""
+    gaussians = cloud()
+    for field, trained in ((stirred_field(kind), True), (tiny_field(kind), False)):
+        outputs = [x for x in vars(field.offsets(gaussians.means, 0.37)).values() if x is not None]
+        torch.stack([(x * weights(x)).sum() for x in outputs]).sum().backward()
+        names = list(field.learned.values())
+        reached = {name for name in names if field.learned[name].grad is not None and field.learned[name].grad.any()}
+        first = set(names) if kind == "trajectory" else set(names[-2:])
+        assert reached == (set(names) if trained else first)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_reach_the_canonical_gaussians(kind: str) -> None:
+    """Only through the sum: the position at which a field is asked is a constant."""
+    gaussians = cloud()
+    means = gaussians.means.clone().requires_grad_()
+    leaves = gaussians.replace(means=means)
+    moved = deformed(leaves, stirred_field(kind).offsets(leaves.means, 0.5))
+    (slope,) = torch.autograd.grad((moved.means * weights(moved.means)).sum(), [means])
+    assert torch.equal(slope, weights(means))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sets(st.integers(0, 8)), st.sets(st.sampled_from(["quats", "log_scales", "logit_opacities", "colors"])))
+def test_rows_alone_are_changed_and_as_without_rows(chosen: set[int], absent: set[str]) -> None:
+    gaussians, rows = cloud(), torch.tensor(sorted(chosen), dtype=torch.long)
+    offsets = Offsets(**{k: None if k in absent else x for k, x in vars(some_offsets(len(rows))).items()})
+    moved = deformed(gaussians, offsets, rows)
+    alone = deformed(gaussians.select(rows), offsets)
+    others = torch.tensor([i for i in range(9) if i not in chosen], dtype=torch.long)
+    for name, x in gaussians.tensors().items():
+        assert torch.equal(getattr(moved, name)[rows], getattr(alone, name)), name
+        assert torch.equal(getattr(moved, name)[others], x[others]), name
+
+
+def test_each_offset_is_added_to_its_own_attribute() -> None:
+    gaussians, offsets = cloud(), some_offsets(9)
+    moved = deformed(gaussians, offsets)
+    assert offsets.log_scales is not None
+    assert offsets.logit_opacities is not None
+    assert torch.equal(moved.means, gaussians.means + offsets.means)
+    assert torch.equal(moved.log_scales, gaussians.log_scales + offsets.log_scales)
+    assert torch.equal(moved.logit_opacities, gaussians.logit_opacities + offsets.logit_opacities)
+    torch.testing.assert_close(moved.sh[:, 0], gaussians.sh[:, 0] + offsets.colors)
+    assert torch.equal(moved.sh[:, 1:], gaussians.sh[:, 1:])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000))
+def test_quaternions_compose_as_rotations_do(seed: int) -> None:
+    """The offset turns after the Gaussian's own rotation, in the world."""
+    generator = torch.Generator().manual_seed(seed)
+    own, offsets = torch.randn((2, 5, 4), generator=generator, dtype=torch.float64)
+    identity = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+    expected = rotations(offsets + identity) * rotations(own)
+    found = rotations(turned_quats(own, offsets))
+    assert (found * expected.inv()).magnitude().max() < 1e-12
+
+
+@pytest.mark.parametrize("rows", [None, (0, 2, 3)], ids=["all", "some"])
+def test_gradcheck_of_deformed(rows: tuple[int, ...] | None) -> None:
+    gaussians = Gaussians(**{k: x.double() for k, x in cloud(4).tensors().items()})
+    index = None if rows is None else torch.tensor(rows)
+    offsets = some_offsets(4 if rows is None else len(rows), torch.float64)
+    leaves = [x.detach().requires_grad_() for x in (*gaussians.tensors().values(), *vars(offsets).values())]
+
+    def moved(*tensors: Tensor) -> tuple[Tensor, ...]:
+        return tuple(deformed(Gaussians(*tensors[:5]), Offsets(*tensors[5:]), index).tensors().values())
+
+    assert torch.autograd.gradcheck(moved, leaves)
+
+
+def test_the_box_is_minus_one_to_one() -> None:
+    setup = tiny_setup()
+    corners = torch.stack([setup.center - setup.half_size, setup.center, setup.center + setup.half_size])
+    assert torch.equal(setup.normalized(corners), torch.tensor([[-1.0], [0.0], [1.0]]).expand(3, 3))

@@ -1,0 +1,63 @@
+"""From options to fields, and through a checkpoint back."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tiny_fields import KINDS, TIMES, cloud, stirred_field, tiny_field, tiny_options, tiny_setup
+
+from dyngs.deform.fields import field_state, new_field, part_of, restored_field
+from dyngs.deform.hexplane import Hexplane
+from dyngs.deform.mlp import Mlp
+from dyngs.deform.trajectory import Trajectory
+
+
+def test_options_decide_the_kind() -> None:
+    kinds = {"hexplane": Hexplane, "mlp": Mlp, "nodes": Mlp, "trajectory": Trajectory}
+    for kind, expected in kinds.items():
+        assert type(tiny_field(kind)) is expected
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_restored_field_moves_everything_alike(kind: str) -> None:
+    """Bitwise, also in the next steps of training; the setup comes back, too."""
+    field, setup, means = stirred_field(kind), tiny_setup(), cloud().means
+    for time in TIMES:
+        field.offsets(means, time).means.square().sum().backward()
+    field.learned.step(1, 0.0)
+    state = {name: x.clone() for name, x in field_state(field, setup).items()}
+    assert all(x.is_contiguous() for x in state.values())
+    again, same = restored_field(tiny_options(kind), state, 9)
+    assert torch.equal(same.center, setup.center)
+    assert torch.equal(same.half_size, setup.half_size)
+    assert (same.num_times, same.num_moving, same.extent) == (setup.num_times, 9, setup.extent)
+    for step in (2, 3):
+        for one in (field, again):
+            one.offsets(means, 0.2 * step).means.square().sum().backward()
+            one.learned.step(step, 0.5)
+    for time in TIMES:
+        found, expected = again.offsets(means, time), field.offsets(means, time)
+        for name, x in vars(expected).items():
+            assert (x is None) == (getattr(found, name) is None)
+            assert x is None or torch.equal(getattr(found, name), x), name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_missing_is_named(kind: str) -> None:
+    state = field_state(tiny_field(kind), tiny_setup())
+    for name in ("box", "numbers", next(name for name in state if name.startswith("learned."))):
+        with pytest.raises(KeyError, match=name.removeprefix("learned.")):
+            restored_field(tiny_options(kind), {k: x for k, x in state.items() if k != name}, 9)
+
+
+def test_the_generator_decides_everything() -> None:
+    for kind in KINDS:
+        fields = [new_field(tiny_options(kind), tiny_setup(), torch.Generator().manual_seed(s)) for s in (1, 1, 2)]
+        first, second, other = (f.learned.values() for f in fields)
+        assert all(torch.equal(x, second[name]) for name, x in first.items())
+        assert kind == "trajectory" or any(not torch.equal(x, other[name]) for name, x in first.items())
+
+
+def test_part_of_takes_the_prefix_away() -> None:
+    x, y = torch.zeros(1), torch.ones(1)
+    assert part_of({"a.x": x, "ab.x": y, "x": y}, "a.") == {"x": x}

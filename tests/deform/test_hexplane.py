@@ -1,0 +1,160 @@
+"""Planes: what they start from, what lies outside them, and how they continue to times not seen yet."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_fields import cloud, stirred_field, tiny_field, tiny_options, tiny_setup
+from torch import Tensor
+
+from dyngs.config import HexplaneField
+from dyngs.deform.hexplane import Hexplane, time_rows
+
+WITHOUT_PENALTIES = {"space_smoothness": 0.0, "time_smoothness": 0.0, "time_sparsity": 0.0}
+
+
+def field_with_rows(rows: int) -> Hexplane:
+    """Planes whose row i over time holds the number i everywhere."""
+    options = tiny_options("hexplane").model_copy(update={"time_resolution": rows})
+    assert isinstance(options, HexplaneField)
+    field = Hexplane(options, tiny_setup(), torch.Generator().manual_seed(0))
+    for level in field.levels:
+        level.time.data[:] = torch.arange(float(rows))[None, :, None, None]
+    return field
+
+
+def rows_of(field: Hexplane) -> list[float]:
+    """The number in each row, which must be the same in all its places."""
+    found = torch.stack([level.time.detach()[:, :, 0, 0] for level in field.levels])
+    for level in field.levels:
+        assert torch.equal(level.time.detach(), level.time.detach()[:, :, :1, :1].expand_as(level.time))
+    assert (found == found[:1, :1]).all()
+    return found[0, 0].tolist()
+
+
+def all_means(field: Hexplane, means: Tensor, time: float) -> Tensor:
+    offsets = vars(field.offsets(means, time)).values()
+    return torch.cat([x.detach().reshape(len(means), -1) for x in offsets if x is not None], dim=1)
+
+
+@pytest.mark.parametrize(("num_times", "rows"), [(2, 2), (3, 2), (4, 2), (5, 3), (48, 24), (300, 150)])
+def test_half_as_many_rows_as_times_and_at_least_two(num_times: int, rows: int) -> None:
+    assert time_rows(HexplaneField(), num_times) == rows
+    assert time_rows(HexplaneField(time_resolution=25), num_times) == 25
+
+
+def test_planes_start_as_published() -> None:
+    """Space uniform in [0.1, 0.5], time at 1; as many rows as the clip asks for."""
+    field = tiny_field("hexplane")
+    assert isinstance(field, Hexplane)
+    for level, side in zip(field.levels, (5, 10), strict=True):
+        assert level.space.shape == (3, side, side, 3)
+        assert level.time.shape == (3, 5, side, 3)
+        assert (level.time == 1).all()
+        assert 0.1 <= level.space.min() < 0.15
+        assert 0.45 < level.space.max() <= 0.5
+
+
+def test_outside_the_box_the_field_is_that_of_its_border() -> None:
+    field = stirred_field("hexplane")
+    assert isinstance(field, Hexplane)
+    means = 3 * cloud(20).means
+    inside = means.clamp(-2, 2)  # the box of tiny_setup
+    assert (means != inside).any()
+    torch.testing.assert_close(all_means(field, means, 0.4), all_means(field, inside, 0.4))
+
+
+def test_the_field_depends_on_place_and_time_smoothly() -> None:
+    field, means = stirred_field("hexplane"), cloud().means
+    assert isinstance(field, Hexplane)
+    here, later = all_means(field, means, 0.4), all_means(field, means, 0.4001)
+    assert 0 < (later - here).abs().max() < 1e-2
+    moved = all_means(field, means + 1e-4, 0.4)
+    assert 0 < (moved - here).abs().max() < 1e-2
+
+
+def test_the_last_time_is_the_last_row() -> None:
+    """At time 1 only the last row counts, at time 0 only the first."""
+    field = stirred_field("hexplane")
+    assert isinstance(field, Hexplane)
+    means = cloud().means
+    ends = [all_means(field, means, t) for t in (0.0, 1.0)]
+    for level in field.levels:
+        level.time.data[:, 1:-1] += 1.0
+    assert all(torch.equal(x, all_means(field, means, t)) for x, t in zip(ends, (0.0, 1.0), strict=True))
+    for level in field.levels:
+        level.time.data[:, 0] += 1.0
+    assert torch.equal(ends[1], all_means(field, means, 1.0))
+    assert not torch.equal(ends[0], all_means(field, means, 0.0))
+
+
+def test_extend_copies_the_outermost_trained_rows_to_the_next() -> None:
+    field = field_with_rows(11)
+    field.extend((0.4, 0.6), (0.2, 0.8))
+    assert rows_of(field) == [0, 1, 4, 4, 4, 5, 6, 6, 6, 9, 10]
+    field = field_with_rows(11)
+    field.extend((0.43, 0.57), (0.29, 0.71))  # rows 4 and 6 took part at 0.43 and 0.57
+    assert rows_of(field) == [0, 1, 4, 4, 4, 5, 6, 6, 6, 9, 10]
+    field = field_with_rows(11)
+    field.extend((0.4, 0.6), (0.4, 0.6))
+    field.extend((0.0, 1.0), (0.0, 1.0))
+    assert rows_of(field) == list(range(11))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(2, 40), st.lists(st.floats(0, 0.5), min_size=1, max_size=6))
+def test_rows_that_were_seen_never_change_and_at_the_end_none_is_left_over(rows: int, strays: list[float]) -> None:
+    """For any sequence of growing windows around the middle, up to the whole clip."""
+    field, last = field_with_rows(rows), rows - 1
+    windows = [(0.5 - x, 0.5 + x) for x in (*sorted(strays), 0.5)]
+    for seen, soon in zip(windows, windows[1:], strict=False):
+        before = rows_of(field)
+        field.extend(seen, soon)
+        after = rows_of(field)
+        trained = [i for i in range(rows) if seen[0] * last - 1 < i < seen[1] * last + 1]
+        assert [after[i] for i in trained] == [before[i] for i in trained]
+    assert set(rows_of(field)) == {float(i) for i in range(rows) if windows[0][0] * last - 1 < i < windows[0][1] * last + 1}
+
+
+def test_extend_makes_the_motion_stand_still_beyond_what_was_seen() -> None:
+    options = tiny_options("hexplane").model_copy(update={"time_resolution": 11})
+    assert isinstance(options, HexplaneField)
+    field = Hexplane(options, tiny_setup(), torch.Generator().manual_seed(0))
+    for x in field.learned.values().values():
+        x += 0.2 * torch.randn(x.shape, generator=torch.Generator().manual_seed(1))
+    means = cloud().means
+    inside, first, last = (all_means(field, means, t) for t in (0.5, 0.4, 0.6))
+    field.extend((0.4, 0.6), (0.0, 1.0))
+    assert torch.equal(all_means(field, means, 0.5), inside)
+    for time, border in ((0.31, first), (0.0, first), (0.69, last), (1.0, last)):
+        torch.testing.assert_close(all_means(field, means, time), border)
+
+
+def test_penalties_vanish_on_smooth_planes_only() -> None:
+    """Second differences of planes that are linear in each axis, and the distance of the planes with time from 1."""
+    field = tiny_field("hexplane")
+    assert isinstance(field, Hexplane)
+    for level in field.levels:
+        level.space.data[:] = torch.arange(float(level.space.shape[1]))[None, :, None, None]
+    assert float(field.penalties()["plane smoothness"].detach()) == 0.0
+    field.levels[0].time.data[1, 2] += 0.1
+    rough = field.penalties()["plane smoothness"]
+    assert rough.detach() > 0
+    rough.backward()
+    grad = field.learned["time0"].grad
+    assert grad is not None
+    assert grad[1].any()
+    assert not grad[2].any() or bool((field.learned["time0"][2] != 1).any())
+    field.levels[0].time.data[1, 2] += 0.1
+    assert field.penalties()["plane smoothness"].detach() > rough.detach()
+    options = HexplaneField(channels=1, resolution=4, levels=(1,), **WITHOUT_PENALTIES)
+    assert Hexplane(options, tiny_setup(), torch.Generator()).penalties() == {}
+
+
+def test_select_changes_nothing() -> None:
+    field = stirred_field("hexplane")
+    before = {name: x.clone() for name, x in field.learned.state().items()}
+    field.select(torch.tensor([3, 3, 0]), torch.tensor([False, True, False]))
+    assert all(torch.equal(x, before[name]) for name, x in field.learned.state().items())

@@ -1,0 +1,147 @@
+"""Motion in pixels: known displacements give known scores, and what does not move is frozen where it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from tiny_fields import cloud, stirred_field
+from torch import Tensor
+
+from dyngs.deform.field import Offsets, deformed
+from dyngs.deform.learned import LearnedTensors
+from dyngs.deform.motion import MAX_SAMPLES, PX_PER_OPACITY, bake_, measure_motion, select_offsets
+
+TIMES = tuple(i / 10 for i in range(11))
+
+
+class Scripted:
+    """A field that follows a function of time; keeps the times at which it was asked."""
+
+    def __init__(self, script: Callable[[Tensor, float], Offsets]) -> None:
+        self.script, self.asked = script, list[float]()
+        self.learned, self.buffers = LearnedTensors({}, {}), dict[str, Tensor]()
+
+    def offsets(self, means: Tensor, time: float) -> Offsets:
+        self.asked.append(time)
+        return self.script(means, time)
+
+    def penalties(self) -> dict[str, Tensor]:
+        return {}
+
+    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None: ...
+
+    def select(self, index: Tensor, is_new: Tensor) -> None: ...
+
+
+def filled(count: int, *values: float) -> Tensor:
+    return torch.tensor(values).expand(count, len(values))
+
+
+def score(script: Callable[[Tensor, float], Offsets], px_size: Tensor | None = None) -> Tensor:
+    gaussians = cloud(4)
+    size = torch.ones(4) if px_size is None else px_size
+    return measure_motion(Scripted(script), gaussians, TIMES, size).pixels
+
+
+def still(means: Tensor) -> Tensor:
+    return torch.zeros_like(means)
+
+
+def test_a_displacement_counts_in_pixels() -> None:
+    """From -0.3 to 0.3 along x: 0.3 from the mean, over what a pixel covers."""
+    px_size = torch.tensor([0.01, 0.1, 1.0, 0.3])
+    found = score(lambda means, t: Offsets(filled(len(means), 0.6 * t, 0.0, 0.0)), px_size)
+    torch.testing.assert_close(found, 0.3 / px_size)
+
+
+def test_a_circle_counts_by_its_radius() -> None:
+    def circle(means: Tensor, t: float) -> Offsets:
+        turn = Rotation.from_rotvec([0, 0, 2 * torch.pi * t]).apply([0.2, 0.0, 0.0])
+        return Offsets(filled(len(means), *turn.tolist()))
+
+    even = tuple(i / 16 for i in range(16))
+    found = measure_motion(Scripted(circle), cloud(4), even, torch.ones(4)).pixels
+    torch.testing.assert_close(found, torch.full((4,), 0.2))
+
+
+def test_a_constant_offset_is_no_motion() -> None:
+    def constant(means: Tensor, t: float) -> Offsets:
+        n = len(means)
+        return Offsets(filled(n, 5.0, -3, 1), filled(n, 0.1, 0.2, 0.3, 0.4), filled(n, 1.0, 1, 1), torch.ones(n), still(means))
+
+    assert score(constant).abs().max() < 1e-5
+
+
+def test_turning_and_growing_count_by_the_size_of_the_gaussian() -> None:
+    """A turn by 0.02 rad moves the end of the longest axis by 0.02 of its length; q there is (0, 0, 0, 0.01)."""
+    longest = cloud(4).scales.amax(1)
+
+    def turn(means: Tensor, t: float) -> Offsets:
+        return Offsets(still(means), filled(len(means), 0.0, 0.0, 0.0, 0.01 * (2 * t - 1)))
+
+    def growth(means: Tensor, t: float) -> Offsets:
+        return Offsets(still(means), None, filled(len(means), 0.0, 0.1 * (2 * t - 1), 0.0))
+
+    torch.testing.assert_close(score(turn), 0.02 * longest)
+    torch.testing.assert_close(score(growth), 0.1 * longest)
+
+
+def test_opacity_and_colour_count_whatever_the_size_of_a_pixel() -> None:
+    gaussians = cloud(4)
+
+    def fade(means: Tensor, t: float) -> Offsets:
+        return Offsets(still(means), logit_opacities=torch.full((len(means),), 2 * t - 1))
+
+    def blush(means: Tensor, t: float) -> Offsets:
+        return Offsets(still(means), colors=filled(len(means), 0.1 * (2 * t - 1), 0.0, 0.05 * t))
+
+    px_size = torch.tensor([0.01, 0.1, 1.0, 0.3])
+    logits = gaussians.logit_opacities
+    change = torch.maximum((logits + 1).sigmoid() - logits.sigmoid(), logits.sigmoid() - (logits - 1).sigmoid())
+    torch.testing.assert_close(score(fade, px_size), PX_PER_OPACITY * change)
+    torch.testing.assert_close(score(blush, px_size), torch.full((4,), 0.1 * PX_PER_OPACITY))
+
+
+@pytest.mark.parametrize("count", [2, 10, MAX_SAMPLES, 10_000])
+def test_long_clips_are_sampled_evenly(count: int) -> None:
+    times = tuple(i / (count - 1) for i in range(count))
+    field = Scripted(lambda means, t: Offsets(filled(len(means), t, 0.0, 0.0)))
+    motion = measure_motion(field, cloud(4), times, torch.ones(4))
+    assert len(field.asked) == min(count, MAX_SAMPLES)
+    assert (field.asked[0], field.asked[-1]) == (0.0, 1.0)
+    assert set(field.asked) <= set(times)
+    gaps = [b - a for a, b in zip(field.asked, field.asked[1:], strict=False)]
+    assert max(gaps) < 2 * min(gaps) + 1e-9
+    torch.testing.assert_close(motion.pixels, torch.full((4,), 0.5), rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("everything", [True, False])
+def test_baking_freezes_at_the_mean(everything: bool) -> None:
+    """Rows that are baked look as the field shows them on average; the others do not change."""
+    gaussians = cloud()
+    field = stirred_field("trajectory", everything=everything)
+    mean = measure_motion(field, gaussians, TIMES, torch.ones(9)).mean
+    samples = [field.offsets(gaussians.means, t).means.detach() for t in TIMES]
+    torch.testing.assert_close(mean.means, torch.stack(samples).mean(0))
+    rows = torch.tensor([1, 4, 8])
+    expected = deformed(gaussians, select_offsets(mean, rows), rows)
+    baked = gaussians.replace(**{k: x.clone().requires_grad_() for k, x in gaussians.tensors().items()})
+    bake_(baked, rows, select_offsets(mean, rows))
+    for name, x in expected.tensors().items():
+        assert torch.equal(getattr(baked, name).detach(), x), name
+        assert getattr(baked, name).requires_grad
+    others = torch.tensor([0, 2, 3, 5, 6, 7])
+    assert torch.equal(baked.means[others], gaussians.means[others])
+    bake_(baked, torch.zeros(0).long(), select_offsets(mean, torch.zeros(0).long()))
+    assert torch.equal(baked.quats.detach(), expected.quats)
+
+
+def test_an_empty_set_has_no_motion() -> None:
+    motion = measure_motion(
+        Scripted(lambda means, t: Offsets(still(means))), cloud().select(torch.zeros(0).long()), TIMES, torch.zeros(0)
+    )
+    assert motion.pixels.shape == (0,)
+    assert motion.mean.means.shape == (0, 3)

@@ -1,0 +1,128 @@
+"""A trained scene at any time, in parts, and from a checkpoint."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tiny_fields import KINDS, cloud, stirred_field, tiny_field, tiny_options, tiny_setup
+from torch import Tensor
+
+from dyngs.config import DynamicModel, StaticModel
+from dyngs.deform.field import deformed
+from dyngs.deform.fields import field_state
+from dyngs.deform.trained import TrainedScene, trained_scene
+from dyngs.gaussians import Gaussians
+from dyngs.static.filters import fuse_filter
+
+ROWS = torch.tensor([1, 4, 5, 8])
+NOTHING = torch.zeros(0, dtype=torch.long)
+
+
+def some_scene(kind: str = "hexplane", filter_std: Tensor | None = None) -> TrainedScene:
+    return TrainedScene(cloud(), ROWS, stirred_field(kind, len(ROWS)), filter_std, times=(0.0, 0.5, 1.0))
+
+
+def same(a: Gaussians, b: Gaussians) -> bool:
+    return all(torch.equal(x, b.tensors()[name]) for name, x in a.tensors().items())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_only_the_rows_move(kind: str) -> None:
+    scene = some_scene(kind)
+    early, late = scene.at(0.1), scene.at(0.9)
+    changed = (early.means != late.means).any(1)
+    assert torch.equal(torch.nonzero(changed)[:, 0], ROWS)
+    others = torch.nonzero(~changed)[:, 0]
+    assert same(late.select(others), scene.gaussians.select(others))
+    assert not late.means.requires_grad
+
+
+@pytest.mark.parametrize("time", [-1e9, -0.1, None])
+def test_times_before_the_clip_are_its_start(time: float | None) -> None:
+    scene = some_scene()
+    assert same(scene.at(time), scene.at(0.0))
+
+
+@pytest.mark.parametrize("time", [1.0001, 7.0, float("inf")])
+def test_times_after_the_clip_are_its_end(time: float) -> None:
+    scene = some_scene()
+    assert same(scene.at(time), scene.at(1.0))
+    assert not same(scene.at(time), scene.at(0.0))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("filtered", [False, True])
+def test_what_moves_and_what_is_still_make_the_scene(kind: str, filtered: bool) -> None:
+    """Together, in their order, at each time."""
+    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if filtered else None)
+    moving, still = scene.part("moving"), scene.part("still")
+    others = torch.tensor([0, 2, 3, 6, 7])
+    assert (len(moving), len(still)) == (4, 5)
+    assert (moving.is_still, still.is_still) == (False, True)
+    assert (moving.moving_share, still.moving_share) == (1.0, 0.0)
+    assert moving.times == still.times == scene.times
+    for time in (0.0, 0.37, 1.0):
+        whole = scene.at(time)
+        assert same(moving.at(time), whole.select(ROWS))
+        assert same(still.at(time), whole.select(others))
+
+
+def test_parts_of_extreme_scenes() -> None:
+    field = stirred_field("trajectory", 9)
+    all_move = TrainedScene(cloud(), torch.arange(9), field)
+    assert same(all_move.part("moving").at(0.3), all_move.at(0.3))
+    assert len(all_move.part("still")) == 0
+    none_moves = TrainedScene(cloud(), NOTHING)
+    assert same(none_moves.part("still").at(0.3), none_moves.gaussians)
+    assert len(none_moves.part("moving").at(0.3)) == 0
+
+
+def test_what_a_scene_says_of_itself() -> None:
+    scene, field = some_scene("trajectory"), tiny_field("trajectory", 4)
+    assert len(scene) == 9
+    assert scene.moving_share == pytest.approx(4 / 9)
+    assert scene.num_field_values == sum(x.numel() for x in field.learned.values().values())
+    for still in (TrainedScene(cloud(), NOTHING), TrainedScene(cloud(), NOTHING, field)):
+        assert still.is_still
+        assert (still.moving_share, still.num_field_values) == (0.0, 0)
+        assert still.at(0.7) is still.gaussians
+
+
+def test_the_filter_acts_on_what_is_drawn() -> None:
+    std = torch.full((9,), 0.3)
+    scene, plain = some_scene("trajectory", std), some_scene("trajectory")
+    assert same(scene.at(0.6), fuse_filter(plain.at(0.6), std))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("rows", [ROWS, None, NOTHING], ids=["some", "all", "none"])
+def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
+    """As the model stored it; without rows all Gaussians move."""
+    gaussians, num_moving = cloud(), 9 if rows is None else len(rows)
+    field = stirred_field(kind, num_moving)
+    state = {f"field.{name}": x for name, x in field_state(field, tiny_setup(num_moving)).items()}
+    state |= {"times": torch.tensor([0.0, 0.25, 1.0], dtype=torch.float64), "filter_std": torch.ones(9)}
+    if rows is not None:
+        state["rows"] = rows
+    scene = trained_scene(gaussians, state, DynamicModel(deform=tiny_options(kind)))
+    assert scene.times == (0.0, 0.25, 1.0)
+    assert torch.equal(scene.rows, torch.arange(9) if rows is None else rows)
+    assert scene.is_still == (num_moving == 0)
+    means = gaussians.means if rows is None else gaussians.means[rows]
+    moved = deformed(gaussians, field.offsets(means, 0.3), rows) if num_moving else gaussians
+    assert same(scene.at(0.3), fuse_filter(moved, torch.ones(9)))
+
+
+def test_a_state_without_field_is_a_still_scene() -> None:
+    for options in (StaticModel(), DynamicModel()):
+        scene = trained_scene(cloud(), {}, options)
+        assert scene.is_still
+        assert scene.times == ()
+        assert same(scene.at(0.5), cloud())
+
+
+def test_a_field_that_lacks_something_is_a_key_error() -> None:
+    state = {f"field.{name}": x for name, x in field_state(tiny_field("mlp"), tiny_setup()).items()}
+    del state["field.learned.bias0"]
+    with pytest.raises(KeyError, match="bias0"):
+        trained_scene(cloud(), state, DynamicModel(deform=tiny_options("mlp")))

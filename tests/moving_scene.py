@@ -1,0 +1,137 @@
+"""Scenes whose motion is known exactly, in memory and as a run on disk."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.config import Config, DataConfig, DynamicModel, StaticModel, TrajectoryField
+from dyngs.config_io import RESOLVED_NAME, save_config
+from dyngs.data.synthetic import StillOptions, write_still_capture
+from dyngs.deform.field import FieldSetup, Offsets
+from dyngs.deform.fields import field_state, new_field
+from dyngs.deform.learned import LearnedTensors
+from dyngs.deform.trained import TrainedScene
+from dyngs.gaussians import Gaussians
+from dyngs.train.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
+
+MOVING_ROWS = (1, 3)
+TRAIN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
+TEST_TIMES = (0.1, 0.4, 0.9)
+
+
+@dataclass
+class Sliding:
+    """Everything goes ``speed`` along x from time 0 to 1; counts how often it is asked."""
+
+    speed: float = 1.0
+    calls: int = 0
+    learned: LearnedTensors = field(default_factory=lambda: LearnedTensors({}, {}))
+    buffers: dict[str, Tensor] = field(default_factory=dict)
+
+    def offsets(self, means: Tensor, time: float) -> Offsets:
+        self.calls += 1
+        return Offsets(torch.tensor([self.speed * time, 0.0, 0.0]).expand(len(means), 3))
+
+    def penalties(self) -> dict[str, Tensor]:
+        return {}
+
+    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
+        raise NotImplementedError
+
+    def select(self, index: Tensor, is_new: Tensor) -> None:
+        raise NotImplementedError
+
+
+@dataclass
+class Blinking(Sliding):
+    """Everything is brighter by ``speed`` at every other of ``num_times`` even moments."""
+
+    num_times: int = 5
+
+    def offsets(self, means: Tensor, time: float) -> Offsets:
+        odd = round(time * (self.num_times - 1)) % 2
+        return Offsets(torch.zeros(len(means), 3), colors=torch.full((len(means), 3), self.speed * odd))
+
+
+def row_of_balls(count: int = 5) -> Gaussians:
+    """Grey balls side by side along x from -1 to 1."""
+    means = torch.zeros(count, 3)
+    means[:, 0] = torch.linspace(-1, 1, count)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
+    return Gaussians(means, quats, torch.full((count, 3), -1.6), torch.full((count,), 3.0), torch.zeros(count, 1, 3))
+
+
+def still_scene(count: int = 5, times: tuple[float, ...] = ()) -> TrainedScene:
+    """A scene in which nothing moves."""
+    return TrainedScene(row_of_balls(count), torch.zeros(0, dtype=torch.long), times=times)
+
+
+def moving_scene(
+    motion: Sliding, rows: tuple[int, ...] = MOVING_ROWS, times: tuple[float, ...] = TRAIN_TIMES
+) -> TrainedScene:
+    """Five balls of which ``rows`` follow ``motion``."""
+    return TrainedScene(row_of_balls(), torch.tensor(rows), motion, times=times)
+
+
+def camera(width: int = 20, height: int = 14) -> Cameras:
+    """One camera, 4 in front of the balls."""
+    pose = torch.eye(4)
+    pose[2, 3] = 4.0
+    intrinsics = torch.tensor([[20.0, 0, width / 2], [0, 20, height / 2], [0, 0, 1]])
+    return Cameras(pose[None], intrinsics[None], width, height)
+
+
+def write_timed_capture(root: Path, *, standing: bool = False) -> Path:
+    """A capture of 16x16 px at ``TRAIN_TIMES`` and ``TEST_TIMES``; ``standing``: all test pictures from one pose."""
+    options = StillOptions(size=16, num_train=len(TRAIN_TIMES), num_test=len(TEST_TIMES), samples=1)
+    write_still_capture(root, options)
+    for split, times in (("train", TRAIN_TIMES), ("test", TEST_TIMES)):
+        file = root / f"transforms_{split}.json"
+        document = json.loads(file.read_text())
+        for frame, time in zip(document["frames"], times, strict=True):
+            frame["time"] = time
+            if standing and split == "test":
+                frame["transform_matrix"] = document["frames"][0]["transform_matrix"]
+        file.write_text(json.dumps(document))
+    return root
+
+
+def write_moving_run(
+    folder: Path,
+    *,
+    moves: bool = True,
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    standing: bool = False,
+) -> Path:
+    """A run with a capture beside it: of five balls the second and fourth go 1 along x over time, if ``moves``."""
+    root = write_timed_capture(folder / "capture", standing=standing)
+    options = TrajectoryField(polynomial=1, fourier=0, move_rotations=False, move_scales=False)
+    model = DynamicModel(deform=options) if moves else StaticModel()
+    config = Config(data=DataConfig.model_validate({"root": root}), model=model)
+    save_config(config, folder / "run" / RESOLVED_NAME)
+    gaussians = row_of_balls()
+    tensors = {f"gaussians.{name}": x.contiguous() for name, x in gaussians.tensors().items()}
+    if moves:
+        setup = FieldSetup(torch.zeros(3), torch.ones(3), len(TRAIN_TIMES), len(MOVING_ROWS), 1.0)
+        motion = new_field(options, setup, torch.Generator())
+        motion.learned["means"].data[:, 0, 0] = 0.5  # times 2 t - 1
+        state = field_state(motion, setup)
+        tensors |= {f"model.field.{name}": x for name, x in state.items()}
+        tensors["model.rows"] = torch.tensor(MOVING_ROWS)
+        tensors["model.times"] = torch.tensor(TRAIN_TIMES, dtype=torch.float64)
+    info = CheckpointInfo(7, 1.0, offset, "white", "classic")
+    save_checkpoint(folder / "run", Checkpoint(info, tensors), 1.0)
+    return folder / "run"
+
+
+def moved_x(rows: tuple[int, ...], time: float) -> Tensor:
+    """x of the balls ``rows`` of ``write_moving_run`` at ``time``."""
+    x = row_of_balls().means[:, 0].clone()
+    x[list(MOVING_ROWS)] += time - 0.5
+    return x[list(rows)]

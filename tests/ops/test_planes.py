@@ -1,0 +1,383 @@
+"""The HexPlane look-up and the penalties of its planes against plain torch, finite differences and known answers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from importlib import import_module
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from dyngs.errors import DyngsError
+from dyngs.ops.native import core, kernel_threads
+from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
+
+AXES = ((0, 1), (0, 2), (1, 2))
+WEIGHTS = (0.3, 0.7, 0.2)
+
+
+def make_levels(
+    sizes: tuple[int, ...], times: int, channels: int, dtype: torch.dtype = torch.float64, seed: int = 0
+) -> list[PlaneLevel]:
+    """Random planes around 1, so that products neither vanish nor grow."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def planes(rows: int, size: int) -> Tensor:
+        return (torch.rand(3, rows, size, channels, generator=generator, dtype=torch.float64) + 0.5).to(dtype)
+
+    return [PlaneLevel(planes(size, size), planes(times, size)) for size in sizes]
+
+
+def make_coords(count: int, dtype: torch.dtype = torch.float64, reach: float = 1.1, seed: int = 0) -> Tensor:
+    """(M, 3) uniform in [-reach, reach]."""
+    generator = torch.Generator().manual_seed(seed + 1)
+    return (reach * (2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1)).to(dtype)
+
+
+def sample(plane: Tensor, fast: Tensor, slow: Tensor) -> Tensor:
+    """(M, C) bilinear samples of a plane (rows, columns, C) at coordinates (M,) in [-1, 1]."""
+    grid = torch.stack([fast, slow], dim=1)[None, None]
+    picture = plane.permute(2, 0, 1)[None]
+    return grid_sample(picture, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
+
+
+def reference_features(coords: Tensor, time: float, levels: list[PlaneLevel]) -> Tensor:
+    """`hexplane_features` as 4DGS writes it: six grid_sample per level."""
+    parts = []
+    for level in levels:
+        feature = torch.ones_like(level.space[0, 0, :1])
+        for plane, (fast, slow) in zip(level.space, AXES, strict=True):
+            feature = feature * sample(plane, coords[:, fast], coords[:, slow])
+        at = torch.full_like(coords[:, 0], 2 * time - 1)
+        for axis, plane in enumerate(level.time):
+            feature = feature * sample(plane, coords[:, axis], at)
+        parts.append(feature)
+    return torch.cat(parts, dim=1)
+
+
+def mean_squared_bend(planes: Tensor, axis: int) -> Tensor:
+    """Mean square of p[i-1] - 2 p[i] + p[i+1] along an axis; 0 where it is too short."""
+    n = planes.shape[axis]
+    if n < 3:
+        return planes.new_zeros(())
+    before, here, after = (planes.narrow(axis, i, n - 2) for i in range(3))
+    return (before - 2 * here + after).square().mean()
+
+
+def reference_penalty(levels: list[PlaneLevel], weights: tuple[float, float, float]) -> Tensor:
+    total = torch.zeros((), dtype=levels[0].space.dtype)
+    for level in levels:
+        for space, time in zip(level.space, level.time, strict=True):
+            total = total + weights[0] * (mean_squared_bend(space, 0) + mean_squared_bend(space, 1)) / 2
+            total = total + weights[1] * mean_squared_bend(time, 0) + weights[2] * (1 - time).abs().mean()
+    return total
+
+
+def leaves(levels: list[PlaneLevel]) -> list[Tensor]:
+    return [x for level in levels for x in (level.space, level.time)]
+
+
+def with_gradients(levels: list[PlaneLevel]) -> list[PlaneLevel]:
+    return [PlaneLevel(x.space.clone().requires_grad_(), x.time.clone().requires_grad_()) for x in levels]
+
+
+def run_features(
+    function: Callable[[Tensor, float, list[PlaneLevel]], Tensor], coords: Tensor, time: float, levels: list[PlaneLevel]
+) -> list[Tensor]:
+    """Features, and the gradients of a fixed weighted sum of them by coordinates and planes."""
+    coords, levels = coords.clone().requires_grad_(), with_gradients(levels)
+    features = function(coords, time, levels)
+    generator = torch.Generator().manual_seed(7)
+    upstream = torch.randn(features.shape, generator=generator, dtype=torch.float64).to(features)
+    return [features.detach(), *torch.autograd.grad(features, (coords, *leaves(levels)), upstream)]
+
+
+def run_penalty(
+    function: Callable[[list[PlaneLevel], tuple[float, float, float]], Tensor], levels: list[PlaneLevel]
+) -> list[Tensor]:
+    levels = with_gradients(levels)
+    value = function(levels, WEIGHTS)
+    # the reference does not touch planes of fewer than three samples
+    return [value.detach(), *torch.autograd.grad(value, leaves(levels), materialize_grads=True)]
+
+
+def assert_all_close(got: list[Tensor], expected: list[Tensor], tolerance: float) -> None:
+    """Equal up to ``tolerance`` times the largest element of each tensor, or 1."""
+    assert len(got) == len(expected)
+    for a, b in zip(got, expected, strict=True):
+        assert a.shape == b.shape
+        scale = max(1.0, b.abs().max().item()) if b.numel() else 1.0
+        assert (a.double() - b).abs().max().item() <= tolerance * scale if b.numel() else True
+
+
+def assert_equal(got: list[Tensor], expected: list[Tensor]) -> None:
+    assert len(got) == len(expected)
+    assert all(torch.equal(a, b) for a, b in zip(got, expected, strict=True))
+
+
+@pytest.fixture(params=["v2", "v3", "v4"])
+def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The planes run on the kernels of this instruction set."""
+    if request.param > core.best_isa():
+        pytest.skip(f"this processor has no {request.param}")
+    monkeypatch.setattr("dyngs.ops.planes.core", import_module(f"dyngs.ops._core_{request.param}"))
+    return request.param
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    count=st.integers(0, 70),
+    sizes=st.lists(st.integers(1, 9), min_size=1, max_size=3).map(tuple),
+    times=st.integers(1, 5),
+    channels=st.integers(1, 37),
+    time=st.floats(0, 1),
+    seed=st.integers(0, 1000),
+)
+def test_features_equal_grid_sample(
+    count: int, sizes: tuple[int, ...], times: int, channels: int, time: float, seed: int
+) -> None:
+    levels, coords = make_levels(sizes, times, channels, seed=seed), make_coords(count, seed=seed)
+    got = run_features(hexplane_features, coords, time, levels)
+    assert_all_close(got, run_features(reference_features, coords, time, levels), 1e-12)
+
+
+@pytest.mark.parametrize("channels", [32, 19])
+def test_every_instruction_set_gives_the_same_features(instruction_set: str, channels: int) -> None:
+    levels, coords = make_levels((16, 32), 9, channels), make_coords(300)
+    expected = run_features(reference_features, coords, 0.37, levels)
+    assert_all_close(run_features(hexplane_features, coords, 0.37, levels), expected, 1e-12)
+    singles = [PlaneLevel(x.space.float(), x.time.float()) for x in levels]
+    # Products of six numbers and sums of some hundred terms are good to 1e-6. An index u * 15.5 + 15.5 is good to 2e-6,
+    # and the gradient by u is multiplied by 15.5.
+    got = run_features(hexplane_features, coords.float(), 0.37, singles)
+    inside = run_features(reference_features, coords.float().double(), 0.37, levels)
+    assert_all_close(got, inside, 2e-5)
+
+
+@pytest.mark.parametrize("channels", [48, 5])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_any_number_of_threads_gives_the_same_bytes(channels: int, dtype: torch.dtype) -> None:
+    # two levels of three packets of channels or one: more tasks than threads, and fewer
+    levels, coords = make_levels((20, 33), 7, channels, dtype), make_coords(1500, dtype)
+    features, penalties = [], []
+    for threads in (1, 2, 3, 8):
+        with kernel_threads(threads):
+            features.append(run_features(hexplane_features, coords, 0.61, levels))
+            penalties.append(run_penalty(plane_penalty, levels))
+    for other in features[1:]:
+        assert_equal(other, features[0])
+    for other in penalties[1:]:
+        assert_equal(other, penalties[0])
+
+
+def test_gradcheck_of_features() -> None:
+    levels = make_levels((3, 5), 3, 3)
+    # a quarter between samples of both levels, away from the kinks
+    generator = torch.Generator().manual_seed(3)
+    coords = torch.randint(-4, 4, (6, 3), generator=generator).double() / 4 + 0.125
+    inputs = [x.requires_grad_() for x in (coords, *leaves(levels))]
+
+    def function(at: Tensor, *planes: Tensor) -> Tensor:
+        pairs = zip(planes[::2], planes[1::2], strict=True)
+        return hexplane_features(at, 0.3, [PlaneLevel(space, time) for space, time in pairs])
+
+    assert torch.autograd.gradcheck(function, inputs)
+
+
+def test_gradcheck_of_penalty() -> None:
+    inputs = [x.requires_grad_() for x in leaves(make_levels((4, 5), 6, 3))]
+
+    def function(*planes: Tensor) -> Tensor:
+        pairs = zip(planes[::2], planes[1::2], strict=True)
+        return 2.5 * plane_penalty([PlaneLevel(space, time) for space, time in pairs], WEIGHTS)
+
+    assert torch.autograd.gradcheck(function, inputs)
+
+
+def test_samples_lie_where_they_are_said_to() -> None:
+    (level,) = make_levels((3,), 4, 2)
+    z, y, x, t = 2, 0, 1, 3
+    coords = torch.tensor([[float(i - 1) for i in (x, y, z)]], dtype=torch.float64)
+    space = level.space[0, y, x] * level.space[1, z, x] * level.space[2, z, y]
+    expected = space * level.time[0, t, x] * level.time[1, t, y] * level.time[2, t, z]
+    torch.testing.assert_close(hexplane_features(coords, t / 3, [level])[0], expected, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("time", [0.0, 1.0, -3.0, 4.0, math.inf, -math.inf])
+def test_first_and_last_time(time: float) -> None:
+    levels, coords = make_levels((5,), 6, 4), make_coords(20)
+    row = 0 if time <= 0 else 5
+    frozen = [PlaneLevel(x.space, x.time[:, row : row + 1]) for x in levels]
+    torch.testing.assert_close(hexplane_features(coords, time, levels), hexplane_features(coords, 0.4, frozen))
+    *_, g_time = run_features(hexplane_features, coords, time, levels)
+    assert g_time[:, row].any()
+    assert not torch.cat([g_time[:, :row], g_time[:, row + 1 :]], dim=1).any()
+
+
+def test_only_two_times_get_a_gradient() -> None:
+    *_, g_time = run_features(hexplane_features, make_coords(20), 0.5, make_levels((5,), 8, 4))
+    assert [row for row in range(8) if g_time[:, row].any()] == [3, 4]
+
+
+def test_outside_the_box_is_its_border() -> None:
+    levels = make_levels((6,), 3, 4)
+    outside = torch.tensor([[-7.0, 0.3, 1e30], [math.inf, -math.inf, 0.1]], dtype=torch.float64)
+    features, g_coords, *_ = run_features(hexplane_features, outside, 0.2, levels)
+    torch.testing.assert_close(features, hexplane_features(outside.clamp(-1, 1), 0.2, levels))
+    assert (g_coords != 0).tolist() == [[False, True, False], [False, False, True]]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_nan_stays_where_it_is(dtype: torch.dtype) -> None:
+    levels, coords = make_levels((6, 1), 3, 20, dtype), make_coords(40, dtype)
+    coords[17, 1] = math.nan
+    features, g_coords, *_ = run_features(hexplane_features, coords, 0.2, levels)
+    assert features.isnan().all(dim=1).nonzero().flatten().tolist() == [17]
+    assert features.isnan().any(dim=1).nonzero().flatten().tolist() == [17]
+    assert g_coords.isnan().any(dim=1).nonzero().flatten().tolist() == [17]
+
+
+def test_no_points() -> None:
+    results = run_features(hexplane_features, torch.zeros(0, 3), 0.5, make_levels((4, 8), 3, 32, torch.float32))
+    features, g_coords, *g_planes = results
+    assert features.shape == (0, 64)
+    assert g_coords.shape == (0, 3)
+    assert len(g_planes) == 4
+    assert not any(x.any() for x in g_planes)
+
+
+def test_order_of_points_does_not_matter() -> None:
+    levels, coords = make_levels((12,), 3, 16), make_coords(100)
+    shuffled = torch.randperm(100, generator=torch.Generator().manual_seed(5))
+    features = hexplane_features(coords, 0.3, levels)
+    assert torch.equal(hexplane_features(coords[shuffled], 0.3, levels), features[shuffled])
+
+
+def test_strided_inputs() -> None:
+    levels, coords = make_levels((7,), 4, 18), make_coords(30)
+    strided = [PlaneLevel(*(x.permute(3, 0, 1, 2).contiguous().permute(1, 2, 3, 0) for x in leaves(levels)))]
+    assert not strided[0].space.is_contiguous()
+    expected = run_features(hexplane_features, coords, 0.4, levels)
+    assert_equal(run_features(hexplane_features, coords.T.contiguous().T, 0.4, strided), expected)
+    assert_equal(run_penalty(plane_penalty, strided), run_penalty(plane_penalty, levels))
+    # an expanded upstream gradient, as sums give
+    (leaf,) = with_gradients(levels)
+    hexplane_features(coords, 0.4, [leaf]).sum().backward()
+    (dense,) = with_gradients(levels)
+    hexplane_features(coords, 0.4, [dense]).backward(torch.ones(30, 18, dtype=torch.float64))
+    assert leaf.space.grad is not None
+    assert dense.space.grad is not None
+    assert torch.equal(leaf.space.grad, dense.space.grad)
+
+
+def test_constant_coordinates_get_no_gradient() -> None:
+    (level,) = with_gradients(make_levels((5,), 3, 4))
+    coords = make_coords(9)
+    hexplane_features(coords, 0.5, [level]).sum().backward()
+    assert coords.grad is None
+    assert level.space.grad is not None
+    assert not hexplane_features(coords, 0.5, make_levels((5,), 3, 4)).requires_grad
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    sizes=st.lists(st.integers(1, 40), min_size=1, max_size=3).map(tuple),
+    times=st.integers(1, 40),
+    channels=st.integers(1, 20),
+    seed=st.integers(0, 1000),
+)
+def test_penalty_equals_reference(sizes: tuple[int, ...], times: int, channels: int, seed: int) -> None:
+    levels = make_levels(sizes, times, channels, seed=seed)
+    assert_all_close(run_penalty(plane_penalty, levels), run_penalty(reference_penalty, levels), 1e-13)
+
+
+def test_every_instruction_set_gives_the_same_penalty(instruction_set: str) -> None:
+    levels = make_levels((16, 33), 20, 19)
+    expected = run_penalty(reference_penalty, levels)
+    assert_all_close(run_penalty(plane_penalty, levels), expected, 1e-13)
+    singles = [PlaneLevel(x.space.float(), x.time.float()) for x in levels]
+    rounded = run_penalty(reference_penalty, [PlaneLevel(x.space.double(), x.time.double()) for x in singles])
+    assert_all_close(run_penalty(plane_penalty, singles), rounded, 1e-6)  # some ten roundings of 6e-8
+
+
+def test_straight_planes_of_ones_cost_nothing() -> None:
+    ramp = torch.arange(8, dtype=torch.float64)
+    space = (ramp[:, None] + 3 * ramp)[None, :, :, None].repeat(3, 1, 1, 4)
+    value, g_space, g_time = run_penalty(plane_penalty, [PlaneLevel(space, torch.ones(3, 5, 8, 4).double())])
+    assert value == 0
+    assert not g_space.any()
+    assert not g_time.any()
+
+
+def test_known_penalty() -> None:
+    space, time = torch.zeros(3, 3, 3, 1), torch.ones(3, 3, 3, 1)
+    space[0, 1, 1, 0] = 1.0  # bends of -2 in the middle of one row and of one column, out of three each
+    time[1, 1, 2, 0] = 4.0  # a bend of -6, out of three; 3 away from 1, out of nine
+    level = [PlaneLevel(space, time)]
+    assert plane_penalty(level, (1.0, 0.0, 0.0)).item() == pytest.approx(4 / 3)
+    assert plane_penalty(level, (0.0, 1.0, 0.0)).item() == pytest.approx(12)
+    assert plane_penalty(level, (0.0, 0.0, 1.0)).item() == pytest.approx(1 / 3)
+
+
+def test_penalty_can_be_differentiated_again() -> None:
+    (level,) = with_gradients(make_levels((6,), 5, 3))
+    value = plane_penalty([level], WEIGHTS)
+    (first,) = torch.autograd.grad(value, level.space, retain_graph=True)
+    (second,) = torch.autograd.grad(3 * value, level.space)
+    torch.testing.assert_close(second, 3 * first)
+
+
+def test_penalty_without_gradient_has_the_same_value() -> None:
+    levels = with_gradients(make_levels((6,), 5, 3))
+    with torch.no_grad():
+        value = plane_penalty(levels, WEIGHTS)
+    assert not value.requires_grad
+    assert torch.equal(value, plane_penalty(levels, WEIGHTS).detach())
+
+
+def test_nan_in_a_plane_shows_in_the_penalty() -> None:
+    (level,) = make_levels((6,), 5, 3)
+    level.time[0, 2, 3, 1] = math.nan
+    assert plane_penalty([level], WEIGHTS).isnan()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c, x: (c, 0.5, []), "at least one level"),
+        (lambda c, x: (c[:, :2], 0.5, x), r"coordinates must be \(M, 3\)"),
+        (lambda c, x: (c.double(), 0.5, x), "coordinates must be torch.float32"),
+        (lambda c, x: (c, math.nan, x), "time must be a number"),
+        (lambda c, x: (c, 0.5, [PlaneLevel(x[0].space[:2], x[0].time)]), "level 0 must have space"),
+        (lambda c, x: (c, 0.5, [x[0], PlaneLevel(x[1].space, x[0].time)]), "level 1 must have space"),
+        (lambda c, x: (c, 0.5, [x[0], PlaneLevel(x[1].space[..., :4], x[1].time[..., :4])]), "level 1 must have"),
+        (lambda c, x: (c, 0.5, [PlaneLevel(x[0].space, x[0].time[:, :0])]), "none empty"),
+        (lambda c, x: (c, 0.5, [PlaneLevel(x[0].space, x[0].time.double())]), "level 0 must be torch.float32"),
+        (lambda c, x: (c, 0.5, [PlaneLevel(x[0].space.half(), x[0].time.half())]), "in float32 or float64"),
+    ],
+)
+def test_input_that_does_not_fit(
+    change: Callable[[Tensor, list[PlaneLevel]], tuple[Tensor, float, list[PlaneLevel]]], message: str
+) -> None:
+    levels = make_levels((4, 6), 3, 5, torch.float32)
+    with pytest.raises(DyngsError, match=message):
+        hexplane_features(*change(torch.zeros(7, 3), levels))
+
+
+def test_weights_must_be_finite() -> None:
+    with pytest.raises(DyngsError, match="weights must be finite"):
+        plane_penalty(make_levels((4,), 3, 5), (1.0, math.nan, 0.0))
+
+
+def test_the_kernels_refuse_arrays_that_do_not_fit() -> None:
+    (level,) = make_levels((4,), 3, 5, torch.float32)
+    arrays = [(level.space, level.time)]
+    with pytest.raises(ValueError, match="different sizes"):
+        core.hexplane_forward(torch.zeros(7, 3), arrays, 0.5, torch.zeros(6, 5), torch.zeros(7, dtype=torch.int32), 1)
+    with pytest.raises(ValueError, match="another size than the planes"):
+        core.plane_penalty(arrays, [(level.time, level.time)], WEIGHTS, 1)
