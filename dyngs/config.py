@@ -107,11 +107,26 @@ class MlpField(FieldSection):
     kind: Literal["mlp"] = "mlp"
     depth: int = Field(default=8, ge=2, description="hidden layers")
     width: int = Field(default=256, ge=1)
-    nodes: int = Field(default=0, ge=0, description="evaluate only at so many points (SC-GS); 0 = at every Gaussian")
     space_frequencies: int = Field(default=10, ge=0, le=16)
     time_frequencies: int = Field(default=6, ge=0, le=16)
     lr: Positive = 8e-4
     lr_decay: Fraction = Field(default=0.002, description="last over first rate")
+
+
+class SkeletonField(FieldSection):
+    """Control nodes with a pose at key times, which Gaussians around them follow (after SC-GS, Huang et al. 2024)."""
+
+    kind: Literal["skeleton"] = "skeleton"
+    nodes: int = Field(default=512, ge=1)
+    keys: int = Field(default=0, ge=0, description="key times; 0 = half the number of training times")
+    lr_means: Positive = Field(default=2e-4, description="times the scene extent")
+    lr_quats: Positive = 2e-3
+    lr_scales: Positive = 1e-3
+    lr_opacities: Positive = 1e-2
+    lr_colors: Positive = 2e-3
+    lr_decay: Fraction = Field(default=0.01, description="last over first rate")
+    rigidity: float = Field(default=0.1, ge=0, description="weight of neighbours' strain, squared node spacings")
+    smoothness: float = Field(default=0.01, ge=0, description="weight of the acceleration between keys")
 
 
 class TrajectoryField(FieldSection):
@@ -126,11 +141,14 @@ class TrajectoryField(FieldSection):
     rigidity: float = Field(default=0.0, ge=0, description="weight of neighbours' differing motion")
 
 
+DeformField = HexplaneField | MlpField | TrajectoryField | SkeletonField
+
+
 class DynamicModel(SceneModel):
     """Canonical Gaussians and a deformation field over time. Step numbers follow ``train.steps``."""
 
     kind: Literal["dynamic"] = "dynamic"
-    deform: Annotated[HexplaneField | MlpField | TrajectoryField, Field(discriminator="kind")] = HexplaneField()
+    deform: Annotated[DeformField, Field(discriminator="kind")] = HexplaneField()
     coarse: Fraction = Field(default=0.13, description="share of the run that trains without motion")
     first_views: Fraction = Field(default=0.1, description="share of the views, around the middle, to start with")
     all_views_at: Fraction = Field(default=0.4, description="share of the run from which all times are trained on")

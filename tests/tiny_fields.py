@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from scenes import random_scene
 
-from dyngs.config import HexplaneField, MlpField, TrajectoryField
+from dyngs.config import (
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    DynamicModel,
+    HexplaneField,
+    MlpField,
+    RandomInit,
+    RunConfig,
+    SkeletonField,
+    TrainConfig,
+    TrajectoryField,
+)
+from dyngs.data.synthetic import DynamicOptions, write_dynamic_capture
 from dyngs.deform.field import DeformationField, FieldSetup
 from dyngs.deform.fields import FieldOptions, new_field
 from dyngs.gaussians import Gaussians
 
-KINDS = ("hexplane", "mlp", "nodes", "trajectory")
-"""``nodes`` is the perceptron evaluated at control nodes."""
+KINDS = ("hexplane", "mlp", "skeleton", "trajectory")
 HEADS = ("move_rotations", "move_scales", "move_opacities", "move_colors")
 TIMES = (0.0, 0.37, 1.0)
 
@@ -23,8 +37,9 @@ def tiny_options(kind: str, *, everything: bool = True) -> FieldOptions:
         return HexplaneField(channels=3, resolution=5, levels=(1, 2), width=8, **heads)
     if kind == "trajectory":
         return TrajectoryField(polynomial=2, fourier=1, **heads)
-    nodes = 4 if kind == "nodes" else 0
-    return MlpField(depth=2, width=8, nodes=nodes, space_frequencies=2, time_frequencies=2, **heads)
+    if kind == "skeleton":
+        return SkeletonField(nodes=5, keys=4, **heads)
+    return MlpField(depth=2, width=8, space_frequencies=2, time_frequencies=2, **heads)
 
 
 def tiny_setup(num_moving: int = 9, num_times: int = 10) -> FieldSetup:
@@ -39,14 +54,55 @@ def tiny_field(kind: str, num_moving: int = 9, *, everything: bool = True) -> De
 
 
 def stirred_field(kind: str, num_moving: int = 9, *, size: float = 0.2, everything: bool = True) -> DeformationField:
-    """A field as after training: all that is learned has some noise on it."""
+    """A field as after training: all that is learned has some noise on it, and no unit of the networks is silent.
+
+    A skeleton has its nodes among the first means of ``cloud``.
+    """
     field = tiny_field(kind, num_moving, everything=everything)
-    generator = torch.Generator().manual_seed(4)
-    for x in field.learned.values().values():
-        x += size * torch.randn(x.shape, generator=generator)
+    field.offsets(cloud(num_moving).means, 0.0)
+    stir(field, size)
     return field
+
+
+def stir(field: DeformationField, size: float = 0.2) -> None:
+    """Put noise on all that is learned."""
+    generator = torch.Generator().manual_seed(4)
+    for name, x in field.learned.values().items():
+        noise = size * torch.randn(x.shape, generator=generator)
+        x += noise.abs() if name.startswith(("bias", "space")) else noise
 
 
 def cloud(count: int = 9, seed: int = 0) -> Gaussians:
     """Random float32 Gaussians around the origin, of SH degree 1."""
     return random_scene(n=count, seed=seed).to(torch.float32).gaussians
+
+
+def write_tiny_capture(root: Path) -> Path:
+    """Sixteen pictures of 24x24 px of a scene in which a die turns and a ball rolls."""
+    options = DynamicOptions(size=24, num_times=16, num_test=1, samples=1)
+    return write_dynamic_capture("spin", root, options)
+
+
+def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Config:
+    """A run of 24 steps in which all happens: motion from step 3 on, all times from 10, splits from 11 on.
+
+    The set of Gaussians changes each third step; the field learns so fast that after some steps a part of the Gaussians
+    is seen to move.
+    """
+    rates = {
+        "hexplane": {"lr_planes": 1e-2, "lr_decoder": 1e-2},
+        "mlp": {"lr": 1e-2},
+        "skeleton": {"lr_means": 1e-2},
+        "trajectory": {"lr_means": 1e-2},
+    }
+    field = tiny_options(kind).model_copy(update=rates[kind])
+    still_below = 1.0 if kind in ("skeleton", "trajectory") else 0.3
+    options = {"sh_degree": 1, "deform": field, "still_below": still_below, "time_jitter": 0.1, **model}
+    return Config(
+        data=DataConfig(root=capture),
+        model=DynamicModel.model_validate(options),
+        init=RandomInit(num_random=60),
+        strategy=DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=300),
+        train=TrainConfig(steps=24, log_every=1),
+        run=RunConfig(dir=run_dir, threads=1),
+    )

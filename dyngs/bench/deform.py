@@ -127,7 +127,9 @@ def format_report(report: DeformReport) -> str:
     lines += [f"{name:<24}{ms:10.2f}{1e3 / ms:10.1f}" for name, ms in report.steps.items()]
     lines += [f"{name:<24}{ms:10.2f}" for name, ms in report.stages.items()]
     faster = report.steps[VARIANTS[2]] / report.steps[VARIANTS[1]]
-    lines.append(f"the field takes {report.field_share:.0%} of a step; the static split makes steps {faster:.2f}x faster")
+    lines.append(
+        f"the field takes {report.field_share:.0%} of a step; the static split makes steps {faster:.2f}x faster"
+    )
     return "\n".join(lines)
 
 
@@ -180,7 +182,7 @@ def _field_stages(trainer: Trainer, rounds: int) -> dict[str, float]:
         outputs = [x for x in vars(offsets).values() if x is not None]
         forward = time.perf_counter() - start
         backward = _seconds(lambda o=outputs: torch.autograd.backward(o, [torch.ones_like(x) for x in o]))
-        penalty = _seconds(lambda: [p.backward() for p in field.penalties().values()])
+        penalty = _seconds(lambda: [p.backward() for p in field.penalties(0.37).values()])
         adam = _seconds(lambda: field.learned.step(10**6, 1.0))
         if number:
             for name, seconds in zip(FIELD_STAGES, (forward, backward, penalty, adam), strict=True):

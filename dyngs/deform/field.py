@@ -68,8 +68,8 @@ class DeformationField(Protocol):
         """What moves at ``time`` in [0, 1], for the canonical ``means`` (M, 3) of all moving Gaussians in order."""
         ...
 
-    def penalties(self) -> dict[str, Tensor]:
-        """Differentiable regularizers of the field itself, weighted, by name."""
+    def penalties(self, time: float) -> dict[str, Tensor]:
+        """Differentiable regularizers of the field itself, weighted, by name; some look at ``time`` only."""
         ...
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
@@ -99,7 +99,7 @@ def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None)
 
 
 def turned_quats(quats: Tensor, offsets: Tensor) -> Tensor:
-    """(M, 4) the rotations ``quats`` followed by those of identity + ``offsets``: a Hamilton product, not normalised."""
+    """(M, 4) the rotations ``quats`` followed by identity + ``offsets``: a Hamilton product, not normalised."""
     w1, x1, y1, z1 = (offsets + offsets.new_tensor([1.0, 0.0, 0.0, 0.0])).unbind(-1)
     w2, x2, y2, z2 = quats.unbind(-1)
     return torch.stack(

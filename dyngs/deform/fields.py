@@ -7,21 +7,22 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dyngs.config import HexplaneField, MlpField, TrajectoryField
+from dyngs.config import DeformField, HexplaneField, MlpField, SkeletonField
 from dyngs.deform.field import DeformationField, FieldSetup
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
+from dyngs.deform.skeleton import Skeleton
 from dyngs.deform.trajectory import Trajectory
 
-FieldOptions = HexplaneField | MlpField | TrajectoryField
 
-
-def new_field(options: FieldOptions, setup: FieldSetup, generator: torch.Generator) -> DeformationField:
+def new_field(options: DeformField, setup: FieldSetup, generator: torch.Generator) -> DeformationField:
     """An untrained field of the kind asked for: every Gaussian stays where it is."""
     if isinstance(options, HexplaneField):
         return Hexplane(options, setup, generator)
     if isinstance(options, MlpField):
         return Mlp(options, setup, generator)
+    if isinstance(options, SkeletonField):
+        return Skeleton(options, setup, generator)
     return Trajectory(options, setup, generator)
 
 
@@ -35,9 +36,9 @@ def field_state(field: DeformationField, setup: FieldSetup) -> dict[str, Tensor]
 
 
 def restored_field(
-    options: FieldOptions, state: Mapping[str, Tensor], num_moving: int
+    options: DeformField, state: Mapping[str, Tensor], num_moving: int
 ) -> tuple[DeformationField, FieldSetup]:
-    """The field of a checkpoint for M moving Gaussians, and its setup. Raises KeyError where ``state`` lacks something."""
+    """The field of a checkpoint for M moving Gaussians, and its setup. Raises KeyError where something is missing."""
     num_times, extent = state["numbers"].tolist()
     setup = FieldSetup(state["box"][0], state["box"][1], int(num_times), num_moving, extent)
     field = new_field(options, setup, torch.Generator())

@@ -1,4 +1,4 @@
-"""Planes over pairs of space and time axes with a small decoder (4DGS: Wu et al. 2024; K-Planes: Fridovich-Keil et al. 2023)."""
+"""Planes over pairs of space and time axes with a small decoder (4DGS: Wu et al. 2024)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ class Hexplane:
     """Features from six planes per level, decoded into offsets.
 
     Time covers the planes' whole range, and the decoder's last layer starts at zero, so that the field starts as the
-    identity. Each head has as many hidden units as the trunk; the last layer may mix them (in Wu et al. it is block-diagonal).
+    identity. Each head has as many hidden units as the trunk; the last layer may mix them (in Wu et al. it is
+    block-diagonal).
     """
 
     def __init__(self, options: HexplaneField, setup: FieldSetup, generator: torch.Generator) -> None:
@@ -54,7 +55,7 @@ class Hexplane:
         features = hexplane_features(coords, time, self.levels)
         return split_heads(self.decoder(features, self.learned), self.options)
 
-    def penalties(self) -> dict[str, Tensor]:
+    def penalties(self, time: float) -> dict[str, Tensor]:
         options = self.options
         weights = (options.space_smoothness, options.time_smoothness, options.time_sparsity)
         return {"plane smoothness": plane_penalty(self.levels, weights)} if any(weights) else {}
@@ -64,9 +65,9 @@ class Hexplane:
         """Copy the outermost rows of time that have been trained to those that will be next."""
         for level in self.levels:
             planes, last = level.time.data, level.time.shape[1] - 1
-            old_low, old_high = math.floor(seen[0] * last), math.ceil(seen[1] * last)
-            planes[:, max(math.floor(soon[0] * last), 0) : max(old_low, 0)] = planes[:, max(old_low, 0), None]
-            planes[:, min(old_high, last) + 1 : min(math.ceil(soon[1] * last), last) + 1] = planes[:, min(old_high, last), None]
+            low, high = max(math.floor(seen[0] * last), 0), min(math.ceil(seen[1] * last), last)
+            planes[:, max(math.floor(soon[0] * last), 0) : low] = planes[:, low, None]
+            planes[:, high + 1 : math.ceil(soon[1] * last) + 1] = planes[:, high, None]
 
     def select(self, index: Tensor, is_new: Tensor) -> None:
         """Nothing: no part of the field belongs to one Gaussian."""

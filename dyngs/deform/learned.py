@@ -55,6 +55,14 @@ class LearnedTensors:
             x.grad = None
         return left_out
 
+    def rearrange(self, name: str, values: Tensor, source: Tensor, is_new: Tensor) -> None:
+        """Exchange one tensor for ``values``; row i takes the moments of the old row ``source[i]``, a new one none."""
+        for moments in (self._exp_avg, self._exp_avg_sq):
+            moved = torch.zeros_like(values)
+            moved[~is_new] = moments[name][source[~is_new]]
+            moments[name] = moved
+        self._tensors[name] = _leaf(values)
+
     def select(self, name: str, index: Tensor, is_new: Tensor) -> None:
         """Rearrange the rows of one tensor; moments of new rows start at zero."""
         self._tensors[name] = _leaf(self._tensors[name].detach()[index])

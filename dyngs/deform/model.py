@@ -1,7 +1,7 @@
 """The dynamic model as the trainer sees it: canonical Gaussians, a field that moves some of them, and which ones.
 
-Training goes through three phases: coarse (nothing moves), fine (the field moves all Gaussians), and from the first split
-on the field moves only those whose motion can be seen; the others are frozen where they are and cost nothing more.
+Training goes through three phases: coarse (nothing moves), fine (the field moves all Gaussians), and from the first
+split on the field moves only those whose motion can be seen; the others are frozen and cost nothing more.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from dyngs.config import DynamicModel
 from dyngs.data.loader import Picture
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import field_state, new_field, part_of, restored_field
-from dyngs.deform.window import TimeWindow
 from dyngs.deform.motion import bake_, measure_motion, select_offsets
+from dyngs.deform.window import TimeWindow
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.static.densify import EditResult
 from dyngs.static.filters import FILTER_VARIANCE, filter_std
@@ -96,14 +96,15 @@ class DynamicScene:
         """What is drawn for ``batch`` at its time, and the regularizers of motion; differentiable."""
         if self.field is None:
             return self._still.gaussians_at(parameters, batch, step)
-        means = parameters.means if self.rows is None else parameters.means.detach()[self.rows]
-        offsets = self.field.offsets(means, self._jittered(batch.time or 0.0, step))
+        means = parameters.means if self.rows is None else parameters.means.index_select(0, self.rows)
+        time = self._jittered(batch.time or 0.0, step)
+        offsets = self.field.offsets(means, time)
         moved = deformed(parameters, offsets, self.rows)
         drawn = self._still.gaussians_at(moved, batch, step)
-        return Drawn(drawn.gaussians, drawn.penalties | self.field.penalties() | self._sparsity(offsets))
+        return Drawn(drawn.gaussians, drawn.penalties | self.field.penalties(time) | self._sparsity(offsets))
 
     def after_step(self, parameters: Gaussians, step: int, result: EditResult | None) -> int:
-        """Rows left out for bad gradients; optimizes the field, follows ``result``, begins what begins after ``step``."""
+        """Rows left out for bad gradients; optimizes the field, follows ``result``, begins the next phase."""
         self._still.after_step(parameters, step, result)
         left_out = 0
         if self.field is not None:

@@ -34,8 +34,8 @@ class Motion:
 def measure_motion(field: DeformationField, gaussians: Gaussians, times: Sequence[float], px_size: Tensor) -> Motion:
     """Motion of M Gaussians over ``times``.
 
-    The score is max_t |x_t - mean| + s (2 |q_t - mean| + max_axis |log s_t - mean|) over the size of a pixel, s being the
-    Gaussian's longest standard deviation, plus ``PX_PER_OPACITY`` times the change of opacity and colour.
+    The score is max_t |x_t - mean| + s (2 |q_t - mean| + max_axis |log s_t - mean|) over the size of a pixel, s being
+    the Gaussian's longest standard deviation, plus ``PX_PER_OPACITY`` times the change of opacity and colour.
 
     Args:
         gaussians: the M canonical Gaussians that the field moves.

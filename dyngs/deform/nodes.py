@@ -1,4 +1,4 @@
-"""Sparse control nodes: a field is asked at a few points only, and Gaussians follow the nearest of them (SC-GS: Huang et al. 2024).
+"""Sparse control nodes and how Gaussians follow them: linear blend skinning (SC-GS: Huang et al. 2024).
 
 Local letters: S nodes, B nodes that one Gaussian follows.
 """
@@ -14,18 +14,16 @@ from dyngs.deform.field import Offsets
 
 FOLLOWED = 4
 """Nodes that a Gaussian follows."""
-SPREAD = 1.0
-"""Radius of a node's influence, in distances to its nearest neighbours."""
 
 
 @dataclass(frozen=True)
 class Nodes:
-    """Control nodes among M Gaussians.
+    """Control nodes, and which of them M points follow.
 
     Attributes:
         positions: (S, 3) canonical.
-        radii: (S,) of influence, world units.
-        followed: (M, B) indices of the nodes that each Gaussian follows, nearest first.
+        radii: (S,) of influence, world units: the mean distance to the nearest other nodes.
+        followed: (M, B) indices of the nodes that each point follows, nearest first.
     """
 
     positions: Tensor
@@ -33,47 +31,51 @@ class Nodes:
     followed: Tensor
 
     def weights(self, means: Tensor) -> Tensor:
-        """(M, B) shares of the followed nodes: Gaussians of the distance, normalised; rows add up to 1."""
-        apart = (means[:, None] - self.positions[self.followed]).square().sum(-1)
+        """(M, B) shares of the followed nodes: Gaussians of the distance, normalised; constant in ``means``."""
+        apart = (means.detach()[:, None] - self.positions[self.followed]).square().sum(-1)
         return torch.softmax(-0.5 * apart / self.radii[self.followed].square(), dim=1)
 
 
-def place_nodes(means: Tensor, count: int) -> Nodes:
-    """At most ``count`` nodes spread evenly over ``means`` (M, 3): each is the mean farthest from those before it."""
-    from scipy.spatial import KDTree
-
-    points = means.detach().double()
-    positions = points[farthest_points(points, count)]
-    tree = KDTree(positions.numpy())
-    gaps, _ = tree.query(positions.numpy(), k=min(FOLLOWED, len(positions)))
-    radii = torch.from_numpy(gaps).reshape(len(positions), -1)[:, 1:].mean(1) if len(positions) > 1 else torch.ones(1)
-    _, followed = tree.query(points.numpy(), k=min(FOLLOWED, len(positions)))
+def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
+    """The nodes at ``positions`` (S, 3), at least one, followed by the points ``means`` (M, 3)."""
+    tree, places, points = _tree(positions), positions.double().numpy(), means.detach().double().numpy()
+    count = min(FOLLOWED, len(positions))
+    gaps = torch.from_numpy(tree.query(places, k=count)[0]).reshape(len(positions), -1)
+    radii = gaps[:, 1:].mean(1) if count > 1 else torch.ones(len(positions), dtype=torch.float64)
+    followed = torch.from_numpy(tree.query(points, k=count)[1]).reshape(len(points), -1)
     floor = max(1e-6 * float(radii.max()), 1e-12)
-    return Nodes(
-        positions.to(means),
-        (SPREAD * radii).clamp_min(floor).to(means),
-        torch.from_numpy(followed).reshape(len(points), -1),
-    )
+    return Nodes(positions, radii.clamp_min(floor).to(positions), followed)
 
 
-def farthest_points(points: Tensor, count: int) -> Tensor:
-    """(S,) indices of at most ``count`` of the ``points`` (M, 3), the first nearest to their mean; no two coincide."""
-    chosen = [int((points - points.mean(0)).square().sum(1).argmin())]
-    apart = (points - points[chosen[0]]).square().sum(1)
+def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
+    """Indices of at most ``count`` of the ``points`` (M, 3), each the farthest from those before it and from ``taken``.
+
+    None coincides with another or with one of ``taken`` (S, 3). Without those, the first is nearest to the mean.
+    """
+    points = points.detach().double()
+    chosen: list[int] = []
+    if len(taken):
+        nearest, _ = _tree(taken).query(points.numpy())
+        apart = torch.from_numpy(nearest).square()
+    elif count and len(points):
+        chosen = [int((points - points.mean(0)).square().sum(1).argmin())]
+        apart = (points - points[chosen[0]]).square().sum(1)
+    else:
+        return torch.zeros(0, dtype=torch.long)
     while len(chosen) < min(count, len(points)):
         farthest = int(apart.argmax())
         if float(apart[farthest]) <= 0:
             break
         chosen.append(farthest)
         apart = torch.minimum(apart, (points - points[farthest]).square().sum(1))
-    return torch.tensor(chosen)
+    return torch.tensor(chosen, dtype=torch.long)
 
 
 def follow(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:
-    """Offsets of the Gaussians at ``means`` (M, 3) from those of the nodes: linear blend skinning.
+    """Offsets of the points ``means`` (M, 3) from those of the nodes.
 
-    A node turns what follows it about its own place: x' = sum_b w_b (R_b (x - p_b) + p_b + d_b). All other offsets are
-    blended alike.
+    A node turns what follows it about its own place: x' = sum_b w_b (R_b (x - p_b) + p_b + d_b); differentiable in x,
+    the weights taken as constant. All other offsets are blended alike.
     """
     weights, followed = nodes.weights(means), nodes.followed
     moved = at_nodes.means[followed]
@@ -95,3 +97,9 @@ def turned(offsets: Tensor, vectors: Tensor) -> Tensor:
     w, axis = unit[..., :1], unit[..., 1:]
     twice = 2 * torch.linalg.cross(axis, vectors)
     return vectors + w * twice + torch.linalg.cross(axis, twice)
+
+
+def _tree(points: Tensor):
+    from scipy.spatial import KDTree
+
+    return KDTree(points.double().numpy())

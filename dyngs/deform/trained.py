@@ -50,7 +50,9 @@ class TrainedScene:
     @property
     def num_field_values(self) -> int:
         """How many numbers the field holds."""
-        return 0 if self.field is None or self.is_still else sum(x.numel() for x in self.field.learned.values().values())
+        if self.field is None or self.is_still:
+            return 0
+        return self.field.learned.num_values + sum(x.numel() for x in self.field.buffers.values())
 
     @torch.no_grad()
     def at(self, time: float | None) -> Gaussians:

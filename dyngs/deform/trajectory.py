@@ -35,7 +35,7 @@ class Trajectory:
         parts = [torch.einsum("b,mbd->md", terms, self.learned[name]) for name in head_sizes(self.options)]
         return split_heads(torch.cat(parts, dim=1), self.options)
 
-    def penalties(self) -> dict[str, Tensor]:
+    def penalties(self, time: float) -> dict[str, Tensor]:
         return {}
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-MIN_VIEWS = 12
+MIN_VIEWS = 6
 MIDDLE = 0.5
 
 

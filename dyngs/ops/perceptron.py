@@ -1,19 +1,157 @@
-"""Placeholder in torch."""
+"""A small multilayer perceptron over many rows, fused on the CPU.
+
+Per-Gaussian decoders of deformation fields have tens of thousands of rows but layers of only 10 to 256 features. A
+matrix product, a bias and a ReLU per layer each go through memory once per step and direction; the fused kernel runs
+all layers of a hundred rows while they are in the cache. Its results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
+
 import torch
 from torch import Tensor
+from torch.nn.functional import linear
+
+from dyngs.errors import DyngsError
+from dyngs.ops.native import array, core, num_threads
+
+KEPT_BYTES = 2**30
+"""The backward pass computes the activations again where keeping them would take more memory than this."""
+
 
 @dataclass(frozen=True)
 class Layer:
+    """One linear layer ``weight @ h + bias``: weight (out, in) and bias (out,)."""
+
     weight: Tensor
     bias: Tensor
 
-def perceptron(x, layers, *, skip=None):
+
+def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
+    """(M, out) outputs of linear layers with a ReLU after each but the last, differentiable in ``x`` and the layers.
+
+    Only first derivatives exist on the CPU. A row with NaN gives an output row of NaN and leaves the other rows alone;
+    gradients by the layers are sums over all rows, so a NaN in one reaches them.
+
+    Args:
+        x: (M, K) inputs, any strides; M may be 0. Half precision is computed in float32.
+        layers: first to last, at least one; each takes the width that the one before gives.
+        skip: layer, from 1 on, whose input is the hidden activations followed by ``x``: its weight is
+            (out, width + K). As in NeRF (Mildenhall et al. 2020, figure 7), there for the layer after the fifth.
+
+    Raises:
+        DyngsError: no layer, shapes that do not fit, integer tensors, or tensors on different devices.
+    """
+    widths = _checked_widths(x, layers, skip)
+    dtype = reduce(torch.promote_types, (t.dtype for layer in layers for t in (layer.weight, layer.bias)), x.dtype)
+    dtype = torch.promote_types(dtype, torch.float32)
+    if x.device.type != "cpu":
+        return reference_perceptron(x, layers, skip=skip)
+    params = torch.cat([t.to(dtype).reshape(-1) for layer in layers for t in (layer.weight, layer.bias)])
+    x = x.to(dtype)
+    at = 0 if skip is None else skip
+    with_gradient = torch.is_grad_enabled() and (x.requires_grad or params.requires_grad)
+    return _perceptron(x, params, widths, at, with_gradient)[0]
+
+
+def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
+    """The value of `perceptron` in plain torch: any floating dtype and device, any order of derivatives."""
     h = x
-    for i, l in enumerate(layers):
-        if i == skip:
-            h = torch.cat([h, x], 1)
-        h = torch.addmm(l.bias, h, l.weight.T)
+    for i, layer in enumerate(layers):
+        h = linear(torch.cat([h, x], dim=1) if i == skip else h, layer.weight, layer.bias)
         if i + 1 < len(layers):
             h = h.relu()
     return h
+
+
+def _checked_widths(x: Tensor, layers: Sequence[Layer], skip: int | None) -> list[int]:
+    """Widths of the input and of every layer's output."""
+    if x.ndim != 2 or x.shape[1] == 0:
+        raise DyngsError(f"perceptron: the inputs must be (M, K) with K at least 1, got {tuple(x.shape)}")
+    if not layers:
+        raise DyngsError("perceptron: no layers; give at least one")
+    if skip is not None and not 1 <= skip < len(layers):
+        raise DyngsError(f"perceptron: skip={skip} must name one of the layers 1 to {len(layers) - 1}, or be None")
+    widths = [x.shape[1]]
+    for i, layer in enumerate(layers):
+        weight, bias = layer.weight, layer.bias
+        features = widths[-1] + (widths[0] if i == skip else 0)
+        if weight.ndim != 2 or weight.shape[0] == 0 or weight.shape[1] != features:
+            raise DyngsError(
+                f"perceptron: the weight of layer {i} must be (out, {features}), got {tuple(weight.shape)}"
+            )
+        if bias.shape != weight.shape[:1]:
+            raise DyngsError(f"perceptron: the bias of layer {i} must be ({weight.shape[0]},), got {tuple(bias.shape)}")
+        for tensor in (x, weight, bias):
+            if not tensor.is_floating_point():
+                raise DyngsError(f"perceptron: inputs and layers must be floating point, got {tensor.dtype}")
+            if tensor.device != x.device:
+                raise DyngsError(f"perceptron: the inputs are on {x.device}, but layer {i} on {tensor.device}")
+        widths.append(weight.shape[0])
+    return widths
+
+
+def _empty_kept(x: Tensor, widths: list[int], skip: int, keep: bool) -> Tensor:
+    """Room for the activations between the layers; empty unless asked for, and if they would take too much."""
+    size = x.shape[0] * core.perceptron_kept_per_row(widths, skip)
+    return x.new_empty(size if keep and size * x.element_size() <= KEPT_BYTES else 0)
+
+
+@torch.library.custom_op("dyngs::perceptron", mutates_args=(), device_types="cpu")
+def _perceptron(x: Tensor, params: Tensor, widths: list[int], skip: int, keep: bool) -> tuple[Tensor, Tensor]:
+    """Outputs (M, out), and the activations between the layers in the kernel's layout or an empty tensor."""
+    y = x.new_empty(x.shape[0], widths[-1])
+    kept = _empty_kept(x, widths, skip, keep)
+    arrays = (array(t) for t in (x, params, y))
+    core.perceptron_forward(*arrays, array(kept) if kept.numel() else None, widths, skip, num_threads())
+    return y, kept
+
+
+@_perceptron.register_fake
+def _(x: Tensor, params: Tensor, widths: list[int], skip: int, keep: bool) -> tuple[Tensor, Tensor]:
+    return x.new_empty(x.shape[0], widths[-1]), _empty_kept(x, widths, skip, keep)
+
+
+@torch.library.custom_op("dyngs::perceptron_backward", mutates_args=(), device_types="cpu")
+def _perceptron_backward(
+    inputs: list[Tensor], grad: Tensor, widths: list[int], skip: int, with_x: bool
+) -> tuple[Tensor, Tensor]:
+    """Gradients by ``x``, empty unless asked for, and by the parameters. ``inputs`` are x, params and kept."""
+    x, params, kept = inputs
+    grad_x = x.new_empty(x.shape if with_x else (0,))
+    grad_params = params.new_empty(params.shape)
+    core.perceptron_backward(
+        *(array(t) for t in (x, params, grad)),
+        array(kept) if kept.numel() else None,
+        array(grad_x) if with_x else None,
+        array(grad_params),
+        widths,
+        skip,
+        num_threads(),
+    )
+    return grad_x, grad_params
+
+
+@_perceptron_backward.register_fake
+def _(inputs: list[Tensor], grad: Tensor, widths: list[int], skip: int, with_x: bool) -> tuple[Tensor, Tensor]:
+    x, params, _ = inputs
+    return x.new_empty(x.shape if with_x else (0,)), params.new_empty(params.shape)
+
+
+def _setup_context(ctx, inputs, output) -> None:
+    x, params, ctx.widths, ctx.skip, _ = inputs
+    _, kept = output
+    ctx.mark_non_differentiable(kept)
+    ctx.save_for_backward(x, params, kept)
+
+
+def _backward(ctx, grad: Tensor, _: Tensor | None):
+    with_x = ctx.needs_input_grad[0]
+    grad_x, grad_params = _perceptron_backward(list(ctx.saved_tensors), grad, ctx.widths, ctx.skip, with_x)
+    return grad_x if with_x else None, grad_params, None, None, None
+
+
+_perceptron.register_autograd(_backward, setup_context=_setup_context)

@@ -20,9 +20,9 @@ from torch import Tensor
 from dyngs.config import Config, SceneModel
 from dyngs.config_io import load_resolved
 from dyngs.data.write import whole_file, write_text
+from dyngs.deform.trained import TrainedScene, trained_scene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.deform.trained import TrainedScene, trained_scene
 
 FORMAT_VERSION = 1
 KEEP_CHECKPOINTS = 2

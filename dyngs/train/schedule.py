@@ -83,7 +83,7 @@ def filter_steps(strategy: DefaultStrategy | McmcStrategy, steps: int) -> range:
 
 
 def deform_schedule(model: DynamicModel, steps: int) -> DeformSchedule:
-    """The phases of a dynamic model in a run of ``steps``; where all may move (``still_below`` is 0) nothing is frozen."""
+    """The phases of a dynamic model in a run of ``steps``; where ``still_below`` is 0 nothing is ever frozen."""
     fine = min(max(1, round(model.coarse * steps)), steps)
     shares = [FIRST_SPLIT + i * SPLIT_GAP for i in range(round((LAST_SPLIT - FIRST_SPLIT) / SPLIT_GAP) + 1)]
     splits = sorted({round(share * steps) for share in shares}) if model.still_below > 0 else []

@@ -1,4 +1,4 @@
-"""The perceptron field: its encoding, its skip, and the control nodes that it may be asked at."""
+"""The perceptron field: its encoding, its skip, and what it depends on."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ def test_the_encoding_has_known_values() -> None:
 
 @pytest.mark.parametrize(("depth", "skips"), [(2, False), (SKIP_LAYER, False), (SKIP_LAYER + 1, True), (8, True)])
 def test_deep_networks_see_the_input_once_more(depth: int, skips: bool) -> None:
-    field = Mlp(MlpField(depth=depth, width=6, space_frequencies=1, time_frequencies=1), tiny_setup(), torch.Generator())
+    field = Mlp(
+        MlpField(depth=depth, width=6, space_frequencies=1, time_frequencies=1), tiny_setup(), torch.Generator()
+    )
     num_inputs = 3 * 3 + 3
     widths = [field.learned[f"weight{i}"].shape[1] for i in range(depth + 1)]
     expected = [num_inputs] + [6] * depth
@@ -39,48 +41,16 @@ def test_deep_networks_see_the_input_once_more(depth: int, skips: bool) -> None:
     assert not any(x.any() for x in outputs(field.offsets(cloud().means, 0.3)))
 
 
-@pytest.mark.parametrize("kind", ["mlp", "nodes"])
-def test_it_depends_on_place_and_time(kind: str) -> None:
-    field, means = stirred_field(kind), cloud().means
+def test_it_depends_on_place_and_time() -> None:
+    field, means = stirred_field("mlp"), cloud().means
     at_times = [torch.cat([x.reshape(9, -1) for x in outputs(field.offsets(means, t))], dim=1) for t in TIMES]
     assert not torch.allclose(at_times[0], at_times[1])
     assert not torch.allclose(at_times[1], at_times[2])
     assert not torch.allclose(at_times[1][0], at_times[1][1])
 
 
-def test_nodes_are_placed_once_and_anew_after_a_change_of_the_set() -> None:
-    field, means = stirred_field("nodes"), cloud().means
-    assert isinstance(field, Mlp)
-    field.offsets(means, 0.1)
-    placed = dict(field.buffers)
-    assert placed["positions"].shape == (4, 3)
-    assert placed["followed"].shape == (9, 4)
-    field.offsets(means + 0.01, 0.9)
-    assert all(torch.equal(field.buffers[name], x) for name, x in placed.items())
-    fewer = torch.tensor([0, 2, 5])
-    field.select(fewer, torch.zeros(3, dtype=torch.bool))
-    assert field.buffers == {}
-    field.offsets(means[fewer], 0.1)
-    assert field.buffers["followed"].shape == (3, 3)
-
-
-def test_with_a_node_at_each_gaussian_nodes_move_as_the_network_does() -> None:
-    """Gaussians far apart follow their own node alone."""
-    means = torch.tensor([[-1.0, 0, 0], [1, 0, 0], [0, 1.5, 0]])
-    field = stirred_field("nodes", 3)
-    assert isinstance(field, Mlp)
-    field.offsets(means, 0.3)
-    field.buffers["radii"] = torch.full((3,), 0.1)
-    plain = Mlp(field.options.model_copy(update={"nodes": 0}), field.setup, torch.Generator())
-    plain.learned = field.learned
-    expected = outputs(plain.offsets(means, 0.3))
-    for x, y in zip(outputs(field.offsets(means, 0.3)), expected, strict=True):
-        torch.testing.assert_close(x, y)
-
-
-@pytest.mark.parametrize("kind", ["mlp", "nodes"])
-def test_nothing_moving_is_no_error(kind: str) -> None:
-    offsets = stirred_field(kind).offsets(torch.zeros(0, 3), 0.5)
+def test_nothing_moving_is_no_error() -> None:
+    offsets = stirred_field("mlp").offsets(torch.zeros(0, 3), 0.5)
     assert offsets.means.shape == (0, 3)
     assert offsets.quats is not None
     assert offsets.quats.shape == (0, 4)
@@ -92,4 +62,4 @@ def test_extend_and_select_change_no_weight() -> None:
     field.extend((0.4, 0.6), (0.0, 1.0))
     field.select(torch.tensor([1, 1]), torch.tensor([False, True]))
     assert all(torch.equal(x, before[name]) for name, x in field.learned.state().items())
-    assert field.penalties() == {}
+    assert field.penalties(0.3) == {}

@@ -28,7 +28,7 @@ class Scripted:
         self.asked.append(time)
         return self.script(means, time)
 
-    def penalties(self) -> dict[str, Tensor]:
+    def penalties(self, time: float) -> dict[str, Tensor]:
         return {}
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None: ...
@@ -70,7 +70,9 @@ def test_a_circle_counts_by_its_radius() -> None:
 def test_a_constant_offset_is_no_motion() -> None:
     def constant(means: Tensor, t: float) -> Offsets:
         n = len(means)
-        return Offsets(filled(n, 5.0, -3, 1), filled(n, 0.1, 0.2, 0.3, 0.4), filled(n, 1.0, 1, 1), torch.ones(n), still(means))
+        return Offsets(
+            filled(n, 5.0, -3, 1), filled(n, 0.1, 0.2, 0.3, 0.4), filled(n, 1.0, 1, 1), torch.ones(n), still(means)
+        )
 
     assert score(constant).abs().max() < 1e-5
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.deform.field import Offsets
-from dyngs.deform.nodes import FOLLOWED, Nodes, farthest_points, follow, place_nodes, turned
+from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, spread_out, turned
 
 
 def points(count: int, seed: int = 0) -> Tensor:
@@ -29,6 +29,12 @@ def matrix(rotation: Rotation) -> Tensor:
     return torch.from_numpy(rotation.as_matrix())
 
 
+def place_nodes(means: Tensor, count: int) -> Nodes:
+    """Nodes spread over ``means``, which follow them."""
+    return nodes_at(means[spread_out(means, count, NONE)], means)
+
+
+NONE = torch.zeros(0, 3)
 IDENTITY = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
 
 
@@ -79,7 +85,9 @@ def test_all_other_offsets_are_blended() -> None:
     means = points(8)
     nodes = place_nodes(means, 5)
     values = torch.arange(5.0, dtype=torch.float64)
-    at_nodes = Offsets(torch.zeros(5, 3).double(), None, values[:, None].expand(5, 3), values, -values[:, None].expand(5, 3))
+    at_nodes = Offsets(
+        torch.zeros(5, 3).double(), None, values[:, None].expand(5, 3), values, -values[:, None].expand(5, 3)
+    )
     moved = follow(nodes, means, at_nodes)
     expected = (nodes.weights(means) * values[nodes.followed]).sum(1)
     assert moved.log_scales is not None
@@ -90,19 +98,19 @@ def test_all_other_offsets_are_blended() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(*[st.integers(-2, 2)] * 3), min_size=1, max_size=20), st.integers(1, 25))
-def test_farthest_points_are_distinct_and_the_same_each_time(places: list[tuple[int, ...]], count: int) -> None:
+def test_points_spread_out_are_distinct_and_the_same_each_time(places: list[tuple[int, ...]], count: int) -> None:
     """Also where many points coincide: there are as many as asked for, or as there are places."""
     x = torch.tensor(places, dtype=torch.float64)
-    chosen = farthest_points(x, count)
-    assert torch.equal(chosen, farthest_points(x, count))
+    chosen = spread_out(x, count, NONE)
+    assert torch.equal(chosen, spread_out(x, count, NONE))
     assert len({places[i] for i in chosen.tolist()}) == len(chosen) == min(count, len(set(places)))
 
 
-def test_farthest_points_start_in_the_middle_and_spread() -> None:
+def test_points_spread_out_start_in_the_middle_and_spread() -> None:
     """On a line of eleven: the middle, an end, the other end, then the quarters."""
     x = torch.zeros(11, 3, dtype=torch.float64)
     x[:, 0] = torch.arange(11)
-    chosen = farthest_points(x, 5).tolist()
+    chosen = spread_out(x, 5, NONE).tolist()
     assert chosen[0] == 5
     assert set(chosen[1:3]) == {0, 10}
     assert set(chosen[3:]) <= {2, 3, 7, 8}
@@ -137,15 +145,33 @@ def test_turned_is_a_rotation(seed: int) -> None:
     assert torch.equal(turned(-IDENTITY.expand(4, 4), vectors), vectors), "a zero quaternion turns nothing"
 
 
-def test_gradcheck_of_follow() -> None:
+def test_new_points_keep_away_from_those_taken() -> None:
+    """On a line of eleven with both ends taken: the middle, then the quarters; never a place that is taken."""
+    x = torch.zeros(11, 3, dtype=torch.float64)
+    x[:, 0] = torch.arange(11)
+    chosen = spread_out(x, 3, x[[0, 10]]).tolist()
+    assert chosen[0] == 5
+    assert {chosen[1] in (2, 3, 7, 8), chosen[2] in (2, 3, 7, 8)} == {True}
+    assert set(spread_out(x, 20, x[[0, 10]]).tolist()) == set(range(1, 10))
+    assert len(spread_out(x, 20, x)) == len(spread_out(x, 0, x[:1])) == 0
+    assert len(spread_out(x[:0], 3, NONE)) == len(spread_out(x[:0], 3, x[:2])) == 0
+
+
+def test_gradients_of_follow() -> None:
+    """By the nodes' offsets in double; by the place with constant weights: in a rigid motion the rotation."""
     means = points(4)
     nodes = place_nodes(means, 3)
     generator = torch.Generator().manual_seed(1)
     shapes = ((3, 3), (3, 4), (3, 3), (3,), (3, 3))
-    offsets = [0.3 * torch.randn(s, generator=generator, dtype=torch.float64) for s in shapes]
-    leaves = [x.requires_grad_() for x in (means.clone(), *offsets)]
+    leaves = [(0.3 * torch.randn(s, generator=generator, dtype=torch.float64)).requires_grad_() for s in shapes]
 
-    def moved(x: Tensor, *at_nodes: Tensor) -> tuple[Tensor, ...]:
-        return tuple(vars(follow(nodes, x, Offsets(*at_nodes))).values())
+    def moved(*at_nodes: Tensor) -> tuple[Tensor, ...]:
+        return tuple(vars(follow(nodes, means, Offsets(*at_nodes))).values())
 
     assert torch.autograd.gradcheck(moved, leaves)
+    rotation, quat, shift = rigid(5)
+    target = nodes.positions @ matrix(rotation).T + shift
+    at_nodes = Offsets(target - nodes.positions, (quat - IDENTITY).expand(3, 4))
+    x, direction = means.clone().requires_grad_(), points(4, seed=2)
+    (slope,) = torch.autograd.grad(((x + follow(nodes, x, at_nodes).means) * direction).sum(), [x])
+    torch.testing.assert_close(slope, direction @ matrix(rotation), rtol=0, atol=1e-12)

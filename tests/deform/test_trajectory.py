@@ -88,4 +88,4 @@ def test_the_place_does_not_matter_and_nothing_is_penalized() -> None:
     before = {name: x.clone() for name, x in field.learned.state().items()}
     field.extend((0.4, 0.6), (0.0, 1.0))
     assert all(torch.equal(x, before[name]) for name, x in field.learned.state().items())
-    assert field.penalties() == {}
+    assert field.penalties(0.3) == {}

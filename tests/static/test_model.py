@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.gaussians import Gaussians
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.static.densify import EditResult
 from dyngs.static.filters import filter_std, fuse_filter
 from dyngs.static.model import StaticScene
 
@@ -24,25 +25,40 @@ def _camera() -> Cameras:
 
 def test_without_filter_parameters_pass_through() -> None:
     model, gaussians = StaticScene(), _gaussians(2.0)
-    assert model.gaussians_at(gaussians, None) is gaussians
+    drawn = model.gaussians_at(gaussians, None, 1)
+    assert drawn.gaussians is gaussians
+    assert drawn.penalties == {}
+    assert model.after_step(gaussians, 1, EditResult(None)) == 0
     assert model.state() == {}
+
+
+def test_nothing_depends_on_time() -> None:
+    model = StaticScene()
+    assert all(model.trains_on(time, step) for time in (None, 0.0, 1.0) for step in (1, 1000))
+    assert model.num_moving(7) == 0
 
 
 def test_the_filter_is_kept_until_it_is_due() -> None:
     model = StaticScene([_camera()], range(100, 200, 100))
     near, far = _gaussians(2.0), _gaussians(4.0)
     with_near, with_far = (fuse_filter(far, filter_std(x.means, [_camera()])) for x in (near, far))
-    model.gaussians_at(near, None)
-    model.after_step(far, 50, edited=False)
-    assert torch.equal(model.gaussians_at(far, None).log_scales, with_near.log_scales)
-    model.after_step(far, 100, edited=False)
-    assert torch.equal(model.gaussians_at(far, None).log_scales, with_far.log_scales)
-    model.after_step(near, 101, edited=True)
-    assert torch.equal(model.gaussians_at(far, None).log_scales, with_near.log_scales)
+
+    def drawn(gaussians: Gaussians) -> Gaussians:
+        return model.gaussians_at(gaussians, None, 1).gaussians
+
+    drawn(near)
+    model.after_step(far, 50, None)
+    assert torch.equal(drawn(far).log_scales, with_near.log_scales)
+    model.after_step(far, 100, None)
+    assert torch.equal(drawn(far).log_scales, with_far.log_scales)
+    model.after_step(near, 101, EditResult(TopologyEdit.keep(torch.ones(3, dtype=torch.bool))))
+    assert torch.equal(drawn(far).log_scales, with_near.log_scales)
+    model.after_step(far, 102, EditResult(None))  # opacities were reset: where cameras look may have changed
+    assert torch.equal(drawn(far).log_scales, with_far.log_scales)
 
 
 def test_state_goes_round() -> None:
     first, second = StaticScene([_camera()]), StaticScene([_camera()])
-    drawn = first.gaussians_at(_gaussians(2.0), None)
+    drawn = first.gaussians_at(_gaussians(2.0), None, 1).gaussians
     second.load_state(first.state())
-    assert torch.equal(second.gaussians_at(_gaussians(2.0), None).log_scales, drawn.log_scales)
+    assert torch.equal(second.gaussians_at(_gaussians(4.0), None, 1).gaussians.log_scales[0], drawn.log_scales[0])

@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from dyngs.config import Config, DataConfig, DefaultStrategy, McmcStrategy, PointsInit, StaticModel
+from dyngs.config import (
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    DynamicModel,
+    McmcStrategy,
+    PointsInit,
+    RandomInit,
+    StaticModel,
+    TrainConfig,
+)
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic import StillOptions, write_still_capture
+from dyngs.deform.model import DynamicScene
 from dyngs.static.densify import DefaultDensifier
 from dyngs.static.mcmc import McmcDensifier
-from dyngs.train.assemble import assemble, resolved_background, surroundings, training_cameras
+from dyngs.static.model import StaticScene
+from dyngs.train.assemble import assemble, resolved_background, surroundings, training_cameras, training_times
 
 
 @pytest.fixture(scope="module")
@@ -68,3 +82,66 @@ def test_auto_background_is_white_only_behind_alpha(capture: Path) -> None:
     assert resolved_background(config, read.replace(has_alpha=False)) == "black"
     chosen = Config(data=DataConfig(root=capture, background="random"))
     assert resolved_background(chosen, read) == "random"
+
+
+def _with_times(capture: Path, out: Path, times: list[float] | None) -> Path:
+    """A copy of the capture whose training pictures have these times, and whose test pictures are taken at 0.5."""
+    shutil.copytree(capture, out)
+    for split in ("train", "test"):
+        file = out / f"transforms_{split}.json"
+        document = json.loads(file.read_text())
+        for i, frame in enumerate(document["frames"]):
+            frame |= {} if times is None else {"time": times[i] if split == "train" else 0.5}
+        file.write_text(json.dumps(document))
+    return out
+
+
+def _dynamic(capture: Path, **changes: object) -> Config:
+    config = Config(
+        data=DataConfig(root=capture),
+        model=DynamicModel(sh_degree=1),
+        init=RandomInit(num_random=50),
+        strategy=DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6),
+        train=TrainConfig(steps=12),
+    )
+    return config.model_copy(update=changes)
+
+
+def test_times_make_a_dynamic_model(capture: Path, tmp_path: Path) -> None:
+    root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
+    assert training_times(read_capture(DataConfig(root=root))) == (0.0, 0.25, 0.5, 0.5, 1.0)
+    model = assemble(_dynamic(root)).model
+    assert isinstance(model, DynamicScene)
+    assert model.times == (0.0, 0.25, 0.5, 1.0)
+    assert model.schedule.steps == 12
+    assert isinstance(assemble(_dynamic(root, model=StaticModel())).model, StaticScene)
+
+
+@pytest.mark.parametrize("times", [None, [0.5] * 5], ids=["no times", "one time"])
+@pytest.mark.parametrize("filter_3d", [False, True])
+def test_without_times_a_dynamic_config_is_a_static_one(
+    capture: Path, tmp_path: Path, times: list[float] | None, filter_3d: bool
+) -> None:
+    """The same bytes after some steps, among them changes of the set."""
+    root = _with_times(capture, tmp_path / "capture", times)
+    results = []
+    for model in (DynamicModel(sh_degree=1, filter_3d=filter_3d), StaticModel(sh_degree=1, filter_3d=filter_3d)):
+        trainer = assemble(_dynamic(root, model=model))
+        assert isinstance(trainer.model, StaticScene)
+        for _ in range(8):
+            trainer.step()
+        results.append(trainer.checkpoint())
+    assert len(results[0].tensors["gaussians.means"]) != 50
+    assert results[0].info == results[1].info
+    assert results[0].tensors.keys() == results[1].tensors.keys()
+    assert all(torch.equal(x, results[1].tensors[name]) for name, x in results[0].tensors.items())
+
+
+def test_the_coarse_phase_is_static_training_on_the_middle(capture: Path, tmp_path: Path) -> None:
+    """Until something moves, a dynamic run of few views is a static one, byte by byte."""
+    root = _with_times(capture, tmp_path / "timed", [0.0, 0.25, 0.5, 0.75, 1.0])
+    static, dynamic = (assemble(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(coarse=1.0)))
+    for _ in range(8):
+        assert static.step().loss == dynamic.step().loss
+    mine, others = static.optimizer.state(), dynamic.optimizer.state()
+    assert all(torch.equal(x, others[name]) for name, x in mine.items())

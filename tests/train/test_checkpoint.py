@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from moving_scene import MOVING_ROWS, TRAIN_TIMES, moved_x, write_moving_run
 
 from dyngs.config import Config, DataConfig, RunConfig, StaticModel
 from dyngs.config_io import RESOLVED_NAME, save_config
@@ -64,7 +65,7 @@ def test_what_is_saved_is_what_is_loaded(tmp_path: Path) -> None:
 
 def test_equal_checkpoints_have_equal_bytes_in_any_process(tmp_path: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; sys.path.insert(0, str(Path('tests/train')))\n"
+        "import sys; from pathlib import Path; sys.path[:0] = ['tests', 'tests/train']\n"
         "from test_checkpoint import _checkpoint; from dyngs.train.checkpoint import save_checkpoint\n"
         "save_checkpoint(Path(sys.argv[1]), _checkpoint(7), 99.0)"
     )
@@ -140,8 +141,8 @@ def test_load_run_gives_the_newest_model(tmp_path: Path) -> None:
     run = load_run(tmp_path)
     assert (run.step, run.seconds_train, run.config) == (10, 2.5, _config(tmp_path))
     assert run.info.world_offset == (1e6 + 0.25, 0.0, -3.0)
-    assert torch.equal(run.gaussians.sh, _checkpoint(10).tensors["gaussians.sh"])
-    assert torch.equal(run.gaussians.log_scales, _checkpoint(10).tensors["gaussians.log_scales"])
+    assert torch.equal(run.scene.gaussians.sh, _checkpoint(10).tensors["gaussians.sh"])
+    assert torch.equal(run.scene.gaussians.log_scales, _checkpoint(10).tensors["gaussians.log_scales"])
 
 
 def test_load_run_fuses_the_filter_of_a_filtered_model(tmp_path: Path) -> None:
@@ -149,8 +150,38 @@ def test_load_run_fuses_the_filter_of_a_filtered_model(tmp_path: Path) -> None:
     checkpoint = _checkpoint(5)
     save_checkpoint(tmp_path, checkpoint, 1.0)
     expected = fuse_filter(Gaussians(**checkpoint.part("gaussians")), checkpoint.tensors["model.filter_std"])
-    assert torch.equal(load_run(tmp_path).gaussians.log_scales, expected.log_scales)
-    assert torch.equal(load_run(tmp_path).gaussians.logit_opacities, expected.logit_opacities)
+    drawn = load_run(tmp_path).scene.at(None)
+    assert torch.equal(drawn.log_scales, expected.log_scales)
+    assert torch.equal(drawn.logit_opacities, expected.logit_opacities)
+
+
+def test_a_moving_scene_is_loaded_with_its_field(tmp_path: Path) -> None:
+    scene = load_run(write_moving_run(tmp_path)).scene
+    assert not scene.is_still
+    assert scene.rows.tolist() == list(MOVING_ROWS)
+    assert scene.times == TRAIN_TIMES
+    for time in (0.0, 0.3, 1.0):
+        torch.testing.assert_close(scene.at(time).means[:, 0], moved_x(tuple(range(5)), time))
+
+
+def test_a_field_that_lacks_something_is_named(tmp_path: Path) -> None:
+    run_dir = write_moving_run(tmp_path)
+    checkpoint = latest_checkpoint(run_dir)
+    tensors = {name: x for name, x in checkpoint.tensors.items() if name != "model.field.box"}
+    save_checkpoint(run_dir, replace(checkpoint, tensors=tensors), 1.0)
+    with pytest.raises(DyngsError, match="the checkpoint of step 7 lacks 'box'"):
+        load_run(run_dir)
+
+
+@pytest.mark.xfail(strict=True, reason="BUG: save_checkpoint looks only at gaussians.*; see the report of the tests")
+def test_a_field_that_is_not_finite_is_not_saved(tmp_path: Path) -> None:
+    run_dir = write_moving_run(tmp_path)
+    good = latest_checkpoint(run_dir)
+    bad = replace(good, info=replace(good.info, step=8), tensors=dict(good.tensors))
+    bad.tensors["model.field.learned.means"] = torch.full((2, 1, 3), math.nan)
+    with pytest.raises(DyngsError, match=r"field.*not finite after step 8.*step_0000007"):
+        save_checkpoint(run_dir, bad, 2.0)
+    assert latest_checkpoint(run_dir).info.step == 7
 
 
 def test_missing_things_are_named(tmp_path: Path) -> None:
@@ -162,6 +193,6 @@ def test_missing_things_are_named(tmp_path: Path) -> None:
     checkpoint = _checkpoint(5)
     without = {name: x for name, x in checkpoint.tensors.items() if name != "gaussians.sh"}
     save_checkpoint(tmp_path, replace(checkpoint, tensors=without), 1.0)
-    with pytest.raises(DyngsError, match="lacks sh"):
+    with pytest.raises(DyngsError, match="lacks 'sh'"):
         load_run(tmp_path)
     assert json.loads((tmp_path / "timing.json").read_text()) == {"seconds_train": {"5": 1.0}}

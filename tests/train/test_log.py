@@ -14,7 +14,7 @@ from dyngs.train.log import LogRecord, Progress, RunLog
 
 
 def _record(step: int, psnr: float | None = 20.0) -> LogRecord:
-    return LogRecord(step, loss=0.5, psnr=psnr, num_gaussians=1234, bad_gradients=0, seconds=float(step))
+    return LogRecord(step, loss=0.5, psnr=psnr, num_gaussians=1234, num_moving=56, bad_gradients=0, seconds=float(step))
 
 
 def _steps(path: Path) -> list[int]:
@@ -25,7 +25,8 @@ def test_each_line_is_on_disk_at_once(tmp_path: Path) -> None:
     with RunLog(tmp_path, 0) as log:
         log.write(_record(10))
         assert json.loads(log.path.read_text()) == {
-            "step": 10, "loss": 0.5, "psnr": 20.0, "num_gaussians": 1234, "bad_gradients": 0, "seconds": 10.0,
+            "step": 10, "loss": 0.5, "psnr": 20.0, "num_gaussians": 1234, "num_moving": 56,
+            "bad_gradients": 0, "seconds": 10.0,
         }  # fmt: skip
         log.write_scores(10, "test", 21.0, 0.9)
     assert _steps(log.path) == [10, 10]

@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.config import DefaultStrategy, McmcStrategy, OptimConfig, TrainConfig
+from dyngs.config import DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, TrainConfig
 from dyngs.train.schedule import (
     MIN_RESET_GAP,
     active_sh_degree,
+    deform_schedule,
     densify_schedule,
     filter_steps,
     grad_threshold,
@@ -86,3 +87,24 @@ def test_the_filter_is_refreshed_after_densification_only() -> None:
     steps = filter_steps(DefaultStrategy(), 7000)
     assert (steps[0], steps[-1], steps.step) == (3500, 6900, 100)
     assert len(filter_steps(DefaultStrategy(), 50)) == 0
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(1, 30_000), st.floats(0, 1), st.floats(0, 1))
+def test_phases_of_a_dynamic_model_come_in_order(steps: int, coarse: float, all_views_at: float) -> None:
+    """Coarse, fine, all times, splits; each within the run, and never is there none before motion begins."""
+    model = DynamicModel(coarse=coarse, all_views_at=all_views_at)
+    schedule = deform_schedule(model, steps)
+    assert schedule.steps == steps
+    assert 1 <= schedule.fine <= schedule.full <= steps
+    assert all(schedule.full < split <= steps for split in schedule.splits)
+    assert list(schedule.splits) == sorted(set(schedule.splits))
+    assert deform_schedule(model.model_copy(update={"still_below": 0.0}), steps).splits == ()
+
+
+def test_phases_of_runs_of_usual_lengths() -> None:
+    schedule = deform_schedule(DynamicModel(), 20_000)
+    assert (schedule.fine, schedule.full) == (2600, 8000)
+    assert schedule.splits == (9000, 10_000, 11_000, 12_000, 13_000, 14_000)
+    assert deform_schedule(DynamicModel(), 1).fine == 1
+    assert deform_schedule(DynamicModel(all_views_at=0.6), 1000).splits == (650, 700)

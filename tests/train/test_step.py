@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 import torch
+from moving_scene import TRAIN_TIMES, write_timed_capture
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig, RandomInit, RunConfig, StaticModel, TrainConfig
@@ -13,6 +15,8 @@ from dyngs.data.loader import Picture
 from dyngs.data.synthetic import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.static.densify import EditResult
+from dyngs.static.model import Drawn
 from dyngs.train.assemble import assemble
 from dyngs.train.step import Trainer
 
@@ -41,12 +45,22 @@ class _Lifted:
 
     def __init__(self) -> None:
         self.steps: list[int] = []
+        self.penalty = 0.0
 
-    def gaussians_at(self, parameters: Gaussians, batch: Picture) -> Gaussians:
-        return parameters.replace(means=parameters.means + torch.tensor([0.0, 0.0, 0.1]))
+    def trains_on(self, time: float | None, step: int) -> bool:
+        return True
 
-    def after_step(self, parameters: Gaussians, step: int, *, edited: bool) -> None:
+    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
+        lifted = parameters.replace(means=parameters.means + torch.tensor([0.0, 0.0, 0.1]))
+        penalties = {"height": self.penalty * parameters.means[:, 2].abs().sum()} if self.penalty else {}
+        return Drawn(lifted, penalties)
+
+    def after_step(self, parameters: Gaussians, step: int, result: EditResult | None) -> int:
         self.steps.append(step)
+        return 3
+
+    def num_moving(self, num_gaussians: int) -> int:
+        return num_gaussians
 
     def state(self) -> dict[str, Tensor]:
         return {"steps": torch.tensor(self.steps)}
@@ -67,6 +81,60 @@ def test_a_model_of_another_kind_is_trained(capture: Path) -> None:
     other.model = _Lifted()
     other.restore(trainer.checkpoint())
     assert other.step().loss == trainer.step().loss
+    assert trainer.bad_gradients == 3 * 31
+
+
+def test_penalties_of_the_model_are_part_of_the_loss(capture: Path) -> None:
+    plain, penalized = (_trainer(capture) for _ in range(2))
+    plain.model, penalized.model = _Lifted(), _Lifted()
+    penalized.model.penalty = 0.01
+    heights = plain.optimizer.parameters.means.detach()[:, 2].abs()
+    assert penalized.step().loss == pytest.approx(plain.step().loss + 0.01 * float(heights.sum()), rel=1e-5)
+    for _ in range(20):
+        penalized.step()
+    assert penalized.optimizer.parameters.means.detach()[:, 2].abs().mean() < heights.mean()
+
+
+class _Exploding(_Lifted):
+    """From step 3 on it draws positions and rotations that are not finite, and knows it by a penalty."""
+
+    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
+        if step < 3:
+            return super().gaussians_at(parameters, batch, step)
+        factor = float("nan")
+        drawn = parameters.replace(means=parameters.means * factor, quats=parameters.quats * factor)
+        return Drawn(drawn, {"motion": drawn.means.sum()})
+
+
+@pytest.mark.parametrize("timed", [False, True])
+def test_what_is_not_finite_is_named_in_one_line(capture: Path, tmp_path: Path, timed: bool) -> None:
+    """Step, view, term, attributes, and the time, if there is one; the parameters stay as they were."""
+    trainer = _trainer(write_timed_capture(tmp_path / "timed") if timed else capture)
+    trainer.model = _Exploding()
+    trainer.step()
+    trainer.step()
+    before = {name: x.detach().clone() for name, x in trainer.optimizer.parameters.tensors().items()}
+    with pytest.raises(DyngsError) as caught:
+        trainer.step()
+    message = str(caught.value)
+    assert re.match(r"step 3, view 'train/r_00\d': the loss term 'motion' is nan; the means, quats drawn", message)
+    assert bool(re.search(r"drawn at time (0|0\.25|0\.5|0\.75|1) are not finite", message)) == timed
+    assert ("model.deform" in message) == timed
+    assert "\n" not in message
+    assert trainer.done == 2
+    assert all(torch.equal(x, before[name]) for name, x in trainer.optimizer.parameters.tensors().items())
+
+
+def test_only_times_that_the_model_wants_are_trained_on(tmp_path: Path) -> None:
+    class _Early(_Lifted):
+        def trains_on(self, time: float | None, step: int) -> bool:
+            return time is not None and time <= 0.1 * step
+
+    trainer = _trainer(write_timed_capture(tmp_path))
+    trainer.model = _Early()
+    seen = [trainer.step().picture.time for _ in range(40)]
+    assert all(time is not None and time <= 0.1 * (i + 1) for i, time in enumerate(seen))
+    assert set(seen[20:]) == set(TRAIN_TIMES)
 
 
 @pytest.mark.parametrize(("choice", "value"), [("white", 1.0), ("black", 0.0), ("auto", 1.0)])

@@ -1,0 +1,147 @@
+"""Control nodes with a pose of their own at key times: no network, and a cost that hardly grows with the Gaussians.
+
+After SC-GS (Huang et al. 2024) and Dynamic 3D Gaussians (Luiten et al. 2024): nodes carry rigid motions, neighbours
+move alike, and a motion that leaves the times seen so far goes on at constant velocity.
+
+Local letters: S nodes, P key times.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from dyngs.config import SkeletonField
+from dyngs.deform.decoder import head_sizes
+from dyngs.deform.field import FieldSetup, Offsets
+from dyngs.deform.learned import LearnedTensors
+from dyngs.deform.nodes import Nodes, follow, nodes_at, spread_out, turned
+
+NOTHING = torch.zeros(0, 3)
+
+
+class Skeleton:
+    """Offsets of nodes at key times, linear in between, blended into those of the Gaussians that follow them.
+
+    Nodes are placed when first needed. Whenever the set of Gaussians has changed, nodes that nothing follows are
+    dropped and new ones start, with the motion found there, where Gaussians are farthest from any.
+    """
+
+    def __init__(self, options: SkeletonField, setup: FieldSetup, generator: torch.Generator) -> None:
+        self.options, self.setup = options, setup
+        self.num_keys = options.keys or max(2, (setup.num_times + 1) // 2)
+        self.buffers: dict[str, Tensor] = {"positions": NOTHING}
+        sizes = head_sizes(options)
+        tensors = {name: torch.zeros(0, self.num_keys, size) for name, size in sizes.items()}
+        rates = {
+            "means": options.lr_means * setup.extent,
+            "quats": options.lr_quats,
+            "log_scales": options.lr_scales,
+            "logit_opacities": options.lr_opacities,
+            "colors": options.lr_colors,
+        }
+        self.learned = LearnedTensors(tensors, {name: rates[name] for name in sizes}, options.lr_decay)
+
+    def offsets(self, means: Tensor, time: float) -> Offsets:
+        """See ``DeformationField.offsets``; differentiable in ``means``, which nodes turn about themselves."""
+        if not len(means):  # whatever nodes there are
+            return Offsets(**{name: None if x is None else x[:0] for name, x in vars(self._at(time)).items()})
+        return follow(self._nodes(means), means, self._at(time))
+
+    def penalties(self, time: float) -> dict[str, Tensor]:
+        """Acceleration of the nodes, and how far neighbours stray from moving rigidly, in squared spacings."""
+        if len(self.buffers["positions"]) < 2:
+            return {}
+        penalties = {}
+        if self.options.smoothness and self.num_keys > 2:
+            bend = self.learned["means"].diff(n=2, dim=1) / self.buffers["radii"][:, None, None]
+            penalties["node acceleration"] = self.options.smoothness * bend.square().mean()
+        if self.options.rigidity:
+            penalties["node rigidity"] = self.options.rigidity * self._strain(self._at(time))
+        return penalties
+
+    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
+        """Go on at constant velocity to the keys that are trained on next."""
+        last = self.num_keys - 1
+        first, final = math.floor(seen[0] * last), math.ceil(seen[1] * last)
+        back = 2 if final > first else 1  # a single key has no velocity
+        for key in range(final + 1, min(math.ceil(soon[1] * last), last) + 1):
+            self._continue(key, key - 1, key - back)
+        for key in range(first - 1, max(math.floor(soon[0] * last), 0) - 1, -1):
+            self._continue(key, key + 1, key + back)
+
+    def select(self, index: Tensor, is_new: Tensor) -> None:
+        """Find out anew, when next needed, what follows what."""
+        self.buffers.pop("followed", None)
+
+    def _at(self, time: float) -> Offsets:
+        """The nodes' offsets at ``time``."""
+        place = min(max(time, 0.0), 1.0) * (self.num_keys - 1)
+        key = min(int(place), self.num_keys - 2)
+        parts = {n: torch.lerp(x[:, key], x[:, key + 1], place - key) for n, x in self._keys().items()}
+        if "logit_opacities" in parts:
+            parts["logit_opacities"] = parts["logit_opacities"][:, 0]
+        return Offsets(**parts)
+
+    def _keys(self) -> dict[str, Tensor]:
+        """Head to its (S, P, size) values."""
+        return {name: self.learned[name] for name in head_sizes(self.options)}
+
+    def _nodes(self, means: Tensor) -> Nodes:
+        if "followed" not in self.buffers:
+            self._place(means.detach())
+        return Nodes(self.buffers["positions"], self.buffers["radii"], self.buffers["followed"])
+
+    @torch.no_grad()
+    def _place(self, means: Tensor) -> None:
+        """Drop nodes that nothing follows, add some where they are missing, and let ``means`` (M, 3) follow."""
+        old = self.buffers["positions"]
+        kept = torch.zeros(0, dtype=torch.long)
+        if len(old):
+            kept = nodes_at(old, means).followed[:, 0].unique()
+        added = means[spread_out(means, self.options.nodes - len(kept), old[kept])]
+        source = torch.cat([kept, torch.zeros(len(added), dtype=torch.long)])
+        is_new = torch.arange(len(source)) >= len(kept)
+        started = self._motion_at(added)
+        for name in head_sizes(self.options):
+            values = torch.cat([self.learned[name].detach()[kept], started[name]])
+            self.learned.rearrange(name, values, source, is_new)
+        nodes = nodes_at(torch.cat([old[kept], added]), means)
+        around = nodes_at(nodes.positions, nodes.positions).followed[:, 1:]
+        self.buffers = {
+            "positions": nodes.positions,
+            "radii": nodes.radii,
+            "followed": nodes.followed,
+            "neighbours": around,
+        }
+
+    def _motion_at(self, points: Tensor) -> dict[str, Tensor]:
+        """Head to the (S', P, size) offsets that the present nodes give to ``points`` (S', 3) at every key."""
+        keys = {name: x.detach() for name, x in self._keys().items()}
+        if not len(self.buffers["positions"]) or not len(points):
+            return {name: x.new_zeros(len(points), *x.shape[1:]) for name, x in keys.items()}
+        nodes = nodes_at(self.buffers["positions"], points)
+        weights = nodes.weights(points)
+        started = {name: torch.einsum("mb,mbpd->mpd", weights, x[nodes.followed]) for name, x in keys.items()}
+        if "quats" in keys:
+            arms = (points[:, None] - nodes.positions[nodes.followed])[:, :, None].expand(-1, -1, self.num_keys, -1)
+            swing = turned(keys["quats"][nodes.followed], arms) - arms
+            started["means"] = started["means"] + torch.einsum("mb,mbpd->mpd", weights, swing)
+        return started
+
+    def _strain(self, now: Offsets) -> Tensor:
+        """Mean of |x_j - x_i - R_i (p_j - p_i)|^2 of neighbours, over the squared spacing (Sorkine and Alexa 2007)."""
+        positions, neighbours = self.buffers["positions"], self.buffers["neighbours"]
+        arms = positions[neighbours] - positions[:, None]
+        kept = arms if now.quats is None else turned(now.quats[:, None].expand(-1, arms.shape[1], -1), arms)
+        strain = arms + now.means[neighbours] - now.means[:, None] - kept
+        return (strain / self.buffers["radii"][:, None, None]).square().sum(-1).mean()
+
+    @torch.no_grad()
+    def _continue(self, key: int, before: int, earlier: int) -> None:
+        """Set the keys at ``key`` to those at ``before`` moved on as they were from ``earlier``."""
+        for x in self._keys().values():
+            known = 0 <= earlier < self.num_keys
+            x.data[:, key] = 2 * x.data[:, before] - x.data[:, earlier] if known else x.data[:, before]

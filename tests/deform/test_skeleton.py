@@ -1,0 +1,250 @@
+"""Control nodes with poses at key times: where they are, how they move, and how they come and go."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from tiny_fields import HEADS, cloud, stirred_field, tiny_setup
+from torch import Tensor
+
+from dyngs.config import SkeletonField
+from dyngs.deform.field import Offsets
+from dyngs.deform.skeleton import Skeleton
+
+MEANS_ONLY = dict.fromkeys(HEADS, False)
+
+
+def skeleton(nodes: int = 5, keys: int = 5, num_times: int = 10, **options: object) -> Skeleton:
+    """An untrained one."""
+    return Skeleton(
+        SkeletonField(nodes=nodes, keys=keys, **options),  # type: ignore[arg-type]
+        tiny_setup(num_times=num_times),
+        torch.Generator(),
+    )
+
+
+def placed(means: Tensor, **options: object) -> Skeleton:
+    """One whose nodes are placed."""
+    field = skeleton(**options)  # type: ignore[arg-type]
+    field.offsets(means, 0.0)
+    return field
+
+
+def keys_of(field: Skeleton) -> Tensor:
+    """(P,) what the first node does along x at the key times."""
+    return field.learned["means"].detach()[0, :, 0]
+
+
+def outputs(offsets: Offsets) -> Tensor:
+    parts = [x.detach() for x in vars(offsets).values() if x is not None]
+    return torch.cat([x.reshape(len(x), -1) for x in parts], dim=1)
+
+
+@pytest.mark.parametrize(("num_times", "keys"), [(2, 2), (3, 2), (5, 3), (48, 24)])
+def test_half_as_many_keys_as_times_and_at_least_two(num_times: int, keys: int) -> None:
+    assert skeleton(keys=0, num_times=num_times).num_keys == keys
+    assert skeleton(keys=7, num_times=num_times).num_keys == 7
+
+
+def test_motion_is_linear_between_keys() -> None:
+    means = cloud().means
+    field = placed(means, nodes=1, keys=5, **MEANS_ONLY)
+    field.learned["means"].data[0, :, 0] = torch.tensor([0.0, 1.0, 4.0, 9.0, 7.0])
+    for time, x in ((0.0, 0.0), (0.25, 1.0), (0.3, 1.6), (0.5, 4.0), (0.9, 7.8), (1.0, 7.0)):
+        expected = torch.tensor([x, 0, 0]).expand(9, 3)
+        torch.testing.assert_close(field.offsets(means, time).means.detach(), expected)
+
+
+@pytest.mark.parametrize("keys", [1, 2])
+def test_few_keys(keys: int) -> None:
+    """One key is a constant offset."""
+    means = cloud().means
+    field = placed(means, nodes=2, keys=keys)
+    field.learned["means"].data[:] = torch.arange(float(keys))[None, :, None] + 1
+    for time in (0.0, 0.5, 1.0):
+        found = field.offsets(means, time).means.detach()
+        torch.testing.assert_close(found, torch.full((9, 3), 1 + time * (keys - 1)))
+
+
+def test_a_rigid_motion_of_the_nodes_is_one_of_the_gaussians() -> None:
+    means = cloud(30).means
+    field = placed(means, nodes=6, keys=2)
+    positions = field.buffers["positions"]
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.9])
+    matrix, shift = torch.from_numpy(turn.as_matrix()).float(), torch.tensor([0.1, 0.2, -0.3])
+    field.learned["means"].data[:, 1] = positions @ matrix.T + shift - positions
+    quat = torch.from_numpy(turn.as_quat()).float().roll(1)
+    field.learned["quats"].data[:, 1] = quat - torch.tensor([1.0, 0, 0, 0])
+    moved = means + field.offsets(means, 1.0).means.detach()
+    torch.testing.assert_close(moved, means @ matrix.T + shift, rtol=0, atol=1e-5)
+    assert float(field.penalties(1.0)["node rigidity"].detach()) < 1e-10
+
+
+# --- nodes come and go ------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 12), st.lists(st.lists(st.integers(0, 11), max_size=15), min_size=1, max_size=4))
+def test_after_any_changes_of_the_set_nodes_are_where_gaussians_are(nodes: int, sets: list[list[int]]) -> None:
+    """Never more than asked for, none twice; with as many as places every Gaussian has one of its own."""
+    everything = cloud(12).means
+    field = placed(everything, nodes=nodes)
+    index = torch.arange(12)
+    for chosen in sets:
+        rows = torch.tensor([i % len(index) for i in chosen] if len(index) else [], dtype=torch.long)
+        field.select(rows, torch.zeros(len(rows), dtype=torch.bool))
+        index = index[rows]
+        means = everything[index]
+        offsets = field.offsets(means, 0.3)
+        assert offsets.means.shape == (len(index), 3)
+        if len(index) == 0:
+            continue
+        positions, followed = field.buffers["positions"], field.buffers["followed"]
+        assert 1 <= len(positions) <= nodes
+        assert len(positions.unique(dim=0)) == len(positions) == len(field.learned["means"])
+        assert followed.max() < len(positions)
+        if nodes == 12:
+            assert torch.equal(positions[followed[:, 0]], means)
+        assert all(len(x) == len(positions) for x in field.learned.state().values())
+
+
+def test_new_nodes_start_with_the_motion_found_there() -> None:
+    """A field that moves rigidly moves the newcomers alike, and the others as before."""
+    means = cloud(30).means
+    field = placed(means[:10], nodes=20, keys=3)
+    assert len(field.buffers["positions"]) == 10
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.8])
+    matrix, positions = torch.from_numpy(turn.as_matrix()).float(), field.buffers["positions"]
+    field.learned["means"].data[:, 2] = positions @ matrix.T - positions
+    field.learned["quats"].data[:, 2] = torch.from_numpy(turn.as_quat()).float().roll(1) - torch.tensor([1.0, 0, 0, 0])
+    field.select(torch.arange(30) % 10, torch.arange(30) >= 10)
+    moved = means + field.offsets(means, 1.0).means.detach()
+    assert len(field.buffers["positions"]) == 20
+    torch.testing.assert_close(moved, means @ matrix.T, rtol=0, atol=1e-5)
+
+
+def test_nodes_that_nothing_follows_are_dropped_with_their_moments() -> None:
+    means = torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]])
+    field = placed(means, nodes=3, keys=2, **MEANS_ONLY)
+    field.offsets(means, 0.5).means.square().sum().backward()
+    for x in (field.learned["means"],):
+        x.grad = torch.ones_like(x)
+    field.learned.step(1, 0.0)
+    stays = [x.tolist() for x in field.buffers["positions"]].index([-1.0, 0.0, 0.0])
+    old = {name: x[stays].clone() for name, x in field.learned.state().items()}
+    field.select(torch.tensor([0]), torch.tensor([False]))
+    field.offsets(means[:1], 0.5)
+    assert field.buffers["positions"].tolist() == [[-1.0, 0.0, 0.0]]
+    assert all(torch.equal(x, old[name][None]) for name, x in field.learned.state().items())
+    field.select(torch.tensor([0, 0]), torch.tensor([False, True]))
+    field.offsets(means[[0, 2]], 0.5)
+    state = field.learned.state()
+    assert state["exp_avg.means"][0].any()
+    assert not state["exp_avg.means"][1].any()
+
+
+def test_when_nothing_is_left_there_is_nothing_to_move() -> None:
+    """Also after nodes were placed."""
+    nobody = torch.zeros(0, 3)
+    field = skeleton()
+    assert len(field.offsets(nobody, 0.5).means) == 0
+    field = placed(cloud().means)
+    field.select(torch.zeros(0).long(), torch.zeros(0).bool())
+    offsets = field.offsets(nobody, 0.5)
+    assert offsets.means.shape == (0, 3)
+    assert offsets.quats is not None
+    assert offsets.quats.shape == (0, 4)
+
+
+def test_nodes_stay_while_the_set_does() -> None:
+    means = cloud().means
+    field = placed(means)
+    before = {name: x.clone() for name, x in field.buffers.items()}
+    field.offsets(means + 0.05, 0.7)
+    assert all(torch.equal(x, before[name]) for name, x in field.buffers.items())
+
+
+# --- times not seen yet -----------------------------------------------------------------------------------------------
+
+
+def test_motion_goes_on_at_constant_velocity() -> None:
+    field = placed(cloud().means, keys=11)
+    field.learned["means"].data[0, :, 0] = torch.tensor([-7.0, -7, -7, -7, 3, 4, 6, -7, -7, -7, -7])
+    field.extend((0.4, 0.6), (0.2, 0.8))
+    assert keys_of(field).tolist() == [-7, -7, 1, 2, 3, 4, 6, 8, 10, -7, -7]
+    field.extend((0.2, 0.8), (0.2, 0.8))
+    field.extend((0.2, 0.8), (0.0, 1.0))
+    assert keys_of(field).tolist() == [-1, 0, 1, 2, 3, 4, 6, 8, 10, 12, 14]
+
+
+def test_of_a_single_moment_there_is_no_velocity() -> None:
+    """Cameras of a rig: the first window may be one time."""
+    field = placed(cloud().means, keys=5)
+    field.learned["means"].data[0, :, 0] = torch.tensor([0.0, 0, 3, 0, 0])
+    field.extend((0.5, 0.5), (0.0, 1.0))
+    assert keys_of(field).tolist() == [3.0] * 5
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(2, 30), st.lists(st.floats(0, 0.5), min_size=1, max_size=6))
+def test_keys_that_were_seen_never_change_and_uniform_motion_goes_on(keys: int, strays: list[float]) -> None:
+    """For any growing windows, if two keys or more were seen."""
+    field, last = placed(cloud().means, keys=keys), keys - 1
+    windows = [(0.5 - x, 0.5 + x) for x in (*sorted(strays), 0.5)]
+    uniform = torch.arange(float(keys))
+    seen = [i for i in range(keys) if windows[0][0] * last - 1 < i < windows[0][1] * last + 1]
+    start = torch.full((keys,), -99.0)
+    start[seen] = uniform[seen]
+    field.learned["means"].data[0, :, 0] = start
+    for before, after in pairwise(windows):
+        field.extend(before, after)
+    assert torch.equal(keys_of(field), uniform if len(seen) > 1 else torch.full((keys,), float(seen[0])))
+
+
+# --- penalties --------------------------------------------------------------------------------------------------------
+
+
+def test_uniform_motion_has_no_acceleration_and_a_shift_no_strain() -> None:
+    field = placed(cloud().means, nodes=4, keys=6)
+    field.learned["means"].data[:] = torch.arange(6.0)[None, :, None]
+    penalties = field.penalties(0.3)
+    assert penalties.keys() == {"node acceleration", "node rigidity"}
+    assert float(penalties["node acceleration"].detach()) == pytest.approx(0.0, abs=1e-10)
+    assert float(penalties["node rigidity"].detach()) == pytest.approx(0.0, abs=1e-10)
+
+
+def test_known_penalties() -> None:
+    """Two nodes 2 apart; one goes 1 farther away in the middle key: strain (1/2)^2, second difference -2/2."""
+    means = torch.tensor([[-1.0, 0, 0], [1, 0, 0]])
+    field = placed(means, nodes=2, keys=3, rigidity=1.0, smoothness=1.0)
+    right = int(field.buffers["positions"][:, 0].argmax())
+    field.learned["means"].data[right, 1, 0] = 1.0
+    assert float(field.penalties(0.5)["node rigidity"].detach()) == pytest.approx(0.25)
+    assert float(field.penalties(1.0)["node rigidity"].detach()) == 0.0
+    assert float(field.penalties(0.5)["node acceleration"].detach()) == pytest.approx(
+        1 / 6
+    )  # mean of 2 x 1 x 3 numbers
+    field.penalties(0.5)["node rigidity"].backward()
+    grad = field.learned["means"].grad
+    assert grad is not None
+    assert grad[:, 1, 0].tolist() == pytest.approx([-0.5, 0.5] if right == 1 else [0.5, -0.5])
+    assert not grad[:, 0].any()
+
+
+def test_no_penalties_where_none_are_wanted_or_possible() -> None:
+    assert placed(cloud().means, rigidity=0.0, smoothness=0.0).penalties(0.3) == {}
+    assert placed(cloud().means, nodes=1).penalties(0.3) == {}
+    assert skeleton().penalties(0.3) == {}
+    assert placed(cloud().means, keys=2).penalties(0.3).keys() == {"node rigidity"}
+
+
+def test_the_place_of_a_gaussian_matters() -> None:
+    field = stirred_field("skeleton")
+    found = outputs(field.offsets(cloud().means, 0.6))
+    assert not torch.allclose(found[0], found[1])
+    assert not torch.allclose(found, outputs(field.offsets(cloud().means, 0.1)))
