@@ -138,7 +138,6 @@ class TrajectoryField(FieldSection):
     lr_means: Positive = Field(default=1.6e-4, description="of the coefficients, times the scene extent")
     lr_quats: Positive = 1e-3
     lr_decay: Fraction = Field(default=0.01, description="last over first rate")
-    rigidity: float = Field(default=0.0, ge=0, description="weight of neighbours' differing motion")
 
 
 DeformField = HexplaneField | MlpField | TrajectoryField | SkeletonField
@@ -149,7 +148,11 @@ class DynamicModel(SceneModel):
 
     kind: Literal["dynamic"] = "dynamic"
     deform: Annotated[DeformField, Field(discriminator="kind")] = HexplaneField()
-    coarse: Fraction = Field(default=0.13, description="share of the run that trains without motion")
+    coarse: Fraction = Field(default=0.15, description="share of the run that trains without motion, on all views")
+    moving_error: float = Field(
+        default=0.04, ge=0, description="things may move only where the still model's colour error is larger"
+    )
+    seeds: int = Field(default=4000, ge=0, description="random Gaussians added where motion begins")
     first_views: Fraction = Field(default=0.1, description="share of the views, around the middle, to start with")
     all_views_at: Fraction = Field(default=0.4, description="share of the run from which all times are trained on")
     still_below: float = Field(default=0.3, ge=0, description="px in the nearest training view; 0 = all may move")

@@ -11,6 +11,7 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
+    DeformField,
     DynamicModel,
     HexplaneField,
     MlpField,
@@ -22,7 +23,7 @@ from dyngs.config import (
 )
 from dyngs.data.synthetic import DynamicOptions, write_dynamic_capture
 from dyngs.deform.field import DeformationField, FieldSetup
-from dyngs.deform.fields import FieldOptions, new_field
+from dyngs.deform.fields import new_field
 from dyngs.gaussians import Gaussians
 
 KINDS = ("hexplane", "mlp", "skeleton", "trajectory")
@@ -30,7 +31,7 @@ HEADS = ("move_rotations", "move_scales", "move_opacities", "move_colors")
 TIMES = (0.0, 0.37, 1.0)
 
 
-def tiny_options(kind: str, *, everything: bool = True) -> FieldOptions:
+def tiny_options(kind: str, *, everything: bool = True) -> DeformField:
     """Options of a field that moves every attribute, or only positions."""
     heads = dict.fromkeys(HEADS, everything)
     if kind == "hexplane":

@@ -19,7 +19,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     raster.set_defaults(run=run_rasterize)
     deform = stages.add_parser("deform", help="the field's share of a training step, with and without the static split")
     deform.add_argument("run_dir", type=Path, nargs="?", metavar="RUN", help="a dynamic run; default: random Gaussians")
-    deform.add_argument("--kind", choices=("hexplane", "mlp", "trajectory"), default="hexplane", help="without RUN")
+    deform.add_argument(
+        "--kind", choices=("hexplane", "mlp", "trajectory", "skeleton"), default="hexplane", help="without RUN"
+    )
     deform.add_argument("--gaussians", type=int, default=50_000, metavar="N", help="without RUN (default 50000)")
     deform.add_argument("--moving", type=float, default=0.1, metavar="SHARE", help="without RUN (default 0.1)")
     deform.add_argument("--threads", type=int, metavar="N", help="default: all cores")
@@ -48,7 +50,8 @@ def run_rasterize(arguments: argparse.Namespace) -> int:
 
 def run_deform(arguments: argparse.Namespace) -> int:
     """Measure training steps of a dynamic model and print the table."""
-    if min(arguments.repeats, arguments.gaussians, arguments.threads or 1) < 1 or not 0 < arguments.moving <= 1:
+    threads = 1 if arguments.threads is None else arguments.threads
+    if min(arguments.repeats, arguments.gaussians, threads) < 1 or not 0 < arguments.moving <= 1:
         raise DyngsError("--repeats, --gaussians and --threads must be at least 1, --moving above 0 and at most 1")
     from tempfile import TemporaryDirectory
 

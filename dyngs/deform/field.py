@@ -14,6 +14,9 @@ from torch import Tensor
 from dyngs.deform.learned import LearnedTensors
 from dyngs.gaussians import Gaussians
 
+MAX_KEY_TIMES = 256
+"""Longer clips want a choice of their own: memory grows with it."""
+
 
 @dataclass(frozen=True)
 class Offsets:
@@ -79,6 +82,11 @@ class DeformationField(Protocol):
     def select(self, index: Tensor, is_new: Tensor) -> None:
         """Follow a change of the moving set: row i of the new one descends from row ``index[i]`` of the old one."""
         ...
+
+
+def key_times(num_times: int) -> int:
+    """How finely time is divided for so many training times: half as finely, into 2 to ``MAX_KEY_TIMES``."""
+    return min(max(2, (num_times + 1) // 2), MAX_KEY_TIMES)
 
 
 def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None) -> Gaussians:

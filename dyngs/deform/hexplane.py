@@ -9,11 +9,10 @@ from torch import Tensor
 
 from dyngs.config import HexplaneField
 from dyngs.deform.decoder import Decoder, head_sizes, split_heads
-from dyngs.deform.field import FieldSetup, Offsets
+from dyngs.deform.field import FieldSetup, Offsets, key_times
 from dyngs.deform.learned import LearnedTensors
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 
-MIN_TIME_ROWS = 2
 SPACE_RANGE = (0.1, 0.5)
 """Planes over space start uniformly in it, those with time at 1 (Wu et al.): the product does not depend on time."""
 
@@ -74,5 +73,5 @@ class Hexplane:
 
 
 def time_rows(options: HexplaneField, num_times: int) -> int:
-    """Rows of the planes with time: as asked for, or half the number of training times."""
-    return options.time_resolution or max(MIN_TIME_ROWS, (num_times + 1) // 2)
+    """Rows of the planes with time: as asked for, or as many as ``key_times`` says."""
+    return options.time_resolution or key_times(num_times)

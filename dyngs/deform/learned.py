@@ -45,6 +45,7 @@ class LearnedTensors:
             progress: 0 at the first update, 1 at the last; decides the rates.
         """
         left_out = 0
+        progress = min(progress, 1.0)
         for name, x in self._tensors.items():
             if x.grad is None:
                 continue

@@ -7,7 +7,7 @@ split on the field moves only those whose motion can be seen; the others are fro
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +19,7 @@ from dyngs.data.loader import Picture
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import field_state, new_field, part_of, restored_field
 from dyngs.deform.motion import bake_, measure_motion, select_offsets
+from dyngs.deform.residual import two_group_threshold
 from dyngs.deform.window import TimeWindow
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.static.densify import EditResult
@@ -26,6 +27,10 @@ from dyngs.static.filters import FILTER_VARIANCE, filter_std
 from dyngs.static.model import Drawn, StaticScene
 
 BOX_MARGIN = 1.1
+SEED_SIZE = 0.3
+"""Standard deviation of a seed, in distances between them."""
+SEED_LOGIT = -2.2
+"""Opacity 0.1, as all Gaussians begin."""
 SOLID = 0.05
 """Opacity from which a Gaussian counts for the box in which things move."""
 
@@ -55,11 +60,13 @@ class Surroundings4D:
         times: of the training views, in [0, 1], ascending; at least two differ.
         cameras: the training cameras.
         extent: of the scene, world units.
+        residuals: the mean colour error where each of N still Gaussians shows.
     """
 
     times: tuple[float, ...]
     cameras: Sequence[Cameras]
     extent: float
+    residuals: Callable[[Gaussians], Tensor]
 
 
 class DynamicScene:
@@ -112,13 +119,24 @@ class DynamicScene:
             left_out = self.field.learned.step(since, since / max(self.schedule.steps - self.schedule.fine, 1))
             if result is not None and result.edit is not None:
                 self._follow(result.edit, self.field)
-        if step == self.schedule.fine:
-            self._begin_motion(parameters)
-        elif self.field is not None:
+        if self.field is not None:
             self.field.extend(self.window.bounds(step), self.window.bounds(step + 1))
             if step in self.schedule.splits:
                 self._freeze(parameters, self.field)
         return left_out
+
+    def edit(self, parameters: Gaussians, step: int) -> EditResult | None:
+        """Random Gaussians to begin motion with, after the coarse phase; None where a still model explains all."""
+        if step != self.schedule.fine:
+            return None
+        scores = self.capture.residuals(parameters.detach())
+        rows = torch.nonzero(scores > max(self.options.moving_error, two_group_threshold(scores)))[:, 0]
+        if not len(rows):
+            return None
+        result = seeded(parameters.detach(), self.options.seeds, self.capture.extent, self._generator)
+        added = torch.arange(len(parameters), len(parameters) + self.options.seeds)
+        self._begin_motion(parameters, torch.cat([rows, added]))
+        return result
 
     def num_moving(self, num_gaussians: int) -> int:
         """M of N Gaussians."""
@@ -143,10 +161,11 @@ class DynamicScene:
             num_moving = 0 if self.rows is None else len(self.rows)
             self.field, self._setup = restored_field(self.options.deform, part, num_moving)
 
-    def _begin_motion(self, parameters: Gaussians) -> None:
+    def _begin_motion(self, parameters: Gaussians, rows: Tensor) -> None:
         center, half_size = box_of(parameters, self.capture.extent)
-        setup = FieldSetup(center, half_size, len(self.times), len(parameters), self.capture.extent)
-        self._setup, self.field = setup, new_field(self.options.deform, setup, self._generator)
+        setup = FieldSetup(center, half_size, len(self.times), len(rows), self.capture.extent)
+        self.rows, self._setup = rows, setup
+        self.field = new_field(self.options.deform, setup, self._generator)
 
     def _freeze(self, parameters: Gaussians, field: DeformationField) -> None:
         """Stop moving the Gaussians whose motion is too small to be seen."""
@@ -190,6 +209,23 @@ class DynamicScene:
         tiny = 1e-6 * self.capture.extent
         length = (offsets.means.square().sum(1) + tiny**2).sqrt().mean()
         return {"motion sparsity": length * (self.options.motion_sparsity / self.capture.extent)}
+
+
+def seeded(gaussians: Gaussians, count: int, extent: float, generator: torch.Generator) -> EditResult:
+    """The edit that adds ``count`` faint grey Gaussians, spread evenly in the box of ``gaussians``."""
+    center, half_size = box_of(gaussians, extent)
+    places = center + half_size * (2 * torch.rand((count, 3), generator=generator) - 1)
+    spacing = float((2 * half_size).prod() / max(count, 1)) ** (1 / 3)
+    source = torch.cat([torch.arange(len(gaussians)), torch.zeros(count, dtype=torch.long)])
+    is_new = torch.arange(len(source)) >= len(gaussians)
+    changes = {
+        "means": torch.cat([gaussians.means, places]),
+        "quats": torch.cat([gaussians.quats, torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(count, 4)]),
+        "log_scales": torch.cat([gaussians.log_scales, torch.full((count, 3), math.log(SEED_SIZE * spacing))]),
+        "logit_opacities": torch.cat([gaussians.logit_opacities, torch.full((count,), SEED_LOGIT)]),
+        "sh": torch.cat([gaussians.sh, torch.zeros(count, *gaussians.sh.shape[1:])]),
+    }
+    return EditResult(TopologyEdit(source, is_new), changes)
 
 
 def box_of(gaussians: Gaussians, extent: float) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dyngs.deform.field import Offsets
+from dyngs.ops.skinning import blend_skinning
 
 FOLLOWED = 4
 """Nodes that a Gaussian follows."""
@@ -77,17 +78,16 @@ def follow(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:
     A node turns what follows it about its own place: x' = sum_b w_b (R_b (x - p_b) + p_b + d_b); differentiable in x,
     the weights taken as constant. All other offsets are blended alike.
     """
-    weights, followed = nodes.weights(means), nodes.followed
-    moved = at_nodes.means[followed]
-    if at_nodes.quats is not None:
-        arms = means[:, None] - nodes.positions[followed]
-        moved = moved + turned(at_nodes.quats[followed], arms) - arms
-    blended = {
-        name: None if x is None else torch.einsum("mb,mb...->m...", weights, x[followed])
-        for name, x in vars(at_nodes).items()
-        if name != "means"
-    }
-    return Offsets(torch.einsum("mb,mbd->md", weights, moved), **blended)
+    identity = at_nodes.means.new_tensor([1.0, 0.0, 0.0, 0.0])
+    quats = identity.expand(len(at_nodes.means), 4) if at_nodes.quats is None else at_nodes.quats + identity
+    others = {name: x for name, x in vars(at_nodes).items() if name != "means" and x is not None}
+    values = torch.cat(
+        [at_nodes.means.new_zeros(len(quats), 0), *(x.reshape(len(x), -1) for x in others.values())], dim=1
+    )
+    motion = torch.cat([at_nodes.means, quats], dim=1)
+    moved, blended = blend_skinning(means, nodes.positions, nodes.radii, nodes.followed, motion, values)
+    parts = blended.split([x[0].numel() for x in others.values()], dim=1)
+    return Offsets(moved, **{n: p.reshape(-1, *x.shape[1:]) for (n, x), p in zip(others.items(), parts, strict=True)})
 
 
 def turned(offsets: Tensor, vectors: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dyngs.config import SkeletonField
 from dyngs.deform.decoder import head_sizes
-from dyngs.deform.field import FieldSetup, Offsets
+from dyngs.deform.field import FieldSetup, Offsets, key_times
 from dyngs.deform.learned import LearnedTensors
 from dyngs.deform.nodes import Nodes, follow, nodes_at, spread_out, turned
 
@@ -31,7 +31,7 @@ class Skeleton:
 
     def __init__(self, options: SkeletonField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup
-        self.num_keys = options.keys or max(2, (setup.num_times + 1) // 2)
+        self.num_keys = options.keys or key_times(setup.num_times)
         self.buffers: dict[str, Tensor] = {"positions": NOTHING}
         sizes = head_sizes(options)
         tensors = {name: torch.zeros(0, self.num_keys, size) for name, size in sizes.items()}
@@ -62,15 +62,17 @@ class Skeleton:
             penalties["node rigidity"] = self.options.rigidity * self._strain(self._at(time))
         return penalties
 
+    @torch.no_grad()
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        """Go on at constant velocity to the keys that are trained on next."""
+        """Go on at constant velocity, that of the last two intervals, at all keys beyond those that ``seen`` needs."""
         last = self.num_keys - 1
-        first, final = math.floor(seen[0] * last), math.ceil(seen[1] * last)
-        back = 2 if final > first else 1  # a single key has no velocity
-        for key in range(final + 1, min(math.ceil(soon[1] * last), last) + 1):
-            self._continue(key, key - 1, key - back)
-        for key in range(first - 1, max(math.floor(soon[0] * last), 0) - 1, -1):
-            self._continue(key, key + 1, key + back)
+        low, high = max(math.floor(seen[0] * last), 0), min(math.ceil(seen[1] * last), last)
+        reach = min(2, high - low)
+        after = torch.arange(1, last - high + 1)[:, None]
+        before = torch.arange(low, 0, -1)[:, None]
+        for x in (keys.data for keys in self._keys().values()):
+            x[:, high + 1 :] = x[:, high, None] + after * ((x[:, high] - x[:, high - reach]) / max(reach, 1))[:, None]
+            x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
 
     def select(self, index: Tensor, is_new: Tensor) -> None:
         """Find out anew, when next needed, what follows what."""
@@ -138,10 +140,3 @@ class Skeleton:
         kept = arms if now.quats is None else turned(now.quats[:, None].expand(-1, arms.shape[1], -1), arms)
         strain = arms + now.means[neighbours] - now.means[:, None] - kept
         return (strain / self.buffers["radii"][:, None, None]).square().sum(-1).mean()
-
-    @torch.no_grad()
-    def _continue(self, key: int, before: int, earlier: int) -> None:
-        """Set the keys at ``key`` to those at ``before`` moved on as they were from ``earlier``."""
-        for x in self._keys().values():
-            known = 0 <= earlier < self.num_keys
-            x.data[:, key] = 2 * x.data[:, before] - x.data[:, earlier] if known else x.data[:, before]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -12,6 +13,7 @@ from torch import Tensor
 from dyngs.config import DynamicModel
 from dyngs.deform.field import DeformationField, deformed
 from dyngs.deform.fields import part_of, restored_field
+from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.static.filters import fuse_filter
 
@@ -56,10 +58,16 @@ class TrainedScene:
 
     @torch.no_grad()
     def at(self, time: float | None) -> Gaussians:
-        """The N Gaussians at ``time``, clamped to [0, 1]; None is 0. What is still is not computed anew."""
+        """The N Gaussians at ``time``, clamped to [0, 1]; None is 0. What is still is not computed anew.
+
+        Raises:
+            DyngsError: the time is NaN.
+        """
+        if time is not None and math.isnan(time):
+            raise DyngsError("the time to draw is not a number; give one from 0 to 1")
         drawn = self.gaussians
         if self.field is not None and not self.is_still:
-            moment = min(max(time or 0.0, 0.0), 1.0)
+            moment = min(max(0.0 if time is None else time, 0.0), 1.0)
             everything = len(self.rows) == len(drawn)
             means = drawn.means if everything else drawn.means[self.rows]
             drawn = deformed(drawn, self.field.offsets(means, moment), None if everything else self.rows)

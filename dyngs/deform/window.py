@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 MIN_VIEWS = 6
 MIDDLE = 0.5
+FRONTIER_VIEWS = 6
+"""While the window grows, every other step trains on one of so many views at its ends, which are the newest."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +36,16 @@ class TimeWindow:
         """The window over the times of all training views."""
         return TimeWindow(tuple(sorted(abs(time - MIDDLE) for time in times)), first, opens, full)
 
-    def reach(self, step: int) -> float:
-        """Largest |time - 0.5| in the window at ``step``; 0.5 once it is full."""
+    def num_views(self, step: int) -> int:
+        """How many views the window holds at ``step``."""
         start = min(len(self.strays), max(MIN_VIEWS, math.ceil(self.first * len(self.strays))))
         progress = (step - self.opens) / max(self.full - self.opens, 1)
-        if progress >= 1 or start == len(self.strays):
-            return MIDDLE
-        count = start + int(max(progress, 0.0) * (len(self.strays) - start))
-        return self.strays[count - 1]
+        return start + int(min(max(progress, 0.0), 1.0) * (len(self.strays) - start))
+
+    def reach(self, step: int) -> float:
+        """Largest |time - 0.5| in the window at ``step``; 0.5 once it is full."""
+        count = self.num_views(step)
+        return MIDDLE if count == len(self.strays) else self.strays[count - 1]
 
     def bounds(self, step: int) -> tuple[float, float]:
         """First and last time in the window at ``step``; [0, 1] once it is full."""
@@ -49,6 +53,10 @@ class TimeWindow:
         return MIDDLE - reach, MIDDLE + reach
 
     def holds(self, time: float, step: int) -> bool:
-        """Whether ``time`` is trained on at ``step``."""
+        """Whether ``time`` is trained on at ``step``; while the window grows, in every other step only if it is new."""
         # Not by ``bounds``: their rounding may shut out the very times that the window ends with.
-        return abs(time - MIDDLE) <= self.reach(step)
+        count, stray = self.num_views(step), abs(time - MIDDLE)
+        if step <= self.opens:
+            return True
+        newest = step < self.full and step % 2 == 0 and count < len(self.strays)
+        return stray <= self.reach(step) and (not newest or stray >= self.strays[max(count - FRONTIER_VIEWS, 0)])

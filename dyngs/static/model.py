@@ -56,6 +56,10 @@ class StaticScene:
             self._filter_std = filter_std(parameters.means, self._cameras)
         return 0
 
+    def edit(self, parameters: Gaussians, step: int) -> EditResult | None:
+        """The set of Gaussians is left to the strategy."""
+        return None
+
     def num_moving(self, num_gaussians: int) -> int:
         """None of them moves."""
         return 0

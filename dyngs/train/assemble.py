@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, McmcStrategy
 from dyngs.data.capture import Capture, View
 from dyngs.data.images import target_size
 from dyngs.data.intrinsics import scaled_intrinsics
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.deform.model import DynamicScene, Surroundings4D
+from dyngs.deform.residual import residual_scores
+from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions
 from dyngs.static.densify import DefaultDensifier, Densifier
 from dyngs.static.init import StartValues, Surroundings, initial_gaussians
 from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.model import StaticScene
 from dyngs.static.optimizer import GaussianOptimizer
+from dyngs.train.background import evaluation_background
 from dyngs.train.sampler import ViewSampler
 from dyngs.train.schedule import deform_schedule, densify_schedule, filter_steps, grad_threshold, growth_per_change
 from dyngs.train.step import Model, Trainer
+
+RESIDUAL_VIEWS = 50
+"""Pictures that are looked at for what moves."""
 
 
 def assemble(config: Config) -> Trainer:
@@ -42,7 +49,7 @@ def assemble(config: Config) -> Trainer:
     x, y, z = (float(value) for value in capture.world_offset)
     return Trainer(
         config=config,
-        model=_model(config, capture, scene.extent, generator),
+        model=_model(config, capture, pictures, scene.extent, generator),
         optimizer=GaussianOptimizer(gaussians, config.optim),
         densifier=_densifier(config, background, scene.extent),
         pictures=pictures,
@@ -92,7 +99,9 @@ def training_times(capture: Capture) -> tuple[float, ...]:
     return tuple(sorted(view.time for view in capture.splits["train"] if view.time is not None))
 
 
-def _model(config: Config, capture: Capture, extent: float, generator: torch.Generator) -> Model:
+def _model(
+    config: Config, capture: Capture, pictures: PictureLoader, extent: float, generator: torch.Generator
+) -> Model:
     """The model asked for; a static one where there are no times for anything to move in."""
     model, steps = config.model, config.train.steps
     cameras = training_cameras(capture.splits["train"], config.data)
@@ -100,8 +109,19 @@ def _model(config: Config, capture: Capture, extent: float, generator: torch.Gen
     times = training_times(capture)
     if not isinstance(model, DynamicModel) or len(set(times)) < 2:
         return still
-    surroundings = Surroundings4D(times, cameras, extent)
+    _, colour = evaluation_background(config.data.background, capture.has_alpha)
+
+    def residuals(gaussians: Gaussians) -> Tensor:
+        return residual_scores(gaussians, _spread(pictures), _render_options(config), colour)
+
+    surroundings = Surroundings4D(times, cameras, extent, residuals)
     return DynamicScene(model, deform_schedule(model, steps), surroundings, still, generator)
+
+
+def _spread(pictures: PictureLoader) -> Iterator[Picture]:
+    """At most ``RESIDUAL_VIEWS`` of the pictures, evenly chosen."""
+    count = min(len(pictures), RESIDUAL_VIEWS)
+    return (pictures[i * len(pictures) // count] for i in range(count))
 
 
 def _densifier(config: Config, background: str, extent: float) -> Densifier:

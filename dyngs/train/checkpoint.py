@@ -92,8 +92,8 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
     """
     tensors = {name: x.detach().contiguous() for name, x in checkpoint.tensors.items()}
     for name, x in tensors.items():
-        if name.startswith("gaussians.") and not bool(torch.isfinite(x).all()):
-            field, step = name.removeprefix("gaussians."), checkpoint.info.step
+        if name.startswith(("gaussians.", "model.")) and not bool(torch.isfinite(x).all()):
+            field, step = name.removeprefix("gaussians.").removeprefix("model."), checkpoint.info.step
             raise DyngsError(f"{run_dir}: {field} is not finite after step {step}; not saved. {last_good(run_dir)}")
     header = {"format": FORMAT_VERSION, **asdict(checkpoint.info)}
     header["digest"] = _digest(tensors, header)

@@ -22,11 +22,10 @@ from dyngs.data.write import write_text
 from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.rendering import RenderOptions, render
+from dyngs.train.background import evaluation_background
 from dyngs.train.checkpoint import LoadedRun, load_run
 from dyngs.train.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
 from dyngs.train.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
-
-_BACKGROUNDS = {"white": 1.0, "black": 0.0}
 
 
 @dataclass(frozen=True)
@@ -221,17 +220,6 @@ def split_views(capture: Capture, split: str) -> Sequence[View]:
             return found
     there = ", ".join(f"{name} ({len(found)} views)" for name, found in views.items())
     raise DyngsError(f"{capture.root}: the split {split!r} has no views; there is {there or 'none'}")
-
-
-def evaluation_background(choice: str, has_alpha: bool) -> tuple[str, Tensor]:
-    """Name and (3,) colour of the background to evaluate on: that of training, black where that was random.
-
-    Args:
-        choice: ``data.background`` of the config.
-        has_alpha: of the capture; decides what "auto" means.
-    """
-    resolved = {"auto": "white" if has_alpha else "black", "random": "black"}.get(choice, choice)
-    return resolved, torch.full((3,), _BACKGROUNDS[resolved])
 
 
 def render_options(model: SceneModel) -> RenderOptions:

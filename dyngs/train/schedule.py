@@ -17,8 +17,8 @@ RESET_SHARE = 0.2
 """Of a short run, between resets."""
 MAX_GROWTH = 0.25
 FILTER_EVERY = 100
-FIRST_SPLIT, LAST_SPLIT, SPLIT_GAP = 0.45, 0.7, 0.05
-"""When a dynamic model freezes what does not move, in shares of the run."""
+SPLITS = (0.1, 0.3, 0.5)
+"""When a dynamic model freezes what does not move: shares of the part of the run that sees all times."""
 
 
 def scaled(step: int, steps: int) -> int:
@@ -85,7 +85,6 @@ def filter_steps(strategy: DefaultStrategy | McmcStrategy, steps: int) -> range:
 def deform_schedule(model: DynamicModel, steps: int) -> DeformSchedule:
     """The phases of a dynamic model in a run of ``steps``; where ``still_below`` is 0 nothing is ever frozen."""
     fine = min(max(1, round(model.coarse * steps)), steps)
-    shares = [FIRST_SPLIT + i * SPLIT_GAP for i in range(round((LAST_SPLIT - FIRST_SPLIT) / SPLIT_GAP) + 1)]
-    splits = sorted({round(share * steps) for share in shares}) if model.still_below > 0 else []
     full = max(fine, round(model.all_views_at * steps))
+    splits = sorted({full + round(share * (steps - full)) for share in SPLITS}) if model.still_below > 0 else []
     return DeformSchedule(fine, full, tuple(step for step in splits if step > full), steps)

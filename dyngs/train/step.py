@@ -42,6 +42,10 @@ class Model(Protocol):
         """
         ...
 
+    def edit(self, parameters: Gaussians, step: int) -> EditResult | None:
+        """A change of the set of Gaussians that the model wants after ``step``; it has followed it already."""
+        ...
+
     def num_moving(self, num_gaussians: int) -> int:
         """How many of the Gaussians depend on time."""
         ...
@@ -108,12 +112,14 @@ class Trainer:
         parameters = self.optimizer.parameters
         drawn = self.model.gaussians_at(parameters, picture, step)
         probe = torch.zeros(1, len(parameters), 4, requires_grad=True) if self.densifier.wants_signal(step) else None
+        if self.model.num_moving(len(parameters)):
+            _require_finite(drawn.gaussians, step, picture)
         options = replace(self.options, sh_degree=active_sh_degree(config.train, step, parameters.sh_degree))
         rendering = render(drawn.gaussians, picture.cameras, options, background=background, probe=probe)
         rendered, truth = rendering.rgb[0], picture.composite(background)
         terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
         terms |= drawn.penalties | self.densifier.regularizers(parameters)
-        loss = _finite_sum(terms, step, picture, drawn.gaussians)
+        loss = _finite_sum(terms, step, picture)
         sum(terms.values(), torch.zeros(())).backward()
         if probe is not None and probe.grad is not None:
             size = (picture.cameras.width, picture.cameras.height)
@@ -130,6 +136,9 @@ class Trainer:
             self.optimizer.apply(result)
         self.densifier.perturb(self.optimizer.parameters, lr_means, self.generator)
         self.bad_gradients += self.model.after_step(self.optimizer.parameters, step, result)
+        result = self.model.edit(self.optimizer.parameters, step)
+        if result is not None:
+            self.optimizer.apply(result)
         self.done = step
 
     def checkpoint(self) -> Checkpoint:
@@ -164,15 +173,20 @@ class Trainer:
         return torch.full((3,), 1.0 if self.background == "white" else 0.0)
 
 
-def _finite_sum(terms: dict[str, Tensor], step: int, picture: Picture, gaussians: Gaussians) -> float:
+def _finite_sum(terms: dict[str, Tensor], step: int, picture: Picture) -> float:
     values = {name: float(term.detach()) for name, term in terms.items()}
     for name, value in values.items():
         if not math.isfinite(value):
-            broken = [f for f, x in gaussians.tensors().items() if not bool(x.isfinite().all())]
-            moment = "" if picture.time is None else f" at time {picture.time:g}"
-            cause = f"the {', '.join(broken)} drawn{moment} are not finite" if broken else "look at that picture"
-            raise DyngsError(
-                f"step {step}, view {picture.name!r}: the loss term {name!r} is {value}; {cause}; lower the rates in "
-                f"optim{' and model.deform' if broken and moment else ''}"
-            )
+            what = "look at that picture; lower the rates in optim" if name == "picture" else "lower its weight or rate"
+            raise DyngsError(f"step {step}, view {picture.name!r}: the loss term {name!r} is {value}; {what}")
     return sum(values.values())
+
+
+def _require_finite(gaussians: Gaussians, step: int, picture: Picture) -> None:
+    """A field may explode unseen, because Gaussians that are not finite are not drawn."""
+    broken = [name for name, x in gaussians.tensors().items() if not bool(x.detach().isfinite().all())]
+    if broken:
+        raise DyngsError(
+            f"step {step}, view {picture.name!r}: the field makes {', '.join(broken)} at {picture.time or 0:g} not "
+            "finite; lower the rates in model.deform"
+        )

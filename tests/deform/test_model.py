@@ -117,9 +117,10 @@ def test_motion_is_learned_from_pictures(kind: str) -> None:
     gaussians = flat_cloud()
     blobs = {"log_scales": torch.full((9, 3), -2.5), "logit_opacities": torch.full((9,), 2.0)}
     gaussians = gaussians.replace(**{name: x.requires_grad_() for name, x in blobs.items()})
-    rates = {"hexplane": {"lr_planes": 0.05, "lr_decoder": 0.02, "width": 16}, "mlp": {"lr": 0.01}}
+    planes = {"resolution": 3, "levels": (1,), "time_resolution": 4, "channels": 16, "width": 64}
+    rates = {"hexplane": {**planes, "lr_planes": 0.05, "lr_decoder": 0.01}, "mlp": {"lr": 0.01, "width": 32}}
     options = tiny_options(kind, everything=False).model_copy(update=rates.get(kind, {"lr_means": 0.01}))
-    model, steps = DynamicModel(deform=options, motion_sparsity=0.0), 120
+    model, steps = DynamicModel(deform=options, motion_sparsity=0.0), 150
     capture = Surroundings4D(TIMES, [camera()], 1.0)
     scene = DynamicScene(
         model, DeformSchedule(0, 0, (), steps), capture, StaticScene(), torch.Generator().manual_seed(0)

@@ -103,8 +103,8 @@ def test_phases_of_a_dynamic_model_come_in_order(steps: int, coarse: float, all_
 
 
 def test_phases_of_runs_of_usual_lengths() -> None:
-    schedule = deform_schedule(DynamicModel(), 20_000)
-    assert (schedule.fine, schedule.full) == (2600, 8000)
-    assert schedule.splits == (9000, 10_000, 11_000, 12_000, 13_000, 14_000)
+    """Splits come after a tenth, three tenths and a half of the steps that see all times."""
+    schedule = deform_schedule(DynamicModel(coarse=0.13, all_views_at=0.4), 20_000)
+    assert (schedule.fine, schedule.full, schedule.splits) == (2600, 8000, (9200, 11_600, 14_000))
+    assert deform_schedule(DynamicModel(all_views_at=0.69), 1000).splits == (721, 783, 845)
     assert deform_schedule(DynamicModel(), 1).fine == 1
-    assert deform_schedule(DynamicModel(all_views_at=0.6), 1000).splits == (650, 700)

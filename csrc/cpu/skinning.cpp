@@ -1,0 +1,269 @@
+// Whatever a node carries lies in one row of a table, in fours (x, y, z and one spare), so that a point and a node meet
+// in a few short vector operations. The backward pass splits the points into a number of contiguous parts that depends
+// on the sizes only; each adds up, in order, gradients of its own by all nodes, and these are then summed in order.
+#include "cpu/skinning.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <limits>
+#include <memory>
+#include <vector>
+
+#include "cpu/parallel.hpp"
+#include "math/projection.hpp"
+
+namespace dyngs {
+namespace {
+
+constexpr int64_t kGrain = 512;  // points
+constexpr int64_t kNodeGrain = 64;
+constexpr int64_t kMaxParts = 16;
+
+template <class S>
+struct FourOf {
+  typedef S Vec __attribute__((vector_size(4 * sizeof(S))));
+};
+template <class S>
+using Four = typename FourOf<S>::Vec;
+
+// Rows of the table: the place with minus the rate of decay in the spare lane; R - I, by column in the forward and by
+// row in the backward pass; and in the forward pass the shift and the values.
+constexpr int kPlace = 0, kTurn = 1, kShift = 4, kValues = 5;
+// Rows of gradients: by the columns of R, the shift and the values.
+constexpr int kByTurn = 0, kByShift = 3, kByValues = 4;
+
+template <class S>
+inline Four<S> load_some(const S* from, int64_t count) {
+  Four<S> r{};
+  if (count >= 4) {
+    std::memcpy(&r, from, sizeof r);
+  } else {
+    for (int i = 0; i < count; ++i) r[i] = from[i];
+  }
+  return r;
+}
+template <class S>
+inline Four<S> load_three(const S* from) { return Four<S>{from[0], from[1], from[2], S(0)}; }
+
+template <class S>
+inline void store_some(S* to, Four<S> x, int64_t count) {
+  if (count >= 4) {
+    std::memcpy(to, &x, sizeof x);
+  } else {
+    for (int i = 0; i < count; ++i) to[i] = x[i];
+  }
+}
+
+inline int64_t fours(int64_t width) { return (width + 3) / 4; }
+
+template <class S>
+Quat<S> quaternion(const SkinNodes<S>& nodes, int64_t node) {
+  const S* q = nodes.motion + 7 * node + 3;
+  return {q[0], q[1], q[2], q[3]};
+}
+
+// R - I, whose diagonal would suffer from rounding if 1 were added and taken away. NaN stays NaN.
+template <class S>
+Mat3<S> turn_of(const Quat<S>& q) {
+  if (std::isnan(q.w) || std::isnan(q.x) || std::isnan(q.y) || std::isnan(q.z)) {
+    Mat3<S> unknown;
+    for (auto& row : unknown.m) std::fill(row, row + 3, std::numeric_limits<S>::quiet_NaN());
+    return unknown;
+  }
+  S inv_norm;
+  const Quat<S> n = normalize(q, inv_norm);
+  Mat3<S> r = rotation_matrix(n);
+  r.m[0][0] = S(-2) * (n.y * n.y + n.z * n.z);
+  r.m[1][1] = S(-2) * (n.x * n.x + n.z * n.z);
+  r.m[2][2] = S(-2) * (n.x * n.x + n.y * n.y);
+  return r;
+}
+
+template <class S>
+struct Table {
+  int64_t stride;
+  std::vector<Four<S>> rows;
+
+  const Four<S>* operator[](int64_t node) const { return rows.data() + node * stride; }
+};
+
+template <class S>
+Table<S> node_table(const SkinNodes<S>& nodes, bool forward) {
+  const int64_t stride = forward ? kValues + fours(nodes.width) : kShift;
+  Table<S> table{stride, std::vector<Four<S>>(nodes.count * stride)};
+  for (int64_t s = 0; s < nodes.count; ++s) {
+    Four<S>* row = table.rows.data() + s * stride;
+    const double radius = nodes.radii[s];
+    const double rate = 0.5 * 1.4426950408889634 / (radius * radius);  // of powers of two
+    row[kPlace] = load_three(nodes.positions + 3 * s);
+    row[kPlace][3] = -static_cast<S>(std::min<double>(rate, std::numeric_limits<S>::max()));
+    const Mat3<S> turn = turn_of(quaternion(nodes, s));
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j) row[kTurn + i][j] = forward ? turn.m[j][i] : turn.m[i][j];
+    if (!forward) continue;
+    row[kShift] = load_three(nodes.motion + 7 * s);
+    for (int64_t k = 0; k < fours(nodes.width); ++k)
+      row[kValues + k] = load_some(nodes.values + s * nodes.width + 4 * k, nodes.width - 4 * k);
+  }
+  return table;
+}
+
+// The exponents of one point's weights, as powers of two, the largest 0. Distances that overflow all count as equal.
+template <class S>
+inline void exponents(const Table<S>& table, const S* coords, const int64_t* followed, int64_t num_nodes, S* to) {
+  constexpr S kLowest = std::numeric_limits<S>::lowest();
+  const Four<S> x = load_three(coords);
+  S top = kLowest;
+  for (int64_t b = 0; b < num_nodes; ++b) {
+    const Four<S> place = table[followed[b]][kPlace], arm = x - place;
+    const S exponent = (arm[0] * arm[0] + arm[1] * arm[1] + arm[2] * arm[2]) * place[3];
+    to[b] = exponent < kLowest ? kLowest : exponent;  // NaN stays
+    top = top < to[b] ? to[b] : top;
+  }
+  for (int64_t b = 0; b < num_nodes; ++b) to[b] -= top;
+}
+
+// 2^x in place; NaN stays.
+template <class S>
+void exponentiate(S* values, int64_t count) {
+  const auto power = [](Packet<S> x) { return select(x == x, exp2_of(x), x); };
+  int64_t i = 0;
+  for (; i + kLanes <= count; i += kLanes) power(Packet<S>::load(values + i)).store(values + i);
+  if (i == count) return;
+  S rest[kLanes] = {};
+  std::copy(values + i, values + count, rest);
+  power(Packet<S>::load(rest)).store(rest);
+  std::copy(rest, rest + (count - i), values + i);
+}
+
+template <class S>
+inline void normalize_weights(S* weights, int64_t count) {
+  S total = 0;
+  for (int64_t b = 0; b < count; ++b) total += weights[b];
+  const S inverse = S(1) / total;
+  for (int64_t b = 0; b < count; ++b) weights[b] *= inverse;
+}
+
+template <class S>
+inline void blend(const Table<S>& table, const S* coords, const int64_t* followed, int64_t num_nodes, const S* weights,
+                  S* offset, S* blended, int64_t width) {
+  const Four<S> x = load_three(coords);
+  Four<S> sum{};
+  for (int64_t b = 0; b < num_nodes; ++b) {
+    const Four<S>* row = table[followed[b]];
+    const Four<S> arm = x - row[kPlace];
+    const Four<S> swing = row[kTurn] * arm[0] + row[kTurn + 1] * arm[1] + row[kTurn + 2] * arm[2];
+    sum += weights[b] * (swing + row[kShift]);
+  }
+  store_some<S>(offset, sum, 3);
+  for (int64_t k = 0; k < fours(width); ++k) {
+    Four<S> values{};
+    for (int64_t b = 0; b < num_nodes; ++b) values += weights[b] * table[followed[b]][kValues + k];
+    store_some<S>(blended + 4 * k, values, width - 4 * k);
+  }
+}
+
+// Adds to `sums`, a row per node, what the points [begin, end) give, and writes the gradients by these points.
+template <class S>
+void gather_part(const Table<S>& table, const SkinPoints<S>& points, const Skinned<const S>& g, int64_t width,
+                 int64_t begin, int64_t end, Four<S>* sums, S* g_points) {
+  const int64_t stride = kByValues + fours(width);
+  for (int64_t m = begin; m < end; ++m) {
+    const int64_t* followed = points.followed + m * points.nodes;
+    const S* weights = g.weights + m * points.nodes;
+    const Four<S> x = load_three(points.coords + 3 * m), by_offset = load_three(g.offset + 3 * m);
+    Four<S> by_point{};
+    for (int64_t b = 0; b < points.nodes; ++b) {
+      const Four<S>* row = table[followed[b]];
+      Four<S>* sum = sums + followed[b] * stride;
+      const Four<S> arm = x - row[kPlace], share = weights[b] * by_offset;
+      for (int i = 0; i < 3; ++i) {
+        by_point += row[kTurn + i] * share[i];
+        sum[kByTurn + i] += share * arm[i];
+      }
+      sum[kByShift] += share;
+    }
+    if (g_points != nullptr) store_some<S>(g_points + 3 * m, by_point, 3);
+    for (int64_t k = 0; k < fours(width); ++k) {
+      const Four<S> by_values = load_some(g.blended + m * width + 4 * k, width - 4 * k);
+      for (int64_t b = 0; b < points.nodes; ++b) sums[followed[b] * stride + kByValues + k] += weights[b] * by_values;
+    }
+  }
+}
+
+// The gradients of one node from the sum over all parts.
+template <class S>
+void write_node(const SkinNodes<S>& nodes, int64_t node, const Four<S>* sum, const SkinGrads<S>& grads) {
+  Mat3<S> by_turn;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) by_turn.m[i][j] = sum[kByTurn + j][i];
+  S inv_norm;
+  const Quat<S> unit = normalize(quaternion(nodes, node), inv_norm);
+  const Quat<S> by_quat = normalize_vjp(unit, inv_norm, rotation_matrix_vjp(unit, by_turn));
+  S* to = grads.motion + 7 * node;
+  store_some<S>(to, sum[kByShift], 3);
+  store_some<S>(to + 3, Four<S>{by_quat.w, by_quat.x, by_quat.y, by_quat.z}, 4);
+  for (int64_t k = 0; k < fours(nodes.width); ++k)
+    store_some<S>(grads.values + node * nodes.width + 4 * k, sum[kByValues + k], nodes.width - 4 * k);
+}
+
+// Few where there are more nodes than points: every part costs a pass over all nodes.
+int64_t num_parts(int64_t num_points, int64_t per_point, int64_t num_nodes) {
+  return std::clamp<int64_t>(num_points * per_point / std::max<int64_t>(4 * num_nodes, 1), 1, kMaxParts);
+}
+
+}  // namespace
+
+bool follow_within(const int64_t* followed, int64_t size, int64_t num_nodes) {
+  uint64_t largest = 0;  // negative indices are larger than any other
+  for (int64_t i = 0; i < size; ++i) largest = std::max(largest, static_cast<uint64_t>(followed[i]));
+  return size == 0 || largest < static_cast<uint64_t>(num_nodes);
+}
+
+template <class S>
+void skinning_forward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, const Skinned<S>& out, int num_threads) {
+  const Table<S> table = node_table(nodes, true);
+  const int64_t per_point = points.nodes;
+  parallel_for(points.count, kGrain, num_threads, [&](int64_t begin, int64_t end) {
+    for (int64_t m = begin; m < end; ++m)
+      exponents(table, points.coords + 3 * m, points.followed + m * per_point, per_point, out.weights + m * per_point);
+    exponentiate(out.weights + begin * per_point, (end - begin) * per_point);
+    for (int64_t m = begin; m < end; ++m) {
+      S* weights = out.weights + m * per_point;
+      normalize_weights(weights, per_point);
+      blend(table, points.coords + 3 * m, points.followed + m * per_point, per_point, weights, out.offset + 3 * m,
+            out.blended + m * nodes.width, nodes.width);
+    }
+  });
+}
+
+template <class S>
+void skinning_backward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, const Skinned<const S>& g,
+                       const SkinGrads<S>& grads, int num_threads) {
+  const Table<S> table = node_table(nodes, false);
+  const int64_t stride = kByValues + fours(nodes.width), size = nodes.count * stride;
+  const int64_t parts = num_parts(points.count, points.nodes, nodes.count);
+  const auto sums = std::make_unique_for_overwrite<Four<S>[]>(parts * size);
+  parallel_for(parts, 1, num_threads, [&](int64_t part, int64_t) {
+    Four<S>* own = sums.get() + part * size;
+    std::fill(own, own + size, Four<S>{});
+    gather_part(table, points, g, nodes.width, points.count * part / parts, points.count * (part + 1) / parts, own,
+                grads.points);
+  });
+  parallel_for(nodes.count, kNodeGrain, num_threads, [&](int64_t begin, int64_t end) {
+    for (int64_t part = 1; part < parts; ++part)
+      for (int64_t i = begin * stride; i < end * stride; ++i) sums[i] += sums[part * size + i];
+    for (int64_t s = begin; s < end; ++s) write_node(nodes, s, sums.get() + s * stride, grads);
+  });
+}
+
+#define DYNGS_INSTANTIATE(S)                                                                                     \
+  template void skinning_forward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<S>&, int);             \
+  template void skinning_backward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<const S>&,            \
+                                  const SkinGrads<S>&, int);
+DYNGS_INSTANTIATE(float)
+DYNGS_INSTANTIATE(double)
+#undef DYNGS_INSTANTIATE
+
+}  // namespace dyngs
