@@ -124,8 +124,8 @@ class SkeletonField(FieldSection):
     lr_scales: Positive = 1e-3
     lr_opacities: Positive = 1e-2
     lr_colors: Positive = 2e-3
-    lr_decay: Fraction = Field(default=0.01, description="last over first rate")
-    rigidity: float = Field(default=0.1, ge=0, description="weight of neighbours' strain, squared node spacings")
+    lr_decay: Fraction = Field(default=0.2, description="last over first rate")
+    rigidity: float = Field(default=0.5, ge=0, description="weight of neighbours' strain, squared node spacings")
     smoothness: float = Field(default=0.01, ge=0, description="weight of the acceleration between keys")
 
 
@@ -148,13 +148,15 @@ class DynamicModel(SceneModel):
 
     kind: Literal["dynamic"] = "dynamic"
     deform: Annotated[DeformField, Field(discriminator="kind")] = HexplaneField()
-    coarse: Fraction = Field(default=0.15, description="share of the run that trains without motion, on all views")
+    coarse: Fraction = Field(default=0.13, description="share of the run that trains without motion, on all views")
     moving_error: float = Field(
         default=0.04, ge=0, description="things may move only where the still model's colour error is larger"
     )
     seeds: int = Field(default=4000, ge=0, description="random Gaussians added where motion begins")
-    first_views: Fraction = Field(default=0.1, description="share of the views, around the middle, to start with")
-    all_views_at: Fraction = Field(default=0.4, description="share of the run from which all times are trained on")
+    first_views: Fraction = Field(
+        default=1.0, description="share of the views, around the middle, to begin motion with"
+    )
+    all_views_at: Fraction = Field(default=0.5, description="share of the run from which all times are trained on")
     still_below: float = Field(default=0.3, ge=0, description="px in the nearest training view; 0 = all may move")
     motion_sparsity: float = Field(default=0.01, ge=0, description="weight of the mean motion, in scene extents")
     time_jitter: float = Field(default=0.0, ge=0, description="of the step between times, annealed; 0.1 suits videos")

@@ -1,4 +1,4 @@
-"""The demo: the whole of dyngs on an embedded scene, from pictures to a trained, measured and rendered model."""
+"""The demo: the whole of dyngs on an embedded moving scene, from pictures to a trained, measured, rendered model."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.config import Config
 from dyngs.config_io import load_config, packaged_preset
-from dyngs.data.synthetic import StillOptions, write_still_capture
+from dyngs.data.synthetic import DynamicOptions, write_dynamic_capture
 from dyngs.errors import DyngsError
 from dyngs.export.run import export_ply
 from dyngs.train.evaluate import EvalReport, evaluate_run
@@ -31,14 +31,16 @@ class DemoOptions:
         steps: of training.
         threads: 0 = all cores.
         size: width and height of the pictures, pixels.
+        num_times: training pictures, one camera and one time each.
         num_points: random points to start from.
         num_frames: of the video.
     """
 
-    steps: int = 2000
+    steps: int = 3000
     threads: int = 0
-    size: int = 200
-    num_points: int = 10_000
+    size: int = 160
+    num_times: int = 60
+    num_points: int = 6000
     num_frames: int = 90
 
 
@@ -75,12 +77,12 @@ def run_demo(out: Path = DEFAULT_OUT, options: DemoOptions = DemoOptions()) -> D
     folder = unused_folder(out)
     capture, run_dir, pictures = folder / "capture", folder / "run", folder / "pictures"
     print(f"[1/4] ray tracing the pictures of the demo scene into {capture}", flush=True)
-    write_still_capture(capture, StillOptions(size=options.size))
+    write_dynamic_capture("spin", capture, DynamicOptions(size=options.size, num_times=options.num_times, samples=3))
     print(f"[2/4] training {options.steps} steps into {run_dir}", flush=True)
     train(demo_config(capture, run_dir, options))
     print("[3/4] measuring on pictures that were not trained on", flush=True)
     report = evaluate_run(run_dir, threads=options.threads)
-    print("[4/4] rendering the test views and a flight around the scene", flush=True)
+    print("[4/4] rendering the test views and a flight around the moving scene", flush=True)
     write_split(run_dir, "test", pictures)
     shot = shot_of_run(run_dir, ShotOptions("orbit", options.num_frames))
     video = folder / "orbit.mp4"
@@ -92,15 +94,16 @@ def run_demo(out: Path = DEFAULT_OUT, options: DemoOptions = DemoOptions()) -> D
 
 
 def demo_config(capture: Path, run_dir: Path, options: DemoOptions) -> Config:
-    """The packaged preset ``static`` for the demo's capture and size."""
+    """The packaged preset ``dynamic`` for the demo's capture and size."""
     overrides = (
         "data.root=capture",
         f"init.num_random={options.num_points}",
+        f"model.seeds={options.num_points // 3}",
         f"train.steps={options.steps}",
         "run.name=demo",
         f"run.threads={options.threads}",
     )
-    config = load_config(packaged_preset("static"), overrides)
+    config = load_config(packaged_preset("dynamic"), overrides)
     data = config.data.model_copy(update={"root": capture.absolute()})
     return config.model_copy(update={"data": data, "run": config.run.model_copy(update={"dir": run_dir})})
 
@@ -128,6 +131,7 @@ def result_table(result: DemoResult) -> Table:
         "PSNR dB": f"{report.psnr:.2f}",
         "SSIM": f"{report.ssim:.4f}",
         "Gaussians": f"{report.num_gaussians:,}",
+        "moving": f"{report.moving_share:.0%}",
         "MB": f"{report.model_mb:.1f}",
         "frames/s": f"{report.fps:.0f}",
         "training s": f"{report.seconds_train:.1f}",

@@ -38,7 +38,7 @@ class Sliding:
         self.calls += 1
         return Offsets(torch.tensor([self.speed * time, 0.0, 0.0]).expand(len(means), 3))
 
-    def penalties(self) -> dict[str, Tensor]:
+    def penalties(self, time: float) -> dict[str, Tensor]:
         return {}
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:

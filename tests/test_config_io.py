@@ -21,6 +21,7 @@ from dyngs.config import (
     OptimConfig,
     RandomInit,
     RunConfig,
+    SkeletonField,
     StaticModel,
     TrainConfig,
     TrajectoryField,
@@ -282,7 +283,8 @@ configs = st.builds(
         coarse=fractions,
         deform=st.builds(HexplaneField, levels=st.lists(st.integers(1, 9), min_size=1).map(tuple), lr_planes=rates)
         | st.builds(MlpField, lr=rates, move_scales=st.booleans())
-        | st.builds(TrajectoryField, rigidity=rates),
+        | st.builds(TrajectoryField, lr_means=rates)
+        | st.builds(SkeletonField, rigidity=rates),
     ),
     init=st.builds(RandomInit, half_extent=rates),
     strategy=st.builds(McmcStrategy, noise=rates) | st.builds(DefaultStrategy, prune_opacity=fractions),

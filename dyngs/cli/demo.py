@@ -12,11 +12,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``demo`` to the commands."""
     parser = commands.add_parser(
         "demo",
-        help="train, measure and render an embedded scene",
-        description="Ray trace an embedded scene, train on it, measure, render pictures and a video, write a .ply.",
+        help="train, measure and render an embedded moving scene",
+        description="Ray trace an embedded moving scene, train on it, measure, render pictures and a video, write a .ply.",
     )
     parser.add_argument("--out", type=Path, default=Path("dyngs-demo"), metavar="DIR", help="default dyngs-demo")
-    parser.add_argument("--steps", type=int, default=2000, metavar="N", help="of training (default 2000)")
+    parser.add_argument("--steps", type=int, default=3000, metavar="N", help="of training (default 3000)")
     parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
     parser.set_defaults(run=run)
 

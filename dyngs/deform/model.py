@@ -136,6 +136,7 @@ class DynamicScene:
         result = seeded(parameters.detach(), self.options.seeds, self.capture.extent, self._generator)
         added = torch.arange(len(parameters), len(parameters) + self.options.seeds)
         self._begin_motion(parameters, torch.cat([rows, added]))
+        self._still.after_step(Gaussians(**result.changes), step, result)
         return result
 
     def num_moving(self, num_gaussians: int) -> int:

@@ -6,12 +6,16 @@ Local letters: S nodes, B nodes that one Gaussian follows.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from dyngs.deform.field import Offsets
 from dyngs.ops.skinning import blend_skinning
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 FOLLOWED = 4
 """Nodes that a Gaussian follows."""
@@ -99,7 +103,7 @@ def turned(offsets: Tensor, vectors: Tensor) -> Tensor:
     return vectors + w * twice + torch.linalg.cross(axis, twice)
 
 
-def _tree(points: Tensor):
+def _tree(points: Tensor) -> KDTree:
     from scipy.spatial import KDTree
 
     return KDTree(points.double().numpy())

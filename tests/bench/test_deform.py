@@ -102,10 +102,7 @@ def test_shares_are_within_bounds() -> None:
         ["--moving", "nan"],
         ["--gaussians", "0"],
         ["--repeats", "0"],
-        pytest.param(
-            ["--threads", "0"],
-            marks=pytest.mark.xfail(strict=True, reason="BUG: `arguments.threads or 1` takes 0 for the default"),
-        ),
+        ["--threads", "0"],
         ["--threads", "-1"],
         ["--kind", "splines"],
         ["no such run"],

@@ -1,8 +1,8 @@
-"""The dynamic model: its phases, what it freezes, and how it follows changes of the set of Gaussians."""
+"""The dynamic model: its phases, where motion begins, what it freezes, how it follows changes of the set."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -13,13 +13,16 @@ from tiny_fields import KINDS, cloud, stir, tiny_options
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import DynamicModel, TrajectoryField
+from dyngs.config import DynamicModel, OptimConfig, TrajectoryField
 from dyngs.data.loader import Picture
-from dyngs.deform.model import DeformSchedule, DynamicScene, Surroundings4D, box_of
+from dyngs.deform.field import FieldSetup
+from dyngs.deform.fields import field_state, new_field
+from dyngs.deform.model import DeformSchedule, DynamicScene, Surroundings4D, box_of, seeded
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.rendering import render
 from dyngs.static.densify import EditResult
 from dyngs.static.model import StaticScene
+from dyngs.static.optimizer import GaussianOptimizer
 
 FINE, FULL, SPLIT, STEPS = 2, 4, 6, 20
 TIMES = tuple(i / 20 for i in range(21))
@@ -44,18 +47,32 @@ def flat_cloud(count: int = 9) -> Gaussians:
     return Gaussians(**{name: x.clone().requires_grad_() for name, x in gaussians.tensors().items()})
 
 
-def new_scene(times: tuple[float, ...] = TIMES, **options: object) -> DynamicScene:
+def unmeasured(gaussians: Gaussians) -> Tensor:
+    raise AssertionError("errors are measured once, where motion begins")
+
+
+def new_scene(
+    times: tuple[float, ...] = TIMES,
+    residuals: Callable[[Gaussians], Tensor] = unmeasured,
+    still: StaticScene | None = None,
+    **options: object,
+) -> DynamicScene:
     """A dynamic model; its field is a straight line per Gaussian unless told otherwise."""
     line = TrajectoryField(polynomial=1, fourier=0, move_rotations=False, move_scales=False)
-    model = DynamicModel.model_validate({"deform": line, "motion_sparsity": 0.0, "still_below": THRESHOLD, **options})
+    defaults = {"deform": line, "seeds": 0, "motion_sparsity": 0.0, "still_below": THRESHOLD}
+    capture = Surroundings4D(times, [camera()], 1.0, residuals)
     schedule = DeformSchedule(FINE, FULL, (SPLIT,), STEPS)
-    return DynamicScene(model, schedule, Surroundings4D(times, [camera()], 1.0), StaticScene(), torch.Generator())
+    model = DynamicModel.model_validate(defaults | options)
+    return DynamicScene(model, schedule, capture, still or StaticScene(), torch.Generator())
 
 
 def begun(gaussians: Gaussians, **options: object) -> DynamicScene:
-    """After the coarse phase."""
-    scene = new_scene(**options)
-    scene.after_step(gaussians, FINE, None)
+    """After the coarse phase, as if the errors had said that all of the Gaussians move."""
+    scene = new_scene(**options)  # type: ignore[arg-type]
+    setup = FieldSetup(*box_of(gaussians, 1.0), len(scene.times), len(gaussians), 1.0)
+    field = new_field(scene.options.deform, setup, torch.Generator().manual_seed(0))
+    state = {f"field.{name}": x.clone() for name, x in field_state(field, setup).items()}
+    scene.load_state({**state, "rows": torch.arange(len(gaussians))})
     return scene
 
 
@@ -78,16 +95,139 @@ def drawn_at(scene: DynamicScene, gaussians: Gaussians, time: float) -> Gaussian
 
 
 def test_before_the_fine_phase_it_is_the_static_model() -> None:
-    scene, gaussians = new_scene(), flat_cloud()
+    scene, gaussians = new_scene(residuals=lambda _: torch.arange(9.0)), flat_cloud()
     for step in (1, FINE):
+        assert scene.edit(gaussians, step - 1) is None
         drawn = scene.gaussians_at(gaussians, picture(0.3), step)
         assert drawn.gaussians is gaussians
         assert drawn.penalties == {}
         assert scene.num_moving(9) == 0
         scene.after_step(gaussians, step, None)
-    assert scene.field is not None
-    assert scene.num_moving(9) == 9
+    scene.edit(gaussians, FINE)
+    assert scene.num_moving(9) > 0
     assert torch.equal(drawn_at(scene, gaussians, 0.3).means, gaussians.means)
+
+
+# --- where motion begins ----------------------------------------------------------------------------------------------
+
+ERRORS = (0.01, 0.3, 0.02, 0.35, 0.03, 0.0, 0.31, 0.02, 0.01)
+"""Of a still model; 1, 3 and 6 stand out."""
+
+
+def test_what_a_still_model_cannot_explain_moves() -> None:
+    """And only after the last step of the coarse phase."""
+    scene, gaussians = new_scene(residuals=lambda _: torch.tensor(ERRORS)), flat_cloud()
+    result = scene.edit(gaussians, FINE)
+    assert scene.rows is not None
+    assert scene.rows.tolist() == [1, 3, 6]
+    assert scene.num_moving(9) == 3
+    assert result is not None
+    assert result.edit is not None
+    assert result.edit.source.tolist() == list(range(9)), "without seeds the set stays"
+    field = scene.field
+    for step in (1, FINE + 1, FULL, SPLIT):
+        assert scene.edit(gaussians, step) is None
+    assert scene.field is field
+
+
+@pytest.mark.parametrize(
+    ("errors", "moving_error", "rows"),
+    [
+        (ERRORS, 0.305, [3, 6]),  # the two groups part at about 0.16, but no more than this is a motion
+        (ERRORS, 0.5, []),
+        ((0.3,) * 9, 0.04, []),  # badly explained, but all alike
+        ((0.0,) * 9, 0.0, []),
+        ((0.0,) * 8 + (0.01,), 0.0, [8]),
+    ],
+)
+def test_small_errors_are_no_motion(errors: tuple[float, ...], moving_error: float, rows: list[int]) -> None:
+    """Where nothing stands out the model stays static: the same Gaussians, nothing added, no field."""
+    scene = new_scene(residuals=lambda _: torch.tensor(errors), moving_error=moving_error, seeds=5)
+    gaussians = flat_cloud()
+    result = scene.edit(gaussians, FINE)
+    if rows:
+        assert scene.rows is not None
+        assert scene.rows.tolist() == [*rows, *range(9, 14)]
+    else:
+        assert (result, scene.field, scene.rows, scene.num_moving(9)) == (None, None, None, 0)
+        assert scene.state().keys() == {"times"}
+        assert scene.gaussians_at(gaussians, picture(0.2), FINE + 1).gaussians is gaussians
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_seeds_move_too(kind: str) -> None:
+    scene = new_scene(residuals=lambda _: torch.tensor(ERRORS), seeds=4, deform=tiny_options(kind))
+    gaussians = flat_cloud()
+    result = scene.edit(gaussians, FINE)
+    assert result is not None
+    optimizer = GaussianOptimizer(gaussians, OptimConfig())
+    optimizer.apply(result)
+    grown = optimizer.parameters
+    assert scene.rows is not None
+    assert scene.rows.tolist() == [1, 3, 6, 9, 10, 11, 12]
+    assert scene.num_moving(len(grown)) == 7
+    assert torch.equal(drawn_at(scene, grown, 0.3).means, grown.means.detach())
+    assert scene.field is not None
+    stir(scene.field)
+    moved = (drawn_at(scene, grown, 0.3).means != drawn_at(scene, grown, 0.9).means).any(1)
+    assert torch.equal(torch.nonzero(moved)[:, 0], scene.rows)
+
+
+def test_the_filter_of_a_still_model_counts_the_seeds() -> None:
+    """A checkpoint of that very step has as many values as Gaussians."""
+    still = StaticScene([camera()])
+    scene = new_scene(residuals=lambda _: torch.tensor(ERRORS), still=still, seeds=4)
+    gaussians = flat_cloud()
+    scene.gaussians_at(gaussians, picture(0.3), FINE)
+    assert len(scene.state()["filter_std"]) == 9
+    scene.edit(gaussians, FINE)
+    assert len(scene.state()["filter_std"]) == 13
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 30), st.integers(0, 40), st.integers(0, 3), st.integers(0, 2**32))
+def test_seeds_are_faint_and_lie_in_the_box(count: int, seeds: int, degree: int, seed: int) -> None:
+    """So many, after all others, which stay as they are; new rows without moments."""
+    gaussians = cloud(count + 1).select(torch.arange(count)).replace(sh=torch.randn(count, (degree + 1) ** 2, 3))
+    result = seeded(gaussians, seeds, 2.0, torch.Generator().manual_seed(seed))
+    assert result.edit is not None
+    assert torch.equal(result.edit.is_new, torch.arange(count + seeds) >= count)
+    assert torch.equal(result.edit.source[:count], torch.arange(count))
+    if not count:  # nothing that rows could descend from
+        return
+    optimizer = GaussianOptimizer(gaussians, OptimConfig())
+    for x in optimizer.parameters.tensors().values():
+        x.grad = torch.ones_like(x)
+    optimizer.step(1, 0.1, dense=True)
+    before, moments = optimizer.parameters.detach(), optimizer.state()
+    optimizer.apply(seeded(before, seeds, 2.0, torch.Generator().manual_seed(seed)))
+    after = optimizer.parameters.detach()
+    added = after.select(torch.arange(count, count + seeds))
+    assert len(after) == count + seeds
+    for name, x in before.tensors().items():
+        assert torch.equal(after.tensors()[name][:count], x), name
+        for moment in ("exp_avg", "exp_avg_sq"):
+            stored = optimizer.state()[f"{moment}.{name}"]
+            assert torch.equal(stored[:count], moments[f"{moment}.{name}"])
+            assert not stored[count:].any()
+    center, half_size = box_of(before, 2.0)
+    assert ((added.means - center).abs() <= half_size * (1 + 1e-5)).all()
+    assert (added.opacities - 0.1).abs().max() < 0.01 if seeds else True
+    assert not added.sh.any()
+    assert (added.log_scales.exp().amax(1) < 2 * half_size.max()).all()
+
+
+def test_seeds_fill_the_box() -> None:
+    """Each octant has its share; another draw gives other places, the same generator the same."""
+    gaussians = cloud(200)
+    draws = [seeded(gaussians, 4000, 1.0, torch.Generator().manual_seed(i)).changes["means"][200:] for i in (0, 0, 1)]
+    assert torch.equal(draws[0], draws[1])
+    assert not torch.equal(draws[0], draws[2])
+    octants = (draws[0] > box_of(gaussians, 1.0)[0]).float() @ torch.tensor([1.0, 2, 4])
+    assert octants.long().bincount(minlength=8).min() > 400
+
+
+# --- the field learns -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -120,12 +260,9 @@ def test_motion_is_learned_from_pictures(kind: str) -> None:
     planes = {"resolution": 3, "levels": (1,), "time_resolution": 4, "channels": 16, "width": 64}
     rates = {"hexplane": {**planes, "lr_planes": 0.05, "lr_decoder": 0.01}, "mlp": {"lr": 0.01, "width": 32}}
     options = tiny_options(kind, everything=False).model_copy(update=rates.get(kind, {"lr_means": 0.01}))
-    model, steps = DynamicModel(deform=options, motion_sparsity=0.0), 150
-    capture = Surroundings4D(TIMES, [camera()], 1.0)
-    scene = DynamicScene(
-        model, DeformSchedule(0, 0, (), steps), capture, StaticScene(), torch.Generator().manual_seed(0)
-    )
-    scene.after_step(gaussians, 0, None)
+    steps = 150
+    scene = begun(gaussians, deform=options, motion_sparsity=0.0)
+    scene.schedule = DeformSchedule(0, 0, (), steps)
     shift = torch.tensor([0.3, 0.0, 0.0])
     times = [(7 * i % 11) / 10 for i in range(steps)]
     for step, time in enumerate(times, start=1):
@@ -151,11 +288,12 @@ def test_bad_gradients_of_the_field_are_counted() -> None:
 
 
 def test_it_trains_on_the_window() -> None:
-    scene = new_scene(times=tuple(i / 100 for i in range(101)))
-    assert scene.trains_on(0.5, 1)
-    assert not scene.trains_on(0.0, 1)
-    assert not scene.trains_on(None, 1), "no time is time 0"
-    assert all(scene.trains_on(time, FULL) for time in (0.0, 0.5, 1.0, None))
+    """Which opens where motion begins: before, all views are trained on."""
+    scene = new_scene(times=tuple(i / 100 for i in range(101)), first_views=0.1)
+    assert all(scene.trains_on(time, step) for time in (0.0, 0.5, 1.0, None) for step in (1, FINE, FULL))
+    assert scene.trains_on(0.5, FINE + 1)
+    assert not scene.trains_on(0.0, FINE + 1)
+    assert not scene.trains_on(None, FINE + 1), "no time is time 0"
 
 
 def test_motion_sparsity_is_the_mean_length_in_extents() -> None:
@@ -270,7 +408,8 @@ def test_descendants_of_what_moves_move(data: st.DataObject) -> None:
     moves = torch.tensor(data.draw(st.lists(st.booleans(), min_size=9, max_size=9)))
     identity = torch.arange(1.0, 10.0)  # the speed tells the ancestor
     move(scene, torch.where(moves, identity, 0.0))
-    if data.draw(st.booleans(), label="frozen before"):
+    frozen = data.draw(st.booleans(), label="frozen before")
+    if frozen:
         scene.after_step(gaussians, SPLIT, None)
     ancestor = torch.arange(9)
     for _ in range(data.draw(st.integers(1, 3))):
@@ -285,8 +424,9 @@ def test_descendants_of_what_moves_move(data: st.DataObject) -> None:
     shift = (drawn_at(scene, gaussians, 1.0).means - gaussians.means)[:, 0]
     torch.testing.assert_close(shift, torch.where(moves, identity, 0.0)[ancestor], rtol=0, atol=1e-5)
     if scene.rows is not None:
-        assert torch.equal(scene.rows, torch.nonzero(moves[ancestor])[:, 0])
-        assert torch.equal(speeds_of(scene), identity[ancestor[scene.rows]])
+        followed = moves[ancestor] if frozen else torch.ones(len(ancestor), dtype=torch.bool)
+        assert torch.equal(scene.rows, torch.nonzero(followed)[:, 0])
+        assert torch.equal(speeds_of(scene), torch.where(moves, identity, 0.0)[ancestor[scene.rows]])
     assert scene.num_moving(len(ancestor)) == (0 if scene.field is None else len(speeds_of(scene)))
 
 
@@ -320,9 +460,8 @@ def test_a_reset_of_opacities_moves_no_rows() -> None:
 @pytest.mark.parametrize("phase", ["coarse", "fine", "split"])
 def test_state_goes_round(kind: str, phase: str) -> None:
     gaussians, options = flat_cloud(), {"deform": tiny_options(kind)}
-    scene = new_scene(**options)
+    scene = new_scene(**options) if phase == "coarse" else begun(gaussians, **options)
     if phase != "coarse":
-        scene.after_step(gaussians, FINE, None)
         assert scene.field is not None
         drawn_at(scene, gaussians, 0.4)
         stir(scene.field, 0.1)
@@ -355,23 +494,3 @@ def test_the_box_holds_what_is_solid() -> None:
     logits[2:40], far[2:40] = -10.0, -500.0
     bounded = box_of(gaussians.replace(means=far, logit_opacities=logits), 1.0)
     assert (bounded[1] < 1.5 * half_size).all()
-
-
-@pytest.mark.parametrize("count", [0, 1, 5])
-def test_a_box_of_nothing_or_of_one_point_has_a_size(count: int) -> None:
-    for logit in (5.0, -20.0):
-        gaussians = cloud(max(count, 1)).select(torch.zeros(count, dtype=torch.long))
-        center, half_size = box_of(gaussians.replace(logit_opacities=torch.full((count,), logit)), 2.0)
-        assert center.isfinite().all()
-        assert (half_size >= 2e-3).all()
-        if count:
-            torch.testing.assert_close(center, gaussians.means[0])
-
-
-def test_means_that_are_not_finite_do_not_spoil_the_box() -> None:
-    gaussians = cloud(50).replace(logit_opacities=torch.full((50,), 2.0))
-    means = gaussians.means.clone()
-    means[0], means[1] = math.nan, math.inf
-    center, half_size = box_of(gaussians.replace(means=means), 1.0)
-    assert center.isfinite().all()
-    assert half_size.isfinite().all()

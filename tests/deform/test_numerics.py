@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -212,6 +213,26 @@ def test_boxes_without_volume(kind: str, flat: str) -> None:
     assert all(field.learned[n].grad is None or field.learned[n].grad.isfinite().all() for n in field.learned.values())
     if flat == "point" and kind != "trajectory":
         torch.testing.assert_close(found, found[:1].expand_as(found))
+
+
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_a_box_of_nothing_or_of_one_point_has_a_size(count: int) -> None:
+    for logit in (5.0, -20.0):
+        gaussians = cloud(max(count, 1)).select(torch.zeros(count, dtype=torch.long))
+        center, half_size = box_of(gaussians.replace(logit_opacities=torch.full((count,), logit)), 2.0)
+        assert center.isfinite().all()
+        assert (half_size >= 2e-3).all()
+        if count:
+            torch.testing.assert_close(center, gaussians.means[0])
+
+
+def test_means_that_are_not_finite_do_not_spoil_the_box() -> None:
+    gaussians = cloud(50).replace(logit_opacities=torch.full((50,), 2.0))
+    means = gaussians.means.clone()
+    means[0], means[1] = math.nan, math.inf
+    center, half_size = box_of(gaussians.replace(means=means), 1.0)
+    assert center.isfinite().all()
+    assert half_size.isfinite().all()
 
 
 @pytest.mark.parametrize("distance", [1e3, 1e6, 1e30])

@@ -173,7 +173,6 @@ def test_a_field_that_lacks_something_is_named(tmp_path: Path) -> None:
         load_run(run_dir)
 
 
-@pytest.mark.xfail(strict=True, reason="BUG: save_checkpoint looks only at gaussians.*; see the report of the tests")
 def test_a_field_that_is_not_finite_is_not_saved(tmp_path: Path) -> None:
     run_dir = write_moving_run(tmp_path)
     good = latest_checkpoint(run_dir)

@@ -25,7 +25,6 @@ from dyngs.rendering import RenderOptions, render
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.train.evaluate import (
     evaluate_run,
-    evaluation_background,
     parameter_megabytes,
     render_options,
     report_path,
@@ -170,14 +169,6 @@ def test_report_is_strict_json(tmp_path) -> None:
     report = evaluate_run(write_run(tmp_path, some_gaussians()))
     with pytest.raises(ValueError, match="JSON"):
         replace(report, psnr=math.inf).to_json()
-
-
-def test_background_is_that_of_training() -> None:
-    cases = {("auto", True): "white", ("auto", False): "black", ("random", True): "black", ("white", False): "white"}
-    for (choice, has_alpha), name in cases.items():
-        resolved, rgb = evaluation_background(choice, has_alpha)
-        assert resolved == name
-        assert rgb.tolist() == [1.0 if name == "white" else 0.0] * 3
 
 
 def test_options_are_those_of_training() -> None:
