@@ -13,7 +13,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = commands.add_parser(
         "demo",
         help="train, measure and render an embedded moving scene",
-        description="Ray trace an embedded moving scene, train on it, measure, render pictures and a video, write a .ply.",
+        description="Ray trace a small moving scene, train on it, measure, render pictures and a video, write a .ply.",
     )
     parser.add_argument("--out", type=Path, default=Path("dyngs-demo"), metavar="DIR", help="default dyngs-demo")
     parser.add_argument("--steps", type=int, default=3000, metavar="N", help="of training (default 3000)")

@@ -29,6 +29,10 @@ from dyngs.static.model import Drawn, StaticScene
 BOX_MARGIN = 1.1
 SEED_SIZE = 0.3
 """Standard deviation of a seed, in distances between them."""
+SURELY_MOVING = 1.5
+"""Errors so many times ``moving_error`` are never taken for those of still things."""
+MIN_MOVING_SHARE = 0.02
+"""If no larger share of the Gaussians surely moves, nothing does."""
 SEED_LOGIT = -2.2
 """Opacity 0.1, as all Gaussians begin."""
 SOLID = 0.05
@@ -130,9 +134,11 @@ class DynamicScene:
         if step != self.schedule.fine:
             return None
         scores = self.capture.residuals(parameters.detach())
-        rows = torch.nonzero(scores > max(self.options.moving_error, two_group_threshold(scores)))[:, 0]
-        if not len(rows):
+        floor = self.options.moving_error
+        if not bool((scores > SURELY_MOVING * floor).float().mean() > MIN_MOVING_SHARE):
             return None
+        threshold = min(max(two_group_threshold(scores), floor), SURELY_MOVING * floor)
+        rows = torch.nonzero(scores > threshold)[:, 0]
         result = seeded(parameters.detach(), self.options.seeds, self.capture.extent, self._generator)
         added = torch.arange(len(parameters), len(parameters) + self.options.seeds)
         self._begin_motion(parameters, torch.cat([rows, added]))

@@ -15,10 +15,12 @@ from dyngs.rendering import RenderOptions, render
 def residual_scores(
     gaussians: Gaussians, pictures: Iterable[Picture], options: RenderOptions, background: Tensor
 ) -> Tensor:
-    """(N,) mean absolute colour error where each Gaussian shows: over all pixels, weighted by what it adds to them.
+    """(N,) how far the pictures disagree with the colour of each Gaussian, from view to view.
 
-    sum_p w_ip |rendered_p - truth_p| / sum_p w_ip with w = alpha T, both sums by one backward pass through the blending
-    of a constant colour. Masked pixels do not count; a Gaussian that shows nowhere has 0.
+    sum_v |sum_p w_vip (rendered - truth)| / sum_v sum_p w_vip with w = alpha T, a mean over channels. Errors of one
+    view are summed with their sign over what a Gaussian covers: detail that is not yet resolved cancels, a thing that
+    has come or gone does not. Both sums come from passes back through the blending of a constant colour. Masked pixels
+    do not count; a Gaussian that shows nowhere has 0.
 
     Args:
         pictures: as many as are to be looked at, one at a time.
@@ -29,15 +31,14 @@ def residual_scores(
     for picture in pictures:
         with torch.no_grad():
             rendered = render(still, picture.cameras, options, background=background).rgb[0]
-            error = (rendered - picture.composite(background)).abs().mean(-1)
-            counts = torch.ones_like(error) if picture.mask is None else picture.mask
+            counts = torch.ones(rendered.shape[:2]) if picture.mask is None else picture.mask
+            error = (rendered - picture.composite(background)) * counts[..., None]
         flat = torch.zeros(len(still), 1, 3, requires_grad=True)
         blended = render(still.replace(sh=flat), picture.cameras, options).rgb[0]
-        (grad,) = torch.autograd.grad(
-            blended, flat, torch.stack([error * counts, counts, torch.zeros_like(counts)], -1)
-        )
-        errors += grad[:, 0, 0]
-        weights += grad[:, 0, 1]
+        (signed,) = torch.autograd.grad(blended, flat, error, retain_graph=True)
+        (weight,) = torch.autograd.grad(blended, flat, counts[..., None].expand_as(error).contiguous())
+        errors += signed[:, 0].abs().mean(1)
+        weights += weight[:, 0, 0]
     return errors / weights.clamp_min(1e-6)
 
 

@@ -17,6 +17,8 @@ RESET_SHARE = 0.2
 """Of a short run, between resets."""
 MAX_GROWTH = 0.25
 FILTER_EVERY = 100
+MIN_COARSE_STEPS = 1000
+"""Steps that a still model needs to show where it fails; short runs spend at most a third on it."""
 SPLITS = (0.1, 0.3, 0.5)
 """When a dynamic model freezes what does not move: shares of the part of the run that sees all times."""
 
@@ -84,7 +86,7 @@ def filter_steps(strategy: DefaultStrategy | McmcStrategy, steps: int) -> range:
 
 def deform_schedule(model: DynamicModel, steps: int) -> DeformSchedule:
     """The phases of a dynamic model in a run of ``steps``; where ``still_below`` is 0 nothing is ever frozen."""
-    fine = min(max(1, round(model.coarse * steps)), steps)
+    fine = min(max(1, round(model.coarse * steps), min(MIN_COARSE_STEPS, steps // 3)), steps)
     full = max(fine, round(model.all_views_at * steps))
     splits = sorted({full + round(share * (steps - full)) for share in SPLITS}) if model.still_below > 0 else []
     return DeformSchedule(fine, full, tuple(step for step in splits if step > full), steps)

@@ -110,6 +110,18 @@ def test_camera_and_time_are_the_view_s(tmp_path: Path) -> None:
     assert picture.cameras.centers.tolist() == [[-1, -2, -3]]
 
 
+def test_times_are_known_without_decoding(tmp_path: Path) -> None:
+    """In the order of the views; None where a view has none."""
+    times = (0.75, None, 0.0)
+    views = tuple(replace(view, time=time) for view, time in zip(views_of(tmp_path), times, strict=True))
+    pictures = loader(views)
+    for view in views:
+        view.image_path.unlink()
+    assert pictures.times == times
+    assert pictures.cached_bytes == 0
+    assert loader(()).times == ()
+
+
 def test_mask_follows_the_picture(tmp_path: Path) -> None:
     """A small pixel counts only if all that it covers counts."""
     keep = np.full((8, 12, 1), 255, np.uint8)

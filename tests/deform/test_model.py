@@ -133,9 +133,12 @@ def test_what_a_still_model_cannot_explain_moves() -> None:
 @pytest.mark.parametrize(
     ("errors", "moving_error", "rows"),
     [
-        (ERRORS, 0.305, [3, 6]),  # the two groups part at about 0.16, but no more than this is a motion
         (ERRORS, 0.5, []),
-        ((0.3,) * 9, 0.04, []),  # badly explained, but all alike
+        ((0.0, 0.0, 0.0, 0.06, 0.3, 0.3, 0.3, 0.3, 0.4), 0.1, [4, 5, 6, 7, 8]),  # the groups part at 0.06
+        ((0.0, 0.0, 0.3, 0.3, 0.3, 1.0, 1.0, 1.0, 1.0), 0.1, [*range(2, 9)]),  # at 0.3, but that is surely motion
+        ((0.05,) * 9, 0.04, []),  # not well explained, but all alike
+        ((0.12,) * 9, 0.04, [*range(9)]),
+        ((0.0,) * 999 + (0.5,), 0.04, []),  # one in a thousand is noise
         ((0.0,) * 9, 0.0, []),
         ((0.0,) * 8 + (0.01,), 0.0, [8]),
     ],
@@ -185,16 +188,14 @@ def test_the_filter_of_a_still_model_counts_the_seeds() -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 30), st.integers(0, 40), st.integers(0, 3), st.integers(0, 2**32))
+@given(st.integers(1, 30), st.integers(0, 40), st.integers(0, 3), st.integers(0, 2**32))
 def test_seeds_are_faint_and_lie_in_the_box(count: int, seeds: int, degree: int, seed: int) -> None:
     """So many, after all others, which stay as they are; new rows without moments."""
-    gaussians = cloud(count + 1).select(torch.arange(count)).replace(sh=torch.randn(count, (degree + 1) ** 2, 3))
+    gaussians = cloud(count).replace(sh=torch.randn(count, (degree + 1) ** 2, 3))
     result = seeded(gaussians, seeds, 2.0, torch.Generator().manual_seed(seed))
     assert result.edit is not None
     assert torch.equal(result.edit.is_new, torch.arange(count + seeds) >= count)
     assert torch.equal(result.edit.source[:count], torch.arange(count))
-    if not count:  # nothing that rows could descend from
-        return
     optimizer = GaussianOptimizer(gaussians, OptimConfig())
     for x in optimizer.parameters.tensors().values():
         x.grad = torch.ones_like(x)
@@ -212,9 +213,9 @@ def test_seeds_are_faint_and_lie_in_the_box(count: int, seeds: int, degree: int,
             assert not stored[count:].any()
     center, half_size = box_of(before, 2.0)
     assert ((added.means - center).abs() <= half_size * (1 + 1e-5)).all()
-    assert (added.opacities - 0.1).abs().max() < 0.01 if seeds else True
+    assert ((added.opacities - 0.1).abs() < 0.01).all()
     assert not added.sh.any()
-    assert (added.log_scales.exp().amax(1) < 2 * half_size.max()).all()
+    assert (added.log_scales.exp() < half_size.max()).all()
 
 
 def test_seeds_fill_the_box() -> None:

@@ -14,15 +14,16 @@ from tiny_fields import KINDS, busy_config, cloud, stir, stirred_field, tiny_fie
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import DynamicModel, HexplaneField, SkeletonField, TrainConfig
-from dyngs.deform.field import FieldSetup, Offsets, deformed
+from dyngs.config import DynamicModel, HexplaneField, SkeletonField, StaticModel, TrainConfig
+from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
 from dyngs.deform.hexplane import Hexplane, time_rows
 from dyngs.deform.model import DynamicScene, box_of
 from dyngs.deform.motion import MAX_SAMPLES, measure_motion
 from dyngs.deform.skeleton import Skeleton
 from dyngs.deform.trained import TrainedScene
-from dyngs.deform.window import TimeWindow
+from dyngs.deform.window import FRONTIER_VIEWS, TimeWindow
+from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.ops.planes import PlaneLevel, hexplane_features
 from dyngs.rendering import render
@@ -49,9 +50,9 @@ def values(offsets: Offsets) -> Tensor:
 
 
 def fine_trainer(capture: Path, kind: str, **model: object) -> Trainer:
-    """After five steps, two of them without motion."""
+    """After ten steps, eight of them without motion."""
     trainer = assemble(busy_config(capture, capture, kind, **model))
-    for _ in range(5):
+    for _ in range(10):
         trainer.step()
     return trainer
 
@@ -119,15 +120,17 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
 
 
 def test_10000_training_times() -> None:
-    """Half as many rows or keys; the window and the measure of motion stay cheap, and neighbours are told apart."""
-    assert time_rows(HexplaneField(), LONG) == LONG // 2
+    """No more than 256 rows or keys; the window and the measure of motion stay cheap, and neighbours are told apart."""
+    assert time_rows(HexplaneField(), LONG) == MAX_KEY_TIMES
+    assert time_rows(HexplaneField(time_resolution=LONG // 2), LONG) == LONG // 2
     setup = FieldSetup(torch.zeros(3), torch.ones(3), LONG, 3, 1.0)
     skeleton = new_field(SkeletonField(nodes=2), setup, torch.Generator())
     assert isinstance(skeleton, Skeleton)
-    assert skeleton.num_keys == LONG // 2
+    assert skeleton.num_keys == MAX_KEY_TIMES
     times = tuple(i / (LONG - 1) for i in range(LONG))
     window = TimeWindow.around_middle(times, 0.1, 1000, 8000)
-    assert sum(window.holds(time, 0) for time in times) == pytest.approx(LONG / 10, abs=1)
+    assert sum(window.holds(time, 1001) for time in times) == pytest.approx(LONG / 10, abs=2)
+    assert 0 < sum(window.holds(time, 1002) for time in times) <= FRONTIER_VIEWS + 1
     asked: list[float] = []
     field = stirred_field("trajectory")
     real = field.offsets
@@ -178,7 +181,7 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     result = EditResult(TopologyEdit.keep(keep))
     trainer.optimizer.apply(result)
     trainer.densifier = assemble(trainer.config).densifier
-    model.after_step(trainer.optimizer.parameters, 6, result)
+    model.after_step(trainer.optimizer.parameters, 11, result)
     for _ in range(2):
         assert trainer.step().loss > 0
         assert model.num_moving(len(trainer.optimizer.parameters)) == 0
@@ -294,11 +297,67 @@ def test_gradients_that_are_not_finite_are_left_out(kind: str) -> None:
     assert all(x.isfinite().all() for x in field.learned.state().values())
 
 
-def test_a_run_of_one_step(capture: Path) -> None:
-    """It ends as motion begins: with a field that is the identity."""
-    config = busy_config(capture, capture, "hexplane").model_copy(update={"train": TrainConfig(steps=1)})
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> None:
+    """The next step stops before anything changes, and names step, view, attributes and time."""
+    trainer = fine_trainer(capture, kind)
+    model = trainer.model
+    assert isinstance(model, DynamicScene)
+    assert model.field is not None
+    for x in model.field.learned.values().values():
+        x.fill_(bad)
+    before = trainer.optimizer.parameters.means.detach().clone()
+    with pytest.raises(
+        DyngsError, match=r"^step 11, view '.*': the field makes means.* at [0-9.]+ not finite; .*deform$"
+    ):
+        trainer.step()
+    assert torch.equal(trainer.optimizer.parameters.means, before)
+
+
+# --- where motion begins ----------------------------------------------------------------------------------------------
+
+
+def test_a_picture_that_a_still_model_explains(capture: Path) -> None:
+    """No error stands out: nothing moves, no seeds, no field; the run goes on static."""
+    trainer = fine_trainer(capture, "skeleton", moving_error=10.0)
+    assert isinstance(trainer.model, DynamicScene)
+    assert trainer.model.field is None
+    assert len(trainer.optimizer.parameters) == len(reference_set(capture))
+    assert trainer.step().loss > 0
+
+
+def test_no_seeds(capture: Path) -> None:
+    """Just the Gaussians that were there move."""
+    sizes, moving = [], []
+    for seeds in (12, 0):
+        trainer = assemble(busy_config(capture, capture, "trajectory", seeds=seeds))
+        for _ in range(8):
+            trainer.step()
+        sizes.append(len(trainer.optimizer.parameters))
+        moving.append(trainer.model.num_moving(sizes[-1]))
+        assert trainer.step().loss > 0
+    assert sizes[0] == sizes[1] + 12
+    assert moving[0] == moving[1] + 12 > 12
+
+
+def reference_set(capture: Path) -> Gaussians:
+    """What a static run of as many steps has."""
+    config = busy_config(capture, capture, "skeleton")
+    trainer = assemble(config.model_copy(update={"model": StaticModel(sh_degree=1)}))
+    for _ in range(10):
+        trainer.step()
+    return trainer.optimizer.parameters
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_a_run_of_one_step(capture: Path, filtered: bool) -> None:
+    """It ends as motion begins: with a field that is the identity, for the seeds too, and filtered."""
+    config = busy_config(capture, capture, "hexplane", filter_3d=filtered)
+    config = config.model_copy(update={"train": TrainConfig(steps=1)})
     trainer = assemble(config)
     trainer.step()
     scene = stored_scene(trainer.checkpoint(), config.model)
     assert not scene.is_still
+    assert len(scene) == 60 + 12
     assert torch.equal(scene.at(0.3).means, scene.gaussians.means)

@@ -11,6 +11,7 @@ from dyngs.config import DynamicModel, StaticModel
 from dyngs.deform.field import deformed
 from dyngs.deform.fields import field_state
 from dyngs.deform.trained import TrainedScene, trained_scene
+from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.static.filters import fuse_filter
 
@@ -48,6 +49,14 @@ def test_times_after_the_clip_are_its_end(time: float) -> None:
     scene = some_scene()
     assert same(scene.at(time), scene.at(1.0))
     assert not same(scene.at(time), scene.at(0.0))
+
+
+@pytest.mark.parametrize("kind", [*KINDS, None])
+def test_a_time_that_is_no_number_is_refused(kind: str | None) -> None:
+    """Also where nothing moves."""
+    scene = some_scene(kind) if kind else TrainedScene(cloud(), NOTHING)
+    with pytest.raises(DyngsError, match="not a number; give one from 0 to 1"):
+        scene.at(float("nan"))
 
 
 @pytest.mark.parametrize("kind", KINDS)

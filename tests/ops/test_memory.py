@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+import dyngs
 
 # In a process of its own, as the setting cannot be taken back.
 PROGRAM = """
@@ -29,7 +33,9 @@ print(before, taken, faults(4))
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc has the setting")
 def test_blocks_are_reused_without_page_faults() -> None:
-    output = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True).stdout
+    environment = os.environ | {"PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])}
+    command = [sys.executable, "-c", PROGRAM]
+    output = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
     before, taken, after = output.split()
     assert taken == "True"
     assert int(after) < int(before) / 10

@@ -38,6 +38,10 @@ def test_nothing_depends_on_time() -> None:
     assert model.num_moving(7) == 0
 
 
+def test_the_set_is_left_to_the_strategy() -> None:
+    assert all(StaticScene().edit(_gaussians(2.0), step) is None for step in (1, 2, 100))
+
+
 def test_the_filter_is_kept_until_it_is_due() -> None:
     model = StaticScene([_camera()], range(100, 200, 100))
     near, far = _gaussians(2.0), _gaussians(4.0)

@@ -26,6 +26,7 @@ from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic import StillOptions, write_still_capture
 from dyngs.deform.model import DynamicScene
+from dyngs.deform.residual import residual_scores
 from dyngs.static.densify import DefaultDensifier
 from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.model import StaticScene
@@ -137,8 +138,25 @@ def test_without_times_a_dynamic_config_is_a_static_one(
     assert all(torch.equal(x, results[1].tensors[name]) for name, x in results[0].tensors.items())
 
 
-def test_the_coarse_phase_is_static_training_on_the_middle(capture: Path, tmp_path: Path) -> None:
-    """Until something moves, a dynamic run of few views is a static one, byte by byte."""
+@pytest.mark.parametrize(("most", "looked_at"), [(50, [0, 1, 2, 3, 4]), (2, [0, 2])])
+def test_motion_is_looked_for_in_pictures_from_all_over_the_clip(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, looked_at: list[int]
+) -> None:
+    """Drawn as in training, on the background of the evaluation."""
+    monkeypatch.setattr("dyngs.train.assemble.RESIDUAL_VIEWS", most)
+    root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
+    trainer = assemble(_dynamic(root, data=DataConfig(root=root, background="white")))
+    assert isinstance(trainer.model, DynamicScene)
+    gaussians = trainer.optimizer.parameters.detach()
+    found = trainer.model.capture.residuals(gaussians)
+    pictures = [trainer.pictures[i] for i in looked_at]
+    assert torch.equal(found, residual_scores(gaussians, pictures, trainer.options, torch.ones(3)))
+    assert found.shape == (50,)
+    assert found.max() > 0.01
+
+
+def test_the_coarse_phase_is_static_training(capture: Path, tmp_path: Path) -> None:
+    """Until something moves, a dynamic run is a static one, byte by byte, on all views."""
     root = _with_times(capture, tmp_path / "timed", [0.0, 0.25, 0.5, 0.75, 1.0])
     static, dynamic = (assemble(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(coarse=1.0)))
     for _ in range(8):

@@ -108,3 +108,10 @@ def test_phases_of_runs_of_usual_lengths() -> None:
     assert (schedule.fine, schedule.full, schedule.splits) == (2600, 8000, (9200, 11_600, 14_000))
     assert deform_schedule(DynamicModel(all_views_at=0.69), 1000).splits == (721, 783, 845)
     assert deform_schedule(DynamicModel(), 1).fine == 1
+
+
+@pytest.mark.parametrize(("steps", "fine"), [(300, 100), (2000, 666), (5000, 1000), (10_000, 1300)])
+def test_short_runs_stay_still_for_longer(steps: int, fine: int) -> None:
+    """1000 steps, but no more than a third of the run, unless a larger share is asked for."""
+    assert deform_schedule(DynamicModel(coarse=0.13), steps).fine == fine
+    assert deform_schedule(DynamicModel(coarse=0.5), steps).fine == steps // 2

@@ -1,0 +1,190 @@
+"""How far pictures disagree with still Gaussians where they show, and the score that parts two groups of them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import look_around
+from tiny_fields import cloud
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.data.loader import Picture
+from dyngs.deform.residual import residual_scores, two_group_threshold
+from dyngs.gaussians import Gaussians
+from dyngs.rendering import RenderOptions, render
+
+SIZE = 24
+OPTIONS = RenderOptions(nonfinite="trust")
+BLACK, WHITE = torch.zeros(3), torch.ones(3)
+SH_CONSTANT = 0.28209479177387814
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def camera(view: int = 0) -> Cameras:
+    """One of three around the origin, 3 away from it."""
+    intrinsics = torch.tensor([[20.0, 0, SIZE / 2], [0, 20, SIZE / 2], [0, 0, 1]])
+    return Cameras(look_around(3, torch.float32)[view][None], intrinsics[None], SIZE, SIZE)
+
+
+def balls(*places: tuple[float, float, float]) -> Gaussians:
+    """Grey, dense balls, far smaller than the picture."""
+    means, count = torch.tensor(places), len(places)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
+    return Gaussians(means, quats, torch.full((count, 3), -2.0), torch.full((count,), 4.0), torch.zeros(count, 1, 3))
+
+
+def rendered(gaussians: Gaussians, background: Tensor = BLACK, view: int = 0) -> Tensor:
+    return render(gaussians, camera(view), OPTIONS, background=background).rgb[0].detach()
+
+
+def picture(rgb: Tensor, mask: Tensor | None = None, alpha: Tensor | None = None, view: int = 0) -> Picture:
+    return Picture("view", camera(view), rgb, alpha, mask, 0.5)
+
+
+def sideways(x: float) -> tuple[float, float, float]:
+    """A place in the first camera's image plane, ``x`` to the right of the middle."""
+    right, down = camera().cam_from_world[0, 0, :3], camera().cam_from_world[0, 1, :3]
+    a, b, c = (x * right + 0.0 * down).tolist()
+    return a, b, c
+
+
+def left_half() -> Tensor:
+    half = torch.zeros(SIZE, SIZE)
+    half[:, : SIZE // 2] = 1.0
+    return half
+
+
+def test_what_the_pictures_show_has_no_error() -> None:
+    gaussians = cloud(12)
+    pictures = [picture(rendered(gaussians, view=view), view=view) for view in range(3)]
+    assert residual_scores(gaussians, pictures, OPTIONS, BLACK).max() < 1e-6
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.floats(-1, 1, width=32), min_size=3, max_size=3))
+def test_a_known_colour_is_the_error(colour: list[float]) -> None:
+    """Pictures that differ by a colour all over: its mean over the channels, for all that shows, however little."""
+    ball = balls(sideways(0.0), sideways(0.5)).replace(logit_opacities=torch.tensor([4.0, -4.0]))
+    pictures = [picture(rendered(ball, view=view) + torch.tensor(colour), view=view) for view in range(3)]
+    expected = sum(abs(x) for x in colour) / 3
+    assert residual_scores(ball, pictures, OPTIONS, BLACK).tolist() == pytest.approx([expected] * 2, rel=1e-3, abs=1e-6)
+
+
+def test_errors_count_where_a_gaussian_shows() -> None:
+    """The left half is wrong by 0.3: one ball is in it, one in the other half, one on the border."""
+    scene = balls(sideways(-0.9), sideways(0.9), sideways(0.0))
+    wrong = picture(rendered(scene) + 0.3 * left_half()[..., None])
+    left, right, border = residual_scores(scene, [wrong], OPTIONS, BLACK).tolist()
+    assert (left, right) == pytest.approx((0.3, 0.0), abs=0.01)
+    assert 0.05 < border < 0.25
+
+
+def test_masked_pixels_do_not_count() -> None:
+    scene = balls(sideways(-0.9), sideways(0.9), sideways(0.0))
+    truth = rendered(scene) + 0.3 * left_half()[..., None]
+    for mask, expected in ((left_half(), [0.3, 0.0, 0.3]), (1 - left_half(), [0.0, 0.0, 0.0])):
+        scores = residual_scores(scene, [picture(truth, mask)], OPTIONS, BLACK)
+        assert scores.tolist() == pytest.approx(expected, abs=0.01)
+
+
+def test_what_shows_nowhere_has_no_error() -> None:
+    """Behind the camera, beside the picture, behind three dense walls, transparent: exactly 0."""
+    center = camera().centers[0]
+    behind = tuple((2 * center).tolist())
+    places = [sideways(0.0), behind, sideways(40.0), tuple((-0.5 * center).tolist()), sideways(0.5)]
+    walls = [tuple((share * center).tolist()) for share in (0.4, 0.3, 0.2)]
+    scene = balls(*places, *walls)  # type: ignore[arg-type]
+    logits, scales = scene.logit_opacities.clone(), scene.log_scales.clone()
+    logits[4], logits[5:], scales[5:] = -20.0, 20.0, 3.0
+    scene = scene.replace(logit_opacities=logits, log_scales=scales)
+    scores = residual_scores(scene, [picture(torch.ones(SIZE, SIZE, 3))], OPTIONS, BLACK)
+    assert scores[:5].tolist() == [0.0] * 5
+    assert scores[5] > 0.3
+    assert residual_scores(scene, [], OPTIONS, BLACK).tolist() == [0.0] * 8
+
+
+def test_the_background_lies_behind_both() -> None:
+    """Where a picture is transparent, the truth is the background."""
+    scene, clear = balls(sideways(0.0)), torch.zeros(SIZE, SIZE)
+    empty = picture(torch.zeros(SIZE, SIZE, 3), alpha=clear)
+    errors = [float(residual_scores(scene, [empty], OPTIONS, colour)) for colour in (BLACK, WHITE)]
+    assert errors[0] == pytest.approx(errors[1], rel=1e-3)  # grey is as far from black as from white
+    assert 0.2 < errors[0] < 0.5
+    grey = torch.full((3,), 0.5)
+    assert float(residual_scores(scene, [empty], OPTIONS, grey)) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_detail_cancels_in_a_view_but_not_between_views() -> None:
+    """Stripes that a ball cannot resolve are no error; a ball too bright in one view and too dark in the next is."""
+    ball = balls(sideways(0.0)).replace(log_scales=torch.full((1, 3), -0.7))
+    signs = torch.ones(SIZE)
+    signs[1::2] = -1.0
+    stripes = picture(rendered(ball) + 0.3 * signs[None, :, None])
+    assert float(residual_scores(ball, [stripes], OPTIONS, BLACK)) < 0.02
+    changes = [picture(rendered(ball, view=view) + 0.3 * (-1) ** view, view=view) for view in range(2)]
+    assert float(residual_scores(ball, changes, OPTIONS, BLACK)) == pytest.approx(0.3, rel=1e-3)
+
+
+def test_it_is_the_weighted_mean() -> None:
+    """The weights, one Gaussian at a time: what is seen of it if it alone is white and all others are black."""
+    count, random = 12, torch.Generator().manual_seed(0)
+    gaussians = cloud(count)
+    masks = [None, (torch.rand(SIZE, SIZE, generator=random) > 0.3).float(), None]
+    pictures = [picture(torch.rand(SIZE, SIZE, 3, generator=random), masks[view], view=view) for view in range(3)]
+    error, weight = torch.zeros(count), torch.zeros(count)
+    for view, one in enumerate(pictures):
+        wrong = rendered(gaussians, WHITE, view) - one.rgb_premultiplied
+        counts = torch.ones(SIZE, SIZE) if one.mask is None else one.mask
+        for i in range(count):
+            sh = torch.full((count, 1, 3), -0.5 / SH_CONSTANT)
+            sh[i] = 0.5 / SH_CONSTANT
+            share = rendered(gaussians.replace(sh=sh), view=view)[..., 0] * counts
+            error[i] += (share[..., None] * wrong).sum((0, 1)).abs().mean()
+            weight[i] += share.sum()
+    scores = residual_scores(gaussians, iter(pictures), OPTIONS, WHITE)
+    assert (weight > 0.1).sum() > 5
+    torch.testing.assert_close(scores, error / weight.clamp_min(1e-6), rtol=1e-3, atol=1e-5)
+
+
+def test_nothing_is_left_behind() -> None:
+    """Neither gradients nor changes; leaf tensors are taken too."""
+    gaussians = Gaussians(**{name: x.clone().requires_grad_() for name, x in cloud(5).tensors().items()})
+    scores = residual_scores(gaussians, [picture(torch.rand(SIZE, SIZE, 3))], OPTIONS, BLACK)
+    assert not scores.requires_grad
+    for name, x in gaussians.tensors().items():
+        assert x.grad is None
+        assert torch.equal(x.detach(), cloud(5).tensors()[name])
+
+
+def test_no_gaussians() -> None:
+    nobody = cloud(3).select(torch.zeros(0, dtype=torch.long))
+    scores = residual_scores(nobody, [picture(torch.ones(SIZE, SIZE, 3))], OPTIONS, BLACK)
+    assert scores.shape == (0,)
+    assert two_group_threshold(scores) == float("inf")
+
+
+# --- two groups -------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    st.lists(st.floats(0, 0.1), min_size=2, max_size=40),
+    st.lists(st.floats(0.6, 0.7), min_size=2, max_size=40),
+    st.floats(1e-3, 10),
+)
+def test_two_clear_groups_are_parted(low: list[float], high: list[float], scale: float) -> None:
+    """At any scale, in any order, if neither is tiny; to a 256th of the range, which is counted in so many bins."""
+    scores = scale * torch.tensor(low + high)
+    order = torch.randperm(len(scores), generator=torch.Generator().manual_seed(len(scores)))
+    threshold = two_group_threshold(scores[order])
+    bin_width = float(scores.max() - scores.min()) / 256
+    assert scale * max(low) - bin_width <= threshold < scale * min(high) - bin_width
+
+
+@pytest.mark.parametrize("scores", [[], [0.3], [0.3] * 50, [0.0] * 5])
+def test_of_equal_scores_none_stands_out(scores: list[float]) -> None:
+    assert two_group_threshold(torch.tensor(scores)) == float("inf")
