@@ -36,6 +36,11 @@ class Offsets:
     logit_opacities: Tensor | None = None
     colors: Tensor | None = None
 
+    def select(self, index: Tensor | slice) -> Offsets:
+        """The offsets of the Gaussians at ``index``."""
+        others = (self.quats, self.log_scales, self.logit_opacities, self.colors)
+        return Offsets(self.means[index], *(None if x is None else x[index] for x in others))
+
 
 @dataclass(frozen=True)
 class FieldSetup:

@@ -18,7 +18,7 @@ from dyngs.config import DynamicModel
 from dyngs.data.loader import Picture
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import field_state, new_field, part_of, restored_field
-from dyngs.deform.motion import bake_, measure_motion, select_offsets
+from dyngs.deform.motion import bake_, measure_motion
 from dyngs.deform.residual import two_group_threshold
 from dyngs.deform.window import TimeWindow
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -182,7 +182,7 @@ class DynamicScene:
         motion = measure_motion(field, now.select(rows), self.times, px_size)
         moves = motion.pixels >= self.options.still_below
         still = torch.nonzero(~moves)[:, 0]
-        bake_(parameters, rows[still], select_offsets(motion.mean, still))
+        bake_(parameters, rows[still], motion.mean.select(still))
         kept = torch.nonzero(moves)[:, 0]
         self.rows = rows[kept]
         field.select(kept, torch.zeros(len(kept), dtype=torch.bool))

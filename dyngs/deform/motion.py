@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -44,7 +44,7 @@ def measure_motion(field: DeformationField, gaussians: Gaussians, times: Sequenc
     """
     chosen = torch.linspace(0, len(times) - 1, min(len(times), MAX_SAMPLES)).round().long().tolist()
     samples = [field.offsets(gaussians.means, times[i]) for i in chosen]
-    mean = Offsets(**{f.name: _mean([getattr(s, f.name) for s in samples]) for f in fields(Offsets)})
+    mean = _mean(samples)
     longest = gaussians.scales.amax(1)
     score = torch.zeros(len(gaussians))
     for sample in samples:
@@ -78,12 +78,17 @@ def bake_(gaussians: Gaussians, rows: Tensor, offsets: Offsets) -> None:
         gaussians.sh.data[rows, 0] += offsets.colors
 
 
-def select_offsets(offsets: Offsets, index: Tensor) -> Offsets:
-    """The offsets at ``index``."""
-    values = {f.name: getattr(offsets, f.name) for f in fields(Offsets)}
-    return Offsets(**{name: None if x is None else x[index] for name, x in values.items()})
+def _mean(samples: Sequence[Offsets]) -> Offsets:
+    """The means of offsets that have the same heads."""
+    return Offsets(
+        torch.stack([s.means for s in samples]).mean(0),
+        _mean_head([s.quats for s in samples]),
+        _mean_head([s.log_scales for s in samples]),
+        _mean_head([s.logit_opacities for s in samples]),
+        _mean_head([s.colors for s in samples]),
+    )
 
 
-def _mean(samples: list[Tensor | None]) -> Tensor | None:
-    known = [x for x in samples if x is not None]
+def _mean_head(values: Sequence[Tensor | None]) -> Tensor | None:
+    known = [x for x in values if x is not None]
     return torch.stack(known).mean(0) if known else None

@@ -47,7 +47,7 @@ class Skeleton:
     def offsets(self, means: Tensor, time: float) -> Offsets:
         """See ``DeformationField.offsets``; differentiable in ``means``, which nodes turn about themselves."""
         if not len(means):  # whatever nodes there are
-            return Offsets(**{name: None if x is None else x[:0] for name, x in vars(self._at(time)).items()})
+            return self._at(time).select(slice(0))
         return follow(self._nodes(means), means, self._at(time))
 
     def penalties(self, time: float) -> dict[str, Tensor]:

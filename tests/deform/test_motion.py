@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dyngs.deform.field import Offsets, deformed
 from dyngs.deform.learned import LearnedTensors
-from dyngs.deform.motion import MAX_SAMPLES, PX_PER_OPACITY, bake_, measure_motion, select_offsets
+from dyngs.deform.motion import MAX_SAMPLES, PX_PER_OPACITY, bake_, measure_motion
 
 TIMES = tuple(i / 10 for i in range(11))
 
@@ -129,15 +129,15 @@ def test_baking_freezes_at_the_mean(everything: bool) -> None:
     samples = [field.offsets(gaussians.means, t).means.detach() for t in TIMES]
     torch.testing.assert_close(mean.means, torch.stack(samples).mean(0))
     rows = torch.tensor([1, 4, 8])
-    expected = deformed(gaussians, select_offsets(mean, rows), rows)
+    expected = deformed(gaussians, mean.select(rows), rows)
     baked = gaussians.replace(**{k: x.clone().requires_grad_() for k, x in gaussians.tensors().items()})
-    bake_(baked, rows, select_offsets(mean, rows))
+    bake_(baked, rows, mean.select(rows))
     for name, x in expected.tensors().items():
         assert torch.equal(getattr(baked, name).detach(), x), name
         assert getattr(baked, name).requires_grad
     others = torch.tensor([0, 2, 3, 5, 6, 7])
     assert torch.equal(baked.means[others], gaussians.means[others])
-    bake_(baked, torch.zeros(0).long(), select_offsets(mean, torch.zeros(0).long()))
+    bake_(baked, torch.zeros(0).long(), mean.select(torch.zeros(0).long()))
     assert torch.equal(baked.quats.detach(), expected.quats)
 
 
