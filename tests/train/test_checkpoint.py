@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -64,13 +65,15 @@ def test_what_is_saved_is_what_is_loaded(tmp_path: Path) -> None:
 
 
 def test_equal_checkpoints_have_equal_bytes_in_any_process(tmp_path: Path) -> None:
+    folders = [str(REPOSITORY / "tests"), str(REPOSITORY / "tests" / "train")]
     code = (
-        "import sys; from pathlib import Path; sys.path[:0] = ['tests', 'tests/train']\n"
+        f"import sys; from pathlib import Path; sys.path[:0] = {folders!r}\n"
         "from test_checkpoint import _checkpoint; from dyngs.train.checkpoint import save_checkpoint\n"
         "save_checkpoint(Path(sys.argv[1]), _checkpoint(7), 99.0)"
     )
     command = [sys.executable, "-c", code, str(tmp_path / "other")]
-    subprocess.run(command, check=True, cwd=REPOSITORY, env={"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"})
+    # Not from the repository: its source folder would hide the installed package.
+    subprocess.run(command, check=True, cwd=tmp_path, env=os.environ | {"OMP_NUM_THREADS": "1"})
     mine = save_checkpoint(tmp_path / "mine", _checkpoint(7), 1.0)
     assert mine.read_bytes() == checkpoint_paths(tmp_path / "other")[0].read_bytes()
 
