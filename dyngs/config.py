@@ -114,19 +114,19 @@ class MlpField(FieldSection):
 
 
 class SkeletonField(FieldSection):
-    """Control nodes with a pose at key times, which Gaussians around them follow (after SC-GS, Huang et al. 2024)."""
+    """Control nodes that move along splines, which Gaussians around them follow (after SC-GS, Huang et al. 2024)."""
 
     kind: Literal["skeleton"] = "skeleton"
     nodes: int = Field(default=512, ge=1)
-    keys: int = Field(default=0, ge=0, description="key times; 0 = half the number of training times")
-    lr_means: Positive = Field(default=2e-4, description="times the scene extent")
-    lr_quats: Positive = 2e-3
+    pieces: int = Field(default=0, ge=0, description="of the splines; 0 = 0.3 times the number of training times")
+    lr_means: Positive = Field(default=6e-4, description="times the scene extent")
+    lr_quats: Positive = 6e-3
     lr_scales: Positive = 1e-3
     lr_opacities: Positive = 1e-2
     lr_colors: Positive = 2e-3
     lr_decay: Fraction = Field(default=0.2, description="last over first rate")
     rigidity: float = Field(default=0.5, ge=0, description="weight of neighbours' strain, squared node spacings")
-    smoothness: float = Field(default=0.01, ge=0, description="weight of the acceleration between keys")
+    smoothness: float = Field(default=0.01, ge=0, description="weight of the acceleration")
 
 
 class TrajectoryField(FieldSection):
@@ -156,6 +156,7 @@ class DynamicModel(SceneModel):
     first_views: Fraction = Field(
         default=1.0, description="share of the views, around the middle, to begin motion with"
     )
+    first_views_until: Fraction = Field(default=0.0, description="share of the run from which more views are added")
     all_views_at: Fraction = Field(default=0.5, description="share of the run from which all times are trained on")
     still_below: float = Field(default=0.3, ge=0, description="px in the nearest training view; 0 = all may move")
     motion_sparsity: float = Field(default=0.01, ge=0, description="weight of the mean motion, in scene extents")
@@ -220,6 +221,9 @@ class TrainConfig(Section):
     """Length, loss and logging of a run."""
 
     steps: int = Field(default=7000, ge=1)
+    coarsest: Literal[1, 2, 4, 8, 16] = Field(default=1, description="divide the sides of the first pictures by this")
+    sharpen_from: Fraction = Field(default=0.4, description="share of the run after which that is halved first")
+    sharpen_to: Fraction = Field(default=0.7, description="share of the run after which it is halved last")
     ssim_weight: Fraction = 0.2
     sh_every: int = Field(default=1000, ge=1, description="steps (of 30,000) between SH degree increments")
     log_every: int = Field(default=10, ge=1)

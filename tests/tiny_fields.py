@@ -39,7 +39,7 @@ def tiny_options(kind: str, *, everything: bool = True) -> DeformField:
     if kind == "trajectory":
         return TrajectoryField(polynomial=2, fourier=1, **heads)
     if kind == "skeleton":
-        return SkeletonField(nodes=5, keys=4, **heads)
+        return SkeletonField(nodes=5, pieces=3, **heads)
     return MlpField(depth=2, width=8, space_frequencies=2, time_frequencies=2, **heads)
 
 

@@ -16,7 +16,7 @@ from dyngs.data.synthetic import DynamicOptions, write_dynamic_capture
 from dyngs.data.write import write_text
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
-from dyngs.deform.model import DynamicScene
+from dyngs.deform.model import NOBODY, DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.train.assemble import assemble
@@ -153,16 +153,13 @@ def _trainer(load: DeformLoad, variant: str) -> Trainer:
     if load.run_dir is not None:
         trainer.restore(latest_checkpoint(load.run_dir))
     trainer.done = load.config.train.steps
-    rows = model.rows
-    if load.run_dir is None:
-        num_gaussians = len(trainer.optimizer.parameters)
-        rows = torch.arange(round(load.moving_share * num_gaussians))
+    num_gaussians = len(trainer.optimizer.parameters)
     if variant == VARIANTS[0]:
-        model.field = None
-    elif variant == VARIANTS[2] or rows is None or load.run_dir is None:
-        model.rows = None if variant == VARIANTS[2] else rows
-        moving = len(trainer.optimizer.parameters) if model.rows is None else len(model.rows)
-        setup = FieldSetup(torch.zeros(3), torch.ones(3), len(model.times), moving, trainer.extent)
+        model.field, model.rows = None, NOBODY
+    elif variant == VARIANTS[2] or load.run_dir is None:
+        share = 1.0 if variant == VARIANTS[2] else load.moving_share
+        model.rows = torch.arange(round(share * num_gaussians))
+        setup = FieldSetup(torch.zeros(3), torch.ones(3), len(model.times), len(model.rows), trainer.extent)
         model.field = new_field(_options(load.config).deform, setup, torch.Generator().manual_seed(0))
     return trainer
 
@@ -173,8 +170,7 @@ def _field_stages(trainer: Trainer, rounds: int) -> dict[str, float]:
     if not isinstance(model, DynamicScene) or model.field is None:
         return dict.fromkeys(FIELD_STAGES, 0.0)
     field = model.field
-    means = trainer.optimizer.parameters.means.detach()
-    means = means if model.rows is None else means[model.rows]
+    means = trainer.optimizer.parameters.means.detach()[model.rows]
     samples: dict[str, list[float]] = {name: [] for name in FIELD_STAGES}
     for number in range(rounds + 1):
         start = time.perf_counter()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 
 import torch
@@ -25,6 +25,9 @@ from dyngs.data.images import (
 from dyngs.data.intrinsics import scaled_intrinsics
 from dyngs.data.lens import LensMap, is_pinhole, undistort, undistort_map
 from dyngs.errors import DyngsError
+
+ALL_COUNTS = 1 - 1e-4
+"""Mean of a mask from which all that a shrunk pixel covers counts."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,24 @@ class Picture:
         if self.alpha is None:
             return self.rgb_premultiplied
         return self.rgb_premultiplied + (1 - self.alpha[..., None]) * background
+
+    def shrunk(self, factor: int) -> Picture:
+        """The picture with both sides divided by ``factor``, averaged over pixel areas, and the camera that sees it."""
+        if factor == 1:
+            return self
+        old = self.cameras
+        width, height = max(1, round(old.width / factor)), max(1, round(old.height / factor))
+        scale = old.intrinsics.new_tensor([width / old.width, height / old.height, 1.0])
+        alpha, mask = (
+            None if x is None else area_downscale(x[..., None], width, height)[..., 0] for x in (self.alpha, self.mask)
+        )
+        return replace(
+            self,
+            cameras=Cameras(old.cam_from_world, scale[:, None] * old.intrinsics, width, height),
+            rgb_premultiplied=area_downscale(self.rgb_premultiplied, width, height),
+            alpha=alpha,
+            mask=None if mask is None else (mask > ALL_COUNTS).float(),
+        )
 
 
 @dataclass(frozen=True)
@@ -162,7 +183,7 @@ class PictureLoader:
         linear = area_downscale(linear, *size)
         if mask is not None:
             # A pixel counts only if all that it covers counts: otherwise what is masked out bleeds in.
-            mask = area_downscale(mask.float()[..., None], *size)[..., 0] > 1 - 1e-4
+            mask = area_downscale(mask.float()[..., None], *size)[..., 0] > ALL_COUNTS
         return _Decoded(straight_uint8(linear), mask)
 
     def _lens_map(self, view: View) -> LensMap:

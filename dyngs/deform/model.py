@@ -26,6 +26,7 @@ from dyngs.static.densify import EditResult
 from dyngs.static.filters import FILTER_VARIANCE, filter_std
 from dyngs.static.model import Drawn, StaticScene
 
+NOBODY = torch.zeros(0, dtype=torch.long)
 BOX_MARGIN = 1.1
 SEED_SIZE = 0.3
 """Standard deviation of a seed, in distances between them."""
@@ -44,14 +45,17 @@ class DeformSchedule:
     """When the phases begin, in steps of this run.
 
     Attributes:
-        fine: last step without motion; from then on the window of times grows.
-        full: step from which all times are trained on.
+        fine: last step without motion.
+        opens, full: steps between which the window of times grows, to all of them.
+        decays: step from which the field's rates fall.
         splits: steps after which Gaussians that do not move are frozen.
         steps: length of the run.
     """
 
     fine: int
+    opens: int
     full: int
+    decays: int
     splits: tuple[int, ...]
     steps: int
 
@@ -78,7 +82,7 @@ class DynamicScene:
 
     Attributes:
         field: None before the fine phase, and for good if nothing moves.
-        rows: (M,) indices of the Gaussians that it moves, ascending; None = all.
+        rows: (M,) indices of the Gaussians that it moves, ascending.
         times: distinct training times, ascending.
         window: which of them are trained on.
     """
@@ -93,9 +97,10 @@ class DynamicScene:
     ) -> None:
         self.options, self.schedule, self.capture = options, schedule, capture
         self.times = tuple(sorted(set(capture.times)))
-        self.window = TimeWindow.around_middle(capture.times, options.first_views, schedule.fine, schedule.full)
+        phases = schedule.fine, schedule.opens, schedule.full
+        self.window = TimeWindow.around_middle(capture.times, options.first_views, *phases)
         self.field: DeformationField | None = None
-        self.rows: Tensor | None = None
+        self.rows = NOBODY
         self._still, self._generator = still, generator
         self._setup: FieldSetup | None = None
 
@@ -107,7 +112,9 @@ class DynamicScene:
         """What is drawn for ``batch`` at its time, and the regularizers of motion; differentiable."""
         if self.field is None:
             return self._still.gaussians_at(parameters, batch, step)
-        means = parameters.means if self.rows is None else parameters.means.index_select(0, self.rows)
+        if self.window.tracks(step):
+            parameters = parameters.detach()
+        means = parameters.means.index_select(0, self.rows)
         time = self._jittered(batch.time or 0.0, step)
         offsets = self.field.offsets(means, time)
         moved = deformed(parameters, offsets, self.rows)
@@ -119,8 +126,9 @@ class DynamicScene:
         self._still.after_step(parameters, step, result)
         left_out = 0
         if self.field is not None:
-            since = step - self.schedule.fine
-            left_out = self.field.learned.step(since, since / max(self.schedule.steps - self.schedule.fine, 1))
+            decays, steps = self.schedule.decays, self.schedule.steps
+            progress = max(step - decays, 0) / max(steps - decays, 1)
+            left_out = self.field.learned.step(step - self.schedule.fine, progress)
             if result is not None and result.edit is not None:
                 self._follow(result.edit, self.field)
         if self.field is not None:
@@ -147,26 +155,22 @@ class DynamicScene:
 
     def num_moving(self, num_gaussians: int) -> int:
         """M of N Gaussians."""
-        if self.field is None:
-            return 0
-        return num_gaussians if self.rows is None else len(self.rows)
+        return len(self.rows)
 
     def state(self) -> dict[str, Tensor]:
         state = self._still.state() | {"times": torch.tensor(self.times, dtype=torch.float64)}
         if self.field is not None and self._setup is not None:
             state |= {f"field.{name}": x for name, x in field_state(self.field, self._setup).items()}
-            if self.rows is not None:
-                state["rows"] = self.rows
+            state["rows"] = self.rows
         return state
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         self._still.load_state(state)
-        self.rows = state.get("rows")
+        self.rows = state.get("rows", NOBODY)
         part = part_of(state, "field.")
         self.field = self._setup = None
         if part:
-            num_moving = 0 if self.rows is None else len(self.rows)
-            self.field, self._setup = restored_field(self.options.deform, part, num_moving)
+            self.field, self._setup = restored_field(self.options.deform, part, len(self.rows))
 
     def _begin_motion(self, parameters: Gaussians, rows: Tensor) -> None:
         center, half_size = box_of(parameters, self.capture.extent)
@@ -177,23 +181,19 @@ class DynamicScene:
     def _freeze(self, parameters: Gaussians, field: DeformationField) -> None:
         """Stop moving the Gaussians whose motion is too small to be seen."""
         now = parameters.detach()
-        rows = torch.arange(len(now)) if self.rows is None else self.rows
-        px_size = filter_std(now.means, self.capture.cameras)[rows] / math.sqrt(FILTER_VARIANCE)
-        motion = measure_motion(field, now.select(rows), self.times, px_size)
+        px_size = filter_std(now.means, self.capture.cameras)[self.rows] / math.sqrt(FILTER_VARIANCE)
+        motion = measure_motion(field, now.select(self.rows), self.times, px_size)
         moves = motion.pixels >= self.options.still_below
         still = torch.nonzero(~moves)[:, 0]
-        bake_(parameters, rows[still], motion.mean.select(still))
+        bake_(parameters, self.rows[still], motion.mean.select(still))
         kept = torch.nonzero(moves)[:, 0]
-        self.rows = rows[kept]
+        self.rows = self.rows[kept]
         field.select(kept, torch.zeros(len(kept), dtype=torch.bool))
         if not len(kept):
-            self.field = self._setup = self.rows = None
+            self.field = self._setup = None
 
     def _follow(self, edit: TopologyEdit, field: DeformationField) -> None:
         """Let rows and field follow a change of the set: descendants of what moves move."""
-        if self.rows is None:
-            field.select(edit.source, edit.is_new)
-            return
         num_old = 1 + max(int(x.max()) if len(x) else 0 for x in (edit.source, self.rows))
         position = torch.full((num_old,), -1)
         position[self.rows] = torch.arange(len(self.rows))

@@ -1,9 +1,11 @@
-"""Control nodes with a pose of their own at key times: no network, and a cost that hardly grows with the Gaussians.
+"""Control nodes that move along cubic splines: no network, and a cost that hardly grows with the Gaussians.
 
 After SC-GS (Huang et al. 2024) and Dynamic 3D Gaussians (Luiten et al. 2024): nodes carry rigid motions, neighbours
 move alike, and a motion that leaves the times seen so far goes on at constant velocity.
 
-Local letters: S nodes, P key times.
+Every picture moves four neighbouring control points of each spline: poses that few pictures show are shared by many.
+
+Local letters: S nodes, P control points.
 """
 
 from __future__ import annotations
@@ -15,15 +17,19 @@ from torch import Tensor
 
 from dyngs.config import SkeletonField
 from dyngs.deform.decoder import head_sizes
-from dyngs.deform.field import FieldSetup, Offsets, key_times
+from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, Offsets
 from dyngs.deform.learned import LearnedTensors
 from dyngs.deform.nodes import Nodes, follow, nodes_at, spread_out, turned
 
 NOTHING = torch.zeros(0, 3)
+SPAN = 4
+"""Control points that a pose depends on: the splines are cubic."""
+PIECES_PER_TIME = 0.3
+"""Pieces of the splines per training time. With more, poses follow single pictures; with fewer, they lag behind."""
 
 
 class Skeleton:
-    """Offsets of nodes at key times, linear in between, blended into those of the Gaussians that follow them.
+    """Offsets of nodes, uniform cubic B-splines of time, blended into those of the Gaussians that follow them.
 
     Nodes are placed when first needed. Whenever the set of Gaussians has changed, nodes that nothing follows are
     dropped and new ones start, with the motion found there, where Gaussians are farthest from any.
@@ -31,10 +37,10 @@ class Skeleton:
 
     def __init__(self, options: SkeletonField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup
-        self.num_keys = options.keys or key_times(setup.num_times)
+        self.num_pieces = options.pieces or min(max(1, round(PIECES_PER_TIME * setup.num_times)), MAX_KEY_TIMES)
         self.buffers: dict[str, Tensor] = {"positions": NOTHING}
         sizes = head_sizes(options)
-        tensors = {name: torch.zeros(0, self.num_keys, size) for name, size in sizes.items()}
+        tensors = {name: torch.zeros(0, self.num_points, size) for name, size in sizes.items()}
         rates = {
             "means": options.lr_means * setup.extent,
             "quats": options.lr_quats,
@@ -43,6 +49,11 @@ class Skeleton:
             "colors": options.lr_colors,
         }
         self.learned = LearnedTensors(tensors, {name: rates[name] for name in sizes}, options.lr_decay)
+
+    @property
+    def num_points(self) -> int:
+        """Control points of each spline."""
+        return self.num_pieces + SPAN - 1
 
     def offsets(self, means: Tensor, time: float) -> Offsets:
         """See ``DeformationField.offsets``; differentiable in ``means``, which nodes turn about themselves."""
@@ -55,7 +66,7 @@ class Skeleton:
         if len(self.buffers["positions"]) < 2:
             return {}
         penalties = {}
-        if self.options.smoothness and self.num_keys > 2:
+        if self.options.smoothness:
             bend = self.learned["means"].diff(n=2, dim=1) / self.buffers["radii"][:, None, None]
             penalties["node acceleration"] = self.options.smoothness * bend.square().mean()
         if self.options.rigidity:
@@ -64,13 +75,18 @@ class Skeleton:
 
     @torch.no_grad()
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        """Go on at constant velocity, that of the last two intervals, at all keys beyond those that ``seen`` needs."""
-        last = self.num_keys - 1
-        low, high = max(math.floor(seen[0] * last), 0), min(math.ceil(seen[1] * last), last)
+        """Go on at constant velocity, that of the last two intervals.
+
+        The outermost point that a time in ``seen`` depends on counts as not seen, unless no time lies beyond: its share
+        is too small.
+        """
+        last = self.num_points - 1
+        low = 0 if seen[0] <= 0 else math.floor(seen[0] * self.num_pieces) + 1
+        high = last if seen[1] >= 1 else math.ceil(seen[1] * self.num_pieces) + SPAN - 3
         reach = min(2, high - low)
         after = torch.arange(1, last - high + 1)[:, None]
         before = torch.arange(low, 0, -1)[:, None]
-        for x in (keys.data for keys in self._keys().values()):
+        for x in (points.data for points in self._splines().values()):
             x[:, high + 1 :] = x[:, high, None] + after * ((x[:, high] - x[:, high - reach]) / max(reach, 1))[:, None]
             x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
 
@@ -80,14 +96,15 @@ class Skeleton:
 
     def _at(self, time: float) -> Offsets:
         """The nodes' offsets at ``time``."""
-        place = min(max(time, 0.0), 1.0) * (self.num_keys - 1)
-        key = min(int(place), self.num_keys - 2)
-        parts = {n: torch.lerp(x[:, key], x[:, key + 1], place - key) for n, x in self._keys().items()}
+        place = min(max(time, 0.0), 1.0) * self.num_pieces
+        piece = min(int(place), self.num_pieces - 1)
+        shares = cubic_shares(place - piece)[:, None]
+        parts = {n: (shares * x[:, piece : piece + SPAN]).sum(1) for n, x in self._splines().items()}
         if "logit_opacities" in parts:
             parts["logit_opacities"] = parts["logit_opacities"][:, 0]
         return Offsets(**parts)
 
-    def _keys(self) -> dict[str, Tensor]:
+    def _splines(self) -> dict[str, Tensor]:
         """Head to its (S, P, size) values."""
         return {name: self.learned[name] for name in head_sizes(self.options)}
 
@@ -120,16 +137,16 @@ class Skeleton:
         }
 
     def _motion_at(self, points: Tensor) -> dict[str, Tensor]:
-        """Head to the (S', P, size) offsets that the present nodes give to ``points`` (S', 3) at every key."""
-        keys = {name: x.detach() for name, x in self._keys().items()}
+        """Head to the control points (S', P, size) that the present nodes give to ``points`` (S', 3)."""
+        splines = {name: x.detach() for name, x in self._splines().items()}
         if not len(self.buffers["positions"]) or not len(points):
-            return {name: x.new_zeros(len(points), *x.shape[1:]) for name, x in keys.items()}
+            return {name: x.new_zeros(len(points), *x.shape[1:]) for name, x in splines.items()}
         nodes = nodes_at(self.buffers["positions"], points)
         weights = nodes.weights(points)
-        started = {name: torch.einsum("mb,mbpd->mpd", weights, x[nodes.followed]) for name, x in keys.items()}
-        if "quats" in keys:
-            arms = (points[:, None] - nodes.positions[nodes.followed])[:, :, None].expand(-1, -1, self.num_keys, -1)
-            swing = turned(keys["quats"][nodes.followed], arms) - arms
+        started = {name: torch.einsum("mb,mbpd->mpd", weights, x[nodes.followed]) for name, x in splines.items()}
+        if "quats" in splines:
+            arms = (points[:, None] - nodes.positions[nodes.followed])[:, :, None].expand(-1, -1, self.num_points, -1)
+            swing = turned(splines["quats"][nodes.followed], arms) - arms
             started["means"] = started["means"] + torch.einsum("mb,mbpd->mpd", weights, swing)
         return started
 
@@ -140,3 +157,10 @@ class Skeleton:
         kept = arms if now.quats is None else turned(now.quats[:, None].expand(-1, arms.shape[1], -1), arms)
         strain = arms + now.means[neighbours] - now.means[:, None] - kept
         return (strain / self.buffers["radii"][:, None, None]).square().sum(-1).mean()
+
+
+def cubic_shares(place: float) -> Tensor:
+    """(4,) shares of the control points around a piece of a uniform cubic B-spline, at ``place`` in [0, 1] of it."""
+    rest = 1 - place
+    middle = [(3 * x**3 - 6 * x**2 + 4) / 6 for x in (place, rest)]
+    return torch.tensor([rest**3 / 6, *middle, place**3 / 6])

@@ -23,18 +23,20 @@ class TimeWindow:
     Attributes:
         strays: |time - 0.5| of all training views, ascending.
         first: views in the window at the start, as a share of all.
+        begins: step up to which all views are trained on, because nothing moves yet.
         opens, full: steps between which the window grows evenly, in views, to all of them.
     """
 
     strays: tuple[float, ...]
     first: float
+    begins: int
     opens: int
     full: int
 
     @staticmethod
-    def around_middle(times: Sequence[float], first: float, opens: int, full: int) -> TimeWindow:
+    def around_middle(times: Sequence[float], first: float, begins: int, opens: int, full: int) -> TimeWindow:
         """The window over the times of all training views."""
-        return TimeWindow(tuple(sorted(abs(time - MIDDLE) for time in times)), first, opens, full)
+        return TimeWindow(tuple(sorted(abs(time - MIDDLE) for time in times)), first, begins, opens, full)
 
     def num_views(self, step: int) -> int:
         """How many views the window holds at ``step``."""
@@ -55,8 +57,12 @@ class TimeWindow:
     def holds(self, time: float, step: int) -> bool:
         """Whether ``time`` is trained on at ``step``; while the window grows, in every other step only if it is new."""
         # Not by ``bounds``: their rounding may shut out the very times that the window ends with.
-        count, stray = self.num_views(step), abs(time - MIDDLE)
-        if step <= self.opens:
+        if step <= self.begins:
             return True
-        newest = step < self.full and step % 2 == 0 and count < len(self.strays)
-        return stray <= self.reach(step) and (not newest or stray >= self.strays[max(count - FRONTIER_VIEWS, 0)])
+        stray = abs(time - MIDDLE)
+        oldest = self.strays[max(self.num_views(step) - FRONTIER_VIEWS, 0)] if self.tracks(step) else 0.0
+        return oldest <= stray <= self.reach(step)
+
+    def tracks(self, step: int) -> bool:
+        """Whether ``step`` is for the newest views only: every other one while the window grows."""
+        return self.opens < step < self.full and step % 2 == 0 and self.num_views(step) < len(self.strays)

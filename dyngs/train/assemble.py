@@ -26,7 +26,14 @@ from dyngs.static.model import StaticScene
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.train.background import evaluation_background
 from dyngs.train.sampler import ViewSampler
-from dyngs.train.schedule import deform_schedule, densify_schedule, filter_steps, grad_threshold, growth_per_change
+from dyngs.train.schedule import (
+    deform_schedule,
+    densify_schedule,
+    filter_steps,
+    grad_threshold,
+    growth_per_change,
+    picture_divisor,
+)
 from dyngs.train.step import Model, Trainer
 
 RESIDUAL_VIEWS = 50
@@ -110,18 +117,20 @@ def _model(
     if not isinstance(model, DynamicModel) or len(set(times)) < 2:
         return still
     _, colour = evaluation_background(config.data.background, capture.has_alpha)
+    schedule = deform_schedule(model, steps)
+    divisor = picture_divisor(config.train, schedule.fine)
 
     def residuals(gaussians: Gaussians) -> Tensor:
-        return residual_scores(gaussians, _spread(pictures), _render_options(config), colour)
+        return residual_scores(gaussians, _spread(pictures, divisor), _render_options(config), colour)
 
     surroundings = Surroundings4D(times, cameras, extent, residuals)
-    return DynamicScene(model, deform_schedule(model, steps), surroundings, still, generator)
+    return DynamicScene(model, schedule, surroundings, still, generator)
 
 
-def _spread(pictures: PictureLoader) -> Iterator[Picture]:
-    """At most ``RESIDUAL_VIEWS`` of the pictures, evenly chosen."""
+def _spread(pictures: PictureLoader, divisor: int) -> Iterator[Picture]:
+    """At most ``RESIDUAL_VIEWS`` of the pictures, evenly chosen, with their sides divided by ``divisor``."""
     count = min(len(pictures), RESIDUAL_VIEWS)
-    return (pictures[i * len(pictures) // count] for i in range(count))
+    return (pictures[i * len(pictures) // count].shrunk(divisor) for i in range(count))
 
 
 def _densifier(config: Config, background: str, extent: float) -> Densifier:

@@ -28,6 +28,14 @@ def scaled(step: int, steps: int) -> int:
     return max(1, round(step * steps / PUBLISHED_STEPS))
 
 
+def picture_divisor(options: TrainConfig, step: int) -> int:
+    """What the sides of pictures are divided by at ``step``: ``coarsest``, halved at even distances until it is 1."""
+    halvings = options.coarsest.bit_length() - 1
+    first, last = options.sharpen_from, max(options.sharpen_from, options.sharpen_to)
+    shares = [first + (last - first) * i / max(halvings - 1, 1) for i in range(halvings)]
+    return options.coarsest >> sum(step / options.steps >= share for share in shares)
+
+
 def means_rate(options: OptimConfig, step: int, steps: int, extent: float) -> float:
     """Learning rate of the means at ``step``, world units: log-linear over the run, times the scene's extent."""
     t = min(max(step / steps, 0.0), 1.0)
@@ -85,8 +93,13 @@ def filter_steps(strategy: DefaultStrategy | McmcStrategy, steps: int) -> range:
 
 
 def deform_schedule(model: DynamicModel, steps: int) -> DeformSchedule:
-    """The phases of a dynamic model in a run of ``steps``; where ``still_below`` is 0 nothing is ever frozen."""
+    """The phases of a dynamic model in a run of ``steps``; where ``still_below`` is 0 nothing is ever frozen.
+
+    While new times come in, the field learns at its first rate: what has slowed down follows nothing.
+    """
     fine = min(max(1, round(model.coarse * steps), min(MIN_COARSE_STEPS, steps // 3)), steps)
-    full = max(fine, round(model.all_views_at * steps))
+    opens = max(fine, round(model.first_views_until * steps))
+    full = max(opens, round(model.all_views_at * steps))
+    decays = full if model.first_views < 1 else fine
     splits = sorted({full + round(share * (steps - full)) for share in SPLITS}) if model.still_below > 0 else []
-    return DeformSchedule(fine, full, tuple(step for step in splits if step > full), steps)
+    return DeformSchedule(fine, opens, full, decays, tuple(step for step in splits if step > full), steps)

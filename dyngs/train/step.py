@@ -20,7 +20,10 @@ from dyngs.static.model import Drawn
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.train.sampler import ViewSampler
-from dyngs.train.schedule import active_sh_degree, means_rate
+from dyngs.train.schedule import active_sh_degree, means_rate, picture_divisor
+
+COARSE_DAMPING = 1.5
+"""Power of a picture's divisor by which gradients that make Gaussians multiply are divided."""
 
 
 class Model(Protocol):
@@ -107,7 +110,9 @@ class Trainer:
         """
         config, step = self.config, self.done + 1
         times = self.pictures.times
-        picture = self.pictures[self.sampler.next(self.generator, lambda i: self.model.trains_on(times[i], step))]
+        divisor = picture_divisor(config.train, step)
+        index = self.sampler.next(self.generator, lambda i: self.model.trains_on(times[i], step))
+        picture = self.pictures[index].shrunk(divisor)
         background = self._background_colour()
         parameters = self.optimizer.parameters
         drawn = self.model.gaussians_at(parameters, picture, step)
@@ -123,7 +128,8 @@ class Trainer:
         sum(terms.values(), torch.zeros(())).backward()
         if probe is not None and probe.grad is not None:
             size = (picture.cameras.width, picture.cameras.height)
-            self.densifier.after_backward(step, probe.grad, rendering.radii, size)
+            # Fewer Gaussians suit small pictures: a gradient counts for less there.
+            self.densifier.after_backward(step, probe.grad / divisor**COARSE_DAMPING, rendering.radii, size)
         self._update(step)
         return StepReport(step, loss, picture, rendered.detach(), truth)
 

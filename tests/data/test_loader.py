@@ -14,6 +14,7 @@ from tiny_captures import random_pixels, write_picture
 from dyngs.config import DataConfig
 from dyngs.data.capture import Lens, View
 from dyngs.data.loader import PictureLoader
+from dyngs.data.people import Silhouette, person_view
 from dyngs.errors import DyngsError
 
 
@@ -67,6 +68,26 @@ def test_downscaled_compositing_and_intrinsics(
     ray = torch.linalg.solve(small.cameras.intrinsics[0], corner)
     wanted_ray = np.linalg.solve(view.intrinsics, [12.0, 8.0, 1.0])
     np.testing.assert_allclose(ray.numpy(), wanted_ray, rtol=1e-5)
+
+
+def test_a_shrunk_picture_is_the_mean_of_its_pixels(tmp_path: Path) -> None:
+    """And its camera sees the same; what is masked anywhere in a pixel does not count."""
+    picture = loader(views_of(tmp_path))[0]
+    mask = torch.ones(8, 12)
+    mask[5, 3] = 0
+    small = replace(picture, mask=mask).shrunk(4)
+    assert (small.cameras.width, small.cameras.height) == (3, 2)
+    assert picture.alpha is not None
+    assert small.alpha is not None
+    assert small.mask is not None
+    torch.testing.assert_close(small.alpha, picture.alpha.reshape(2, 4, 3, 4).mean((1, 3)))
+    torch.testing.assert_close(small.rgb_premultiplied, picture.rgb_premultiplied.reshape(2, 4, 3, 4, 3).mean((1, 3)))
+    assert small.mask.tolist() == [[1, 1, 1], [0, 1, 1]]
+    torch.testing.assert_close(
+        small.cameras.intrinsics[0], torch.tensor([[5.0, 0, 1.625], [0, 5.25, 0.875], [0, 0, 1]])
+    )
+    assert picture.shrunk(1) is picture
+    assert picture.shrunk(100).rgb_premultiplied.shape == (1, 1, 3)
 
 
 def test_same_bytes_cached_or_not_and_from_threads(tmp_path: Path) -> None:
@@ -175,3 +196,16 @@ def test_sizes_that_disagree(tmp_path: Path) -> None:
     write_picture(tmp_path / "mask.png", np.full((4, 4, 1), 255, np.uint8))
     with pytest.raises(DyngsError, match=r"mask\.png: the mask is 4x4"):
         loader((replace(views[0], mask_path=tmp_path / "mask.png"),))[0]
+
+
+def test_silhouettes_become_alpha(tmp_path: Path) -> None:
+    person = np.zeros((8, 12, 1), np.uint8)
+    person[2:4, 3:6] = 7
+    write_picture(tmp_path / "person.png", person)
+    views = [person_view(v, Silhouette(tmp_path / "person.png", "nonzero")) for v in views_of(tmp_path, channels=3)]
+    alpha = loader(tuple(views))[1].alpha
+    assert alpha is not None
+    assert torch.equal(alpha, torch.from_numpy(person[..., 0] > 0).float())
+    (tmp_path / "person.png").unlink()
+    with pytest.raises(DyngsError, match=r"3 of 6 pictures are missing, the first is .*person\.png"):
+        loader(tuple(views))

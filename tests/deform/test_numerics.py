@@ -106,7 +106,7 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     """Trained on together from the first step on; planes and keys have the least that there can be, two."""
     config = busy_config(timed(tmp_path / "capture", [0.0, 1.0, 0.0, 1.0, 1.0]), tmp_path, kind)
     assert isinstance(config.model, DynamicModel)
-    automatic = {"hexplane": {"time_resolution": 0}, "skeleton": {"keys": 0}}.get(kind, {})
+    automatic = {"hexplane": {"time_resolution": 0}, "skeleton": {"pieces": 0}}.get(kind, {})
     model = config.model.model_copy(update={"deform": config.model.deform.model_copy(update=automatic)})
     trainer = assemble(config.model_copy(update={"model": model}))
     seen = {trainer.step().picture.time for _ in range(12)}
@@ -116,7 +116,7 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     if isinstance(field, Hexplane):
         assert field.levels[0].time.shape[1] == 2
     if isinstance(field, Skeleton):
-        assert field.num_keys == 2
+        assert field.num_pieces == 1
 
 
 def test_10000_training_times() -> None:
@@ -126,9 +126,9 @@ def test_10000_training_times() -> None:
     setup = FieldSetup(torch.zeros(3), torch.ones(3), LONG, 3, 1.0)
     skeleton = new_field(SkeletonField(nodes=2), setup, torch.Generator())
     assert isinstance(skeleton, Skeleton)
-    assert skeleton.num_keys == MAX_KEY_TIMES
+    assert skeleton.num_pieces == MAX_KEY_TIMES
     times = tuple(i / (LONG - 1) for i in range(LONG))
-    window = TimeWindow.around_middle(times, 0.1, 1000, 8000)
+    window = TimeWindow.around_middle(times, 0.1, 1000, 1000, 8000)
     assert sum(window.holds(time, 1001) for time in times) == pytest.approx(LONG / 10, abs=2)
     assert 0 < sum(window.holds(time, 1002) for time in times) <= FRONTIER_VIEWS + 1
     asked: list[float] = []

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 from tiny_fields import HEADS, cloud, stirred_field, tiny_setup
 from torch import Tensor
@@ -19,10 +22,10 @@ from dyngs.deform.skeleton import Skeleton
 MEANS_ONLY = dict.fromkeys(HEADS, False)
 
 
-def skeleton(nodes: int = 5, keys: int = 5, num_times: int = 10, **options: object) -> Skeleton:
+def skeleton(nodes: int = 5, pieces: int = 4, num_times: int = 10, **options: object) -> Skeleton:
     """An untrained one."""
     return Skeleton(
-        SkeletonField(nodes=nodes, keys=keys, **options),  # type: ignore[arg-type]
+        SkeletonField(nodes=nodes, pieces=pieces, **options),  # type: ignore[arg-type]
         tiny_setup(num_times=num_times),
         torch.Generator(),
     )
@@ -35,9 +38,14 @@ def placed(means: Tensor, **options: object) -> Skeleton:
     return field
 
 
-def keys_of(field: Skeleton) -> Tensor:
-    """(P,) what the first node does along x at the key times."""
+def points_of(field: Skeleton) -> Tensor:
+    """(P,) control points of the first node's motion along x."""
     return field.learned["means"].detach()[0, :, 0]
+
+
+def hold(field: Skeleton, name: str, values: Tensor) -> None:
+    """Let all nodes keep ``values`` (S, size) of one head at all times: all control points are equal."""
+    field.learned[name].data[:] = values[:, None]
 
 
 def outputs(offsets: Offsets) -> Tensor:
@@ -45,41 +53,34 @@ def outputs(offsets: Offsets) -> Tensor:
     return torch.cat([x.reshape(len(x), -1) for x in parts], dim=1)
 
 
-@pytest.mark.parametrize(("num_times", "keys"), [(2, 2), (3, 2), (5, 3), (48, 24)])
-def test_half_as_many_keys_as_times_and_at_least_two(num_times: int, keys: int) -> None:
-    assert skeleton(keys=0, num_times=num_times).num_keys == keys
-    assert skeleton(keys=7, num_times=num_times).num_keys == 7
+@pytest.mark.parametrize(("num_times", "pieces"), [(2, 1), (5, 2), (10, 3), (100, 30), (10_000, 256)])
+def test_pieces_follow_the_number_of_times(num_times: int, pieces: int) -> None:
+    assert skeleton(pieces=0, num_times=num_times).num_pieces == pieces
+    assert skeleton(pieces=7, num_times=num_times).num_pieces == 7
 
 
-def test_motion_is_linear_between_keys() -> None:
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0, 1), st.integers(1, 6), st.integers(0, 10_000))
+def test_motion_is_a_cubic_spline(time: float, pieces: int, seed: int) -> None:
+    """The one of SciPy with evenly spaced knots."""
     means = cloud().means
-    field = placed(means, nodes=1, keys=5, **MEANS_ONLY)
-    field.learned["means"].data[0, :, 0] = torch.tensor([0.0, 1.0, 4.0, 9.0, 7.0])
-    for time, x in ((0.0, 0.0), (0.25, 1.0), (0.3, 1.6), (0.5, 4.0), (0.9, 7.8), (1.0, 7.0)):
-        expected = torch.tensor([x, 0, 0]).expand(9, 3)
-        torch.testing.assert_close(field.offsets(means, time).means.detach(), expected)
-
-
-@pytest.mark.parametrize("keys", [1, 2])
-def test_few_keys(keys: int) -> None:
-    """One key is a constant offset."""
-    means = cloud().means
-    field = placed(means, nodes=2, keys=keys)
-    field.learned["means"].data[:] = torch.arange(float(keys))[None, :, None] + 1
-    for time in (0.0, 0.5, 1.0):
-        found = field.offsets(means, time).means.detach()
-        torch.testing.assert_close(found, torch.full((9, 3), 1 + time * (keys - 1)))
+    field = placed(means, nodes=1, pieces=pieces, **MEANS_ONLY)
+    values = np.random.default_rng(seed).normal(size=(pieces + 3, 3))
+    field.learned["means"].data[0] = torch.from_numpy(values).float()
+    expected = BSpline((np.arange(pieces + 7) - 3) / pieces, values, 3)(time)
+    found = field.offsets(means, time).means.detach()
+    torch.testing.assert_close(found, torch.from_numpy(expected).float().expand(9, 3), rtol=0, atol=2e-5)
 
 
 def test_a_rigid_motion_of_the_nodes_is_one_of_the_gaussians() -> None:
     means = cloud(30).means
-    field = placed(means, nodes=6, keys=2)
+    field = placed(means, nodes=6, pieces=1)
     positions = field.buffers["positions"]
     turn = Rotation.from_rotvec([0.3, -0.5, 0.9])
     matrix, shift = torch.from_numpy(turn.as_matrix()).float(), torch.tensor([0.1, 0.2, -0.3])
-    field.learned["means"].data[:, 1] = positions @ matrix.T + shift - positions
+    hold(field, "means", positions @ matrix.T + shift - positions)
     quat = torch.from_numpy(turn.as_quat()).float().roll(1)
-    field.learned["quats"].data[:, 1] = quat - torch.tensor([1.0, 0, 0, 0])
+    hold(field, "quats", (quat - torch.tensor([1.0, 0, 0, 0])).expand(6, 4))
     moved = means + field.offsets(means, 1.0).means.detach()
     torch.testing.assert_close(moved, means @ matrix.T + shift, rtol=0, atol=1e-5)
     assert float(field.penalties(1.0)["node rigidity"].detach()) < 1e-10
@@ -116,12 +117,13 @@ def test_after_any_changes_of_the_set_nodes_are_where_gaussians_are(nodes: int, 
 def test_new_nodes_start_with_the_motion_found_there() -> None:
     """A field that moves rigidly moves the newcomers alike, and the others as before."""
     means = cloud(30).means
-    field = placed(means[:10], nodes=20, keys=3)
+    field = placed(means[:10], nodes=20, pieces=2)
     assert len(field.buffers["positions"]) == 10
     turn = Rotation.from_rotvec([0.0, 0.0, 0.8])
     matrix, positions = torch.from_numpy(turn.as_matrix()).float(), field.buffers["positions"]
-    field.learned["means"].data[:, 2] = positions @ matrix.T - positions
-    field.learned["quats"].data[:, 2] = torch.from_numpy(turn.as_quat()).float().roll(1) - torch.tensor([1.0, 0, 0, 0])
+    hold(field, "means", positions @ matrix.T - positions)
+    quat = torch.from_numpy(turn.as_quat()).float().roll(1)
+    hold(field, "quats", (quat - torch.tensor([1.0, 0, 0, 0])).expand(10, 4))
     field.select(torch.arange(30) % 10, torch.arange(30) >= 10)
     moved = means + field.offsets(means, 1.0).means.detach()
     assert len(field.buffers["positions"]) == 20
@@ -130,7 +132,7 @@ def test_new_nodes_start_with_the_motion_found_there() -> None:
 
 def test_nodes_that_nothing_follows_are_dropped_with_their_moments() -> None:
     means = torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]])
-    field = placed(means, nodes=3, keys=2, **MEANS_ONLY)
+    field = placed(means, nodes=3, pieces=1, **MEANS_ONLY)
     field.offsets(means, 0.5).means.square().sum().backward()
     for x in (field.learned["means"],):
         x.grad = torch.ones_like(x)
@@ -173,50 +175,46 @@ def test_nodes_stay_while_the_set_does() -> None:
 
 
 def test_motion_goes_on_at_constant_velocity() -> None:
-    """That of the last two intervals on either side, at all keys that were not seen."""
-    field = placed(cloud().means, keys=11)
-    field.learned["means"].data[0, :, 0] = torch.tensor([-7.0, -7, -7, -7, 3, 4, 6, -7, -7, -7, -7])
+    """That of the last two intervals on either side; the outermost points of what was seen do not count."""
+    field = placed(cloud().means, pieces=10)
+    field.learned["means"].data[0, :, 0] = torch.tensor([-7.0] * 5 + [3, 4, 6, 7] + [-7] * 4)
     field.extend((0.4, 0.6), (0.2, 0.8))
-    assert keys_of(field).tolist() == [-3.0, -1.5, 0, 1.5, 3, 4, 6, 7.5, 9, 10.5, 12]
-    field.learned["means"].data[0, 8, 0] = 10.0
-    field.extend((0.2, 0.8), (0.0, 1.0))
-    assert keys_of(field).tolist() == [-3.0, -1.5, 0, 1.5, 3, 4, 6, 7.5, 10, 12, 14]
+    assert points_of(field).tolist() == [-4.5, -3, -1.5, 0, 1.5, 3, 4, 6, 7.5, 9, 10.5, 12, 13.5]
     field.extend((0.0, 1.0), (0.0, 1.0))
-    assert keys_of(field).tolist() == [-3.0, -1.5, 0, 1.5, 3, 4, 6, 7.5, 10, 12, 14]
+    assert points_of(field)[[0, -1]].tolist() == [-4.5, 13.5], "with all times seen the ends are free"
 
 
 def test_of_a_single_moment_there_is_no_velocity() -> None:
     """Cameras of a rig: the first window may be one time."""
-    field = placed(cloud().means, keys=5)
-    field.learned["means"].data[0, :, 0] = torch.tensor([0.0, 0, 3, 0, 0])
+    field = placed(cloud().means, pieces=4)
+    field.learned["means"].data[0, :, 0] = torch.tensor([0.0, 0, 0, 3, 0, 0, 0])
     field.extend((0.5, 0.5), (0.0, 1.0))
-    assert keys_of(field)[2] == 3
-    assert set(keys_of(field).tolist()) <= {0.0, 3.0}
+    assert points_of(field).tolist() == [3.0] * 7
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(2, 30), st.lists(st.floats(0, 0.5), min_size=1, max_size=6))
-def test_keys_that_were_seen_never_change_and_uniform_motion_goes_on(keys: int, strays: list[float]) -> None:
-    """For any growing windows, if two keys or more were seen."""
-    field, last = placed(cloud().means, keys=keys), keys - 1
+@given(st.integers(1, 30), st.lists(st.floats(0, 0.5), min_size=1, max_size=6))
+def test_uniform_motion_goes_on(pieces: int, strays: list[float]) -> None:
+    """For any growing windows, if two points or more were seen well."""
+    field = placed(cloud().means, pieces=pieces)
     windows = [(0.5 - x, 0.5 + x) for x in (*sorted(strays), 0.5)]
-    uniform = torch.arange(float(keys))
-    seen = [i for i in range(keys) if windows[0][0] * last - 1 < i < windows[0][1] * last + 1]
-    start = torch.full((keys,), -99.0)
-    start[seen] = uniform[seen]
-    field.learned["means"].data[0, :, 0] = start
+    uniform = torch.arange(pieces + 3.0)
+    low, high = math.floor(windows[0][0] * pieces) + 1, math.ceil(windows[0][1] * pieces) + 1
+    start = torch.full((pieces + 3,), -99.0)
+    start[low : high + 1] = uniform[low : high + 1]
+    field.learned["means"].data[0, :, 0] = uniform if windows[0] == (0.0, 1.0) else start
     for before, after in pairwise(windows):
         field.extend(before, after)
-    assert torch.equal(keys_of(field)[seen], uniform[seen])
-    if len(seen) > 1:
-        torch.testing.assert_close(keys_of(field), uniform)
+    assert torch.equal(points_of(field)[low : high + 1], uniform[low : high + 1])
+    if high > low:
+        torch.testing.assert_close(points_of(field), uniform)
 
 
 # --- penalties --------------------------------------------------------------------------------------------------------
 
 
 def test_uniform_motion_has_no_acceleration_and_a_shift_no_strain() -> None:
-    field = placed(cloud().means, nodes=4, keys=6)
+    field = placed(cloud().means, nodes=4, pieces=3)
     field.learned["means"].data[:] = torch.arange(6.0)[None, :, None]
     penalties = field.penalties(0.3)
     assert penalties.keys() == {"node acceleration", "node rigidity"}
@@ -225,28 +223,27 @@ def test_uniform_motion_has_no_acceleration_and_a_shift_no_strain() -> None:
 
 
 def test_known_penalties() -> None:
-    """Two nodes 2 apart; one goes 1 farther away in the middle key: strain (1/2)^2, second difference -2/2."""
+    """Two nodes 2 apart; one control point is 6 farther away: in the middle of the piece 1/6 of that counts."""
     means = torch.tensor([[-1.0, 0, 0], [1, 0, 0]])
-    field = placed(means, nodes=2, keys=3, rigidity=1.0, smoothness=1.0)
+    field = placed(means, nodes=2, pieces=1, rigidity=1.0, smoothness=1.0)
     right = int(field.buffers["positions"][:, 0].argmax())
-    field.learned["means"].data[right, 1, 0] = 1.0
-    assert float(field.penalties(0.5)["node rigidity"].detach()) == pytest.approx(0.25)
+    field.learned["means"].data[right, 0, 0] = 6.0
+    assert float(field.penalties(0.0)["node rigidity"].detach()) == pytest.approx(0.25)
     assert float(field.penalties(1.0)["node rigidity"].detach()) == 0.0
-    assert float(field.penalties(0.5)["node acceleration"].detach()) == pytest.approx(
-        1 / 6
-    )  # mean of 2 x 1 x 3 numbers
-    field.penalties(0.5)["node rigidity"].backward()
+    acceleration = 3**2 / 12  # second differences 6 / 2 and 0 along one of 2 x 3 coordinates
+    assert float(field.penalties(0.5)["node acceleration"].detach()) == pytest.approx(acceleration)
+    field.penalties(0.0)["node rigidity"].backward()
     grad = field.learned["means"].grad
     assert grad is not None
-    assert grad[:, 1, 0].tolist() == pytest.approx([-0.5, 0.5] if right == 1 else [0.5, -0.5])
-    assert not grad[:, 0].any()
+    away = grad[right, :, 0]
+    assert away.tolist() == pytest.approx([0.5 / 6, 0.5 * 4 / 6, 0.5 / 6, 0.0])
+    torch.testing.assert_close(grad[1 - right, :, 0], -away)
 
 
 def test_no_penalties_where_none_are_wanted_or_possible() -> None:
     assert placed(cloud().means, rigidity=0.0, smoothness=0.0).penalties(0.3) == {}
     assert placed(cloud().means, nodes=1).penalties(0.3) == {}
     assert skeleton().penalties(0.3) == {}
-    assert placed(cloud().means, keys=2).penalties(0.3).keys() == {"node rigidity"}
 
 
 def test_the_place_of_a_gaussian_matters() -> None:

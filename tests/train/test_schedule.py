@@ -18,6 +18,7 @@ from dyngs.train.schedule import (
     grad_threshold,
     growth_per_change,
     means_rate,
+    picture_divisor,
 )
 
 
@@ -115,3 +116,24 @@ def test_short_runs_stay_still_for_longer(steps: int, fine: int) -> None:
     """1000 steps, but no more than a third of the run, unless a larger share is asked for."""
     assert deform_schedule(DynamicModel(coarse=0.13), steps).fine == fine
     assert deform_schedule(DynamicModel(coarse=0.5), steps).fine == steps // 2
+
+
+@pytest.mark.parametrize(
+    ("coarsest", "expected"), [(1, {1}), (2, {2, 1}), (8, {8, 4, 2, 1})], ids=["never", "one level", "three levels"]
+)
+def test_pictures_sharpen_in_even_steps(coarsest: int, expected: set[int]) -> None:
+    options = TrainConfig.model_validate({"steps": 1000, "coarsest": coarsest, "sharpen_from": 0.3, "sharpen_to": 0.6})
+    divisors = [picture_divisor(options, step) for step in range(1, 1001)]
+    assert set(divisors) == expected
+    assert divisors == sorted(divisors, reverse=True)
+    assert set(divisors[:299]) == {coarsest}
+    assert set(divisors[600:]) == {1}
+    if coarsest == 8:
+        assert [divisors.index(x) + 1 for x in (4, 2, 1)] == [300, 450, 600]
+
+
+def test_pictures_may_sharpen_at_once() -> None:
+    """Also where the last halving is asked for before the first."""
+    for to in (0.5, 0.2):
+        options = TrainConfig(steps=10, coarsest=4, sharpen_from=0.5, sharpen_to=to)
+        assert [picture_divisor(options, step) for step in range(1, 11)] == [4] * 4 + [1] * 6
