@@ -26,7 +26,19 @@ class DataConfig(Section):
     """Where the pictures are and how they are read."""
 
     root: Path = Field(description="capture folder")
-    format: Literal["auto", "blender", "nerfstudio", "colmap", "nerfies", "llff", "camera_folders"] = "auto"
+    format: Literal[
+        "auto",
+        "body_json",
+        "zju_mocap",
+        "people_snapshot",
+        "neuman",
+        "blender",
+        "nerfstudio",
+        "colmap",
+        "nerfies",
+        "llff",
+        "camera_folders",
+    ] = "auto"
     frames: str | None = Field(default=None, description="start:stop:step over the capture's times, as Python slices")
     downscale: float = Field(default=1.0, ge=1.0, description="divide width and height by this")
     longest_side: int | None = Field(

@@ -20,7 +20,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         description="Measure a run; prints a table and writes metrics.json (metrics_SPLIT.json for another split).",
     )
     parser.add_argument("run_dir", type=Path, metavar="RUN", help="folder that `dyngs train` wrote")
-    parser.add_argument("--split", choices=("test", "val", "train"), default="test")
+    parser.add_argument("--split", choices=("test", "val", "train", "pose"), default="test")
     parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
     parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
     parser.set_defaults(run=run)

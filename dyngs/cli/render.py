@@ -36,7 +36,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("source", type=Path, metavar="RUN_OR_PLY", help="a run folder, or a 3DGS .ply of any program")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the pictures")
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--split", choices=("test", "val", "train"), help="render these views (default for a run: test)")
+    what.add_argument(
+        "--split", choices=("test", "val", "train", "pose"), help="render these views (default for a run: test)"
+    )
     what.add_argument("--path", metavar="PATH", help="orbit (default for a .ply), spiral, or a .json file of cameras")
     when = parser.add_mutually_exclusive_group()
     when.add_argument("--time", type=moment, metavar="T", help="everything at this time, from 0 to 1")

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-Split = Literal["train", "val", "test"]
+if TYPE_CHECKING:
+    from dyngs.data.people import BodyFrames
+
+Split = Literal["train", "val", "test", "pose"]
+"""A "pose" split shows a person in another clip than the others: with times and frame numbers of its own."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +71,13 @@ class Capture:
 
     Attributes:
         root: the folder.
-        format: name of the reader: "blender", "nerfstudio", "colmap", "nerfies", "llff" or "camera_folders".
+        format: name of the reader, as ``data.format`` has it.
         splits: split name to views, each tuple sorted by name; train is never empty.
         points: sparse points or None.
         world_offset: (3,) float64 added to rebased coordinates to get the file's coordinates (zero unless the scene
             lies far from its origin).
         has_alpha: pictures carry straight alpha that means "transparent here".
-        body: per-frame body parameters (arrays with F rows) for human captures, else None.
+        body: body parameters of each split, by frame number, for captures of people, else None.
         warnings: suspicious things met while reading, one line each.
     """
 
@@ -83,7 +87,7 @@ class Capture:
     points: PointCloud | None = None
     world_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     has_alpha: bool = False
-    body: dict[str, np.ndarray] | None = None
+    body: dict[Split, BodyFrames] | None = None
     warnings: tuple[str, ...] = ()
 
     def replace(self, **changes: object) -> Capture:

@@ -119,7 +119,10 @@ def _facts(capture: Capture) -> tuple[tuple[str, str], ...]:
     if np.any(capture.world_offset):
         facts.append(("world offset", " ".join(f"{x:.10g}" for x in capture.world_offset) + " (rebased)"))
     if capture.body is not None:
-        facts.append(("body", ", ".join(f"{name} {value.shape}" for name, value in capture.body.items())))
+        frames = ", ".join(
+            f"{len(capture.body[name].frames)} {name}" for name in capture.splits if name in capture.body
+        )
+        facts.append(("body", f"{next(iter(capture.body.values())).kind}, frames: {frames}"))
     return tuple(facts)
 
 
@@ -154,7 +157,7 @@ def _frame_rate(capture: Capture) -> float | None:
             fps = calibrated_fps(root) if capture.format == "camera_folders" else None
             videos = [path for path in find_cameras(root).values() if path.is_file()]
             return fps or (planned_frames(root, videos[0]).info.fps if videos else None)
-        names = {"blender": "transforms_train.json", "nerfstudio": "transforms.json"}
+        names = dict.fromkeys(("blender", "body_json"), "transforms_train.json") | {"nerfstudio": "transforms.json"}
         fields = json.loads((root / names.get(capture.format, "")).read_text(encoding="utf-8-sig"))
         fps = fields.get("fps")
     except (DyngsError, OSError, ValueError, AttributeError):
@@ -236,7 +239,7 @@ def _is_still_monocular(capture: Capture) -> bool:
     """Whether all training views are of one camera in one pose, at several times."""
     views = [view for view in capture.splits.get("train", ()) if view.time is not None]
     poses = {view.cam_from_world.round(9).tobytes() for view in views}
-    return len(poses) == 1 and len(set(distinct_times(views).values())) > 1
+    return capture.body is None and len(poses) == 1 and len(set(distinct_times(views).values())) > 1
 
 
 def _picture_problems(capture: Capture, deep: bool) -> list[str]:
@@ -269,7 +272,7 @@ def _scene_problems(capture: Capture, poses: np.ndarray, views: list[View]) -> l
     problems = []
     centers = poses[:, :3, 3]
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    if len(poses) > 1 and spread < 1e-9 and not _is_still_monocular(capture):
+    if len(poses) > 1 and spread < 1e-9 and capture.body is None and not _is_still_monocular(capture):
         problems.append("all cameras are at one place, so no depth can be found")
     xyz = capture.points.xyz if capture.points is not None else np.zeros((0, 3))
     finite = np.isfinite(xyz).all(axis=1)

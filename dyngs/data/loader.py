@@ -24,6 +24,7 @@ from dyngs.data.images import (
 )
 from dyngs.data.intrinsics import scaled_intrinsics
 from dyngs.data.lens import LensMap, is_pinhole, undistort, undistort_map
+from dyngs.data.people import PersonView, cut_out
 from dyngs.errors import DyngsError
 
 ALL_COUNTS = 1 - 1e-4
@@ -41,6 +42,7 @@ class Picture:
         alpha: (H, W) float32 in [0, 1], None where the file has no alpha.
         mask: (H, W) float32, 1 = counts in the loss, 0 = ignore; None where all pixels count.
         time: in [0, 1] or None.
+        frame: the view's frame number or None.
     """
 
     name: str
@@ -49,6 +51,7 @@ class Picture:
     alpha: Tensor | None
     mask: Tensor | None
     time: float | None
+    frame: int | None = None
 
     def composite(self, background: Tensor) -> Tensor:
         """(H, W, 3) picture over ``background`` (3,)."""
@@ -142,6 +145,7 @@ class PictureLoader:
             alpha=pixels[..., 3].contiguous() if pixels.shape[-1] == 4 else None,
             mask=None if decoded.mask is None else decoded.mask.float(),
             time=view.time,
+            frame=view.frame,
         )
 
     @property
@@ -166,6 +170,8 @@ class PictureLoader:
 
     def _decode(self, view: View) -> _Decoded:
         pixels = read_picture(view.image_path)
+        if isinstance(view, PersonView) and view.silhouette is not None:
+            pixels = cut_out(pixels, view.silhouette)
         mask = None if view.mask_path is None else read_mask(view.mask_path)
         if mask is not None and mask.shape != pixels.shape[:2]:
             raise DyngsError(
@@ -202,7 +208,8 @@ def check_files(views: Sequence[View]) -> None:
     Raises:
         DyngsError: otherwise; missing files are counted and the first is named.
     """
-    paths = [path for view in views for path in (view.image_path, view.mask_path) if path is not None]
+    outlines = [view.silhouette.path for view in views if isinstance(view, PersonView) and view.silhouette]
+    paths = [path for view in views for path in (view.image_path, view.mask_path) if path is not None] + outlines
     missing = [path for path in paths if not path.is_file()]
     if missing:
         raise DyngsError(

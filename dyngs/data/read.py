@@ -9,6 +9,7 @@ import numpy as np
 
 from dyngs.config import DataConfig
 from dyngs.data.blender import is_blender, read_blender
+from dyngs.data.body_json import is_body_json, read_body_json
 from dyngs.data.camera_folders import CALIBRATION, is_camera_folders, read_camera_folders
 from dyngs.data.capture import Capture, PointCloud, Split, View
 from dyngs.data.colmap import MODEL_FOLDERS, is_colmap, read_colmap
@@ -18,13 +19,21 @@ from dyngs.data.images import read_header
 from dyngs.data.llff import POSES, is_llff, read_llff
 from dyngs.data.nerfies import is_nerfies, read_nerfies
 from dyngs.data.nerfstudio import is_nerfstudio, read_nerfstudio
+from dyngs.data.neuman import is_neuman, read_neuman
+from dyngs.data.people import PersonView
+from dyngs.data.people_snapshot import is_people_snapshot, read_people_snapshot
 from dyngs.data.rebase import rebase
 from dyngs.data.times import sequence_warnings, still_if_constant, unit_times
+from dyngs.data.zju_mocap import is_zju_mocap, read_zju_mocap
 from dyngs.errors import DyngsError
 
 Splits = dict[Split, tuple[View, ...]]
 
 _READERS = {
+    "body_json": (is_body_json, read_body_json, "transforms_train.json and body_train.npz"),
+    "zju_mocap": (is_zju_mocap, read_zju_mocap, "annots.npy, or cameras.pkl and mesh_infos.pkl"),
+    "people_snapshot": (is_people_snapshot, read_people_snapshot, "camera.pkl, masks.hdf5, reconstructed_poses.hdf5"),
+    "neuman": (is_neuman, read_neuman, "a COLMAP model and alignments.npy or 4d_humans"),
     "blender": (is_blender, read_blender, "transforms_train.json"),
     "nerfstudio": (is_nerfstudio, read_nerfstudio, "transforms.json"),
     "colmap": (is_colmap, read_colmap, f"cameras.bin or cameras.txt in {', '.join(MODEL_FOLDERS)}"),
@@ -32,6 +41,8 @@ _READERS = {
     "camera_folders": (is_camera_folders, read_camera_folders, CALIBRATION),
     "llff": (is_llff, read_llff, POSES),
 }
+_BUILT_ON = {"body_json": "blender", "neuman": "colmap"}
+"""Formats that are another one with body parameters beside it."""
 
 
 def read_capture(options: DataConfig, decode_videos: bool = True) -> Capture:
@@ -62,8 +73,9 @@ def read_capture(options: DataConfig, decode_videos: bool = True) -> Capture:
         raise DyngsError(f"{root}: no {options.format} capture, which would have {_READERS[options.format][2]}{also}")
     name = found[0] if options.format == "auto" else options.format
     capture = _finished(_READERS[name][1](root), options, decode_videos)
-    if options.format == "auto" and len(found) > 1:
-        note = f"read as {name}, but there is also a {found[1]} capture; data.format= chooses"
+    others = [other for other in found[1:] if other != _BUILT_ON.get(name)]
+    if options.format == "auto" and others:
+        note = f"read as {name}, but there is also a {others[0]} capture; data.format= chooses"
         capture = replace(capture, warnings=(note, *capture.warnings))
     return capture
 
@@ -80,12 +92,15 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
     splits: Splits = {name: tuple(sorted(views, key=lambda view: view.name)) for name, views in capture.splits.items()}
     if not splits.get("train"):
         raise DyngsError(f"{capture.root}: the {capture.format} capture has no training views; add posed pictures")
+    new_poses = splits.pop("pose", None)
     splits, notes = _timed(capture.root, splits, options.frames)
     if "test" not in splits:
         splits["train"], splits["test"] = hold_out(splits["train"], options.test_every)
         if not splits["train"]:
             raise DyngsError(f"{capture.root}: data.test_every={options.test_every} leaves no training views; raise it")
     splits.setdefault("val", ())
+    if new_poses is not None:
+        splits["pose"] = new_poses
     if decode_videos:
         paths = [view.image_path for views in splits.values() for view in views]
         decode_frames(capture.root, paths, options.frame_cache_mb)
@@ -121,6 +136,8 @@ def _missing_pictures(splits: Splits) -> list[str]:
 
 def _first_has_alpha(views: tuple[View, ...]) -> bool:
     for view in views:
+        if isinstance(view, PersonView) and view.silhouette is not None:
+            return True
         try:
             return read_header(view.image_path).has_alpha
         except DyngsError:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from dyngs.data.capture import Capture, PointCloud, View
+from dyngs.data.people import moved
 from dyngs.data.poses import camera_center
 
 MAX_DISTANCE = 1e5
@@ -34,7 +35,8 @@ def shifted(capture: Capture, offset: np.ndarray) -> Capture:
     """The capture with ``offset`` (3,) subtracted from all positions and added to ``world_offset``."""
     splits = {name: tuple(_shifted_view(view, offset) for view in views) for name, views in capture.splits.items()}
     points = capture.points and PointCloud(capture.points.xyz - offset, capture.points.rgb)
-    return replace(capture, splits=splits, points=points, world_offset=capture.world_offset + offset)
+    body = capture.body and {name: moved(body, offset) for name, body in capture.body.items()}
+    return replace(capture, splits=splits, points=points, body=body, world_offset=capture.world_offset + offset)
 
 
 def _shifted_view(view: View, offset: np.ndarray) -> View:

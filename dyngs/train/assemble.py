@@ -79,7 +79,7 @@ def surroundings(capture: Capture) -> Surroundings:
         camera_centers=centers,
         points=None if points is None else points.xyz,
         points_rgb=None if points is None else points.rgb,
-        around_origin=capture.format == "blender",
+        around_origin=capture.format in ("blender", "body_json"),
     )
 
 

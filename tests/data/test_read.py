@@ -300,3 +300,26 @@ def test_part_of_a_real_sequence(shared: Path) -> None:
     capture = read(shared / "stage", frames="6:12")
     assert (len(capture.splits["train"]), len(capture.splits["test"]), capture.warnings) == (48, 6, ())
     assert sorted({view.time for view in capture.splits["test"]}) == pytest.approx([i / 5 for i in range(6)], abs=1e-4)
+
+
+def test_new_poses_keep_times_and_frames_of_their_own(shared: Path) -> None:
+    """They are another clip: choosing frames of the first one leaves them alone."""
+    if not (shared / "human" / "casual_m").is_dir():
+        pytest.skip("the captures of people are not here")
+    capture = read_capture(DataConfig.model_validate({"root": shared / "human" / "casual_m", "frames": "0:5"}))
+    assert (capture.format, capture.warnings, capture.has_alpha) == ("body_json", (), True)
+    assert {name: len(views) for name, views in capture.splits.items()} == {
+        "train": 40,
+        "test": 20,
+        "val": 0,
+        "pose": 32,
+    }
+    assert {view.time for view in capture.splits["train"]} == {0.0, 0.25, 0.5, 0.75, 1.0}
+    assert sorted({view.time for view in capture.splits["pose"]}) == pytest.approx([i / 7 for i in range(8)])
+    assert capture.body is not None
+    assert {name: len(body.frames) for name, body in capture.body.items()} == {
+        "train": 20,
+        "val": 20,
+        "test": 20,
+        "pose": 8,
+    }

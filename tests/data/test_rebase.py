@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from tiny_captures import opengl_pose
 
 from dyngs.data.capture import Capture, PointCloud, View
+from dyngs.data.people import body_frames, of_one_clip
 from dyngs.data.poses import cam_from_opengl, camera_center, checked_pose, inverse_rigid
 from dyngs.data.rebase import rebase, shifted
 from dyngs.errors import DyngsError
@@ -93,3 +94,11 @@ def test_infinite_position_is_an_error() -> None:
     pose[1, 3] = np.inf
     with pytest.raises(DyngsError, match="here: the pose holds NaN"):
         checked_pose(pose, "here")
+
+
+def test_bodies_move_with_the_cameras() -> None:
+    body = body_frames(Path("b"), [0], np.zeros((1, 72)), [[1e6, 2.0, 3.0]], np.zeros(10))
+    capture = Capture(Path("x"), "blender", {}).replace(body=of_one_clip(body))
+    moved = shifted(capture, np.array([1e6, 0.0, 0.0]))
+    assert moved.body is not None
+    assert moved.body["train"].trans.tolist() == [[0.0, 2.0, 3.0]]

@@ -1,0 +1,1 @@
+"""People: a body template, its motion, and Gaussians anchored on its skin."""

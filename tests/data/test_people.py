@@ -1,0 +1,499 @@
+"""Body parameters, silhouettes, and files that may be damaged or hostile."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import sys
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from tiny_captures import random_pixels, write_picture
+
+from dyngs.data.capture import View
+from dyngs.data.people import (
+    BodyFrames,
+    Silhouette,
+    about_pelvis,
+    body_frames,
+    cut_out,
+    hdf5_length,
+    moved,
+    numbers_of,
+    person_view,
+    read_hdf5,
+    read_npz,
+    read_pickle,
+    read_pickled_array,
+    rows_of,
+    some,
+)
+from dyngs.errors import DyngsError
+
+PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
+FILE = Path("body.npz")
+
+
+def posed(points: np.ndarray, joints: np.ndarray, weights: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """(M, 3) linear blend skinning, one joint after the other: ``v = sum_j w_j A_j v``."""
+    to_world: list[np.ndarray] = []
+    total = np.zeros_like(points)
+    for joint, parent in enumerate(PARENTS):
+        step = np.eye(4)
+        step[:3, :3] = Rotation.from_rotvec(pose[joint]).as_matrix()
+        step[:3, 3] = joints[joint] - (joints[parent] if parent >= 0 else 0)
+        to_world.append(step if parent < 0 else to_world[parent] @ step)
+        turned = (points - joints[joint]) @ to_world[joint][:3, :3].T + to_world[joint][:3, 3]
+        total += weights[:, joint, None] * turned
+    return total
+
+
+def random_body(seed: int, count: int = 3, turned: bool = True) -> BodyFrames:
+    rng = np.random.default_rng(seed)
+    return BodyFrames(
+        frames=tuple(range(count)),
+        poses=rng.normal(size=(count, 24, 3)),
+        trans=rng.normal(size=(count, 3)),
+        betas=np.zeros(10),
+        scale=rng.uniform(0.2, 3, count),
+        turns=rng.normal(size=(count, 3)) * 2 if turned else None,
+    )
+
+
+def in_world(body: BodyFrames, row: int, points: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Where the points of a template are, as ``BodyFrames`` says it."""
+    at_rest = posed(points, joints, weights, body.poses[row])
+    if body.turns is not None:
+        at_rest = at_rest @ Rotation.from_rotvec(body.turns[row]).as_matrix().T
+    return body.scale[row] * at_rest + body.trans[row]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 1000))
+def test_turns_about_the_origin_become_turns_about_the_pelvis(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, joints, weights = rng.normal(size=(8, 3)), rng.normal(size=(24, 3)), rng.dirichlet(np.ones(24), 8)
+    body = random_body(seed)
+    same = about_pelvis(body, joints[0])
+    assert same.turns is None
+    for row in range(3):
+        expected = in_world(body, row, points, joints, weights)
+        np.testing.assert_allclose(in_world(same, row, points, joints, weights), expected, atol=1e-11)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 1000), st.booleans())
+def test_another_template_has_its_pelvis_where_the_fitted_body_had_it(seed: int, turned: bool) -> None:
+    rng = np.random.default_rng(seed)
+    fitted, own = rng.normal(size=(2, 3))
+    body = replace(random_body(seed, turned=turned), pelvis=fitted)
+    other = about_pelvis(body, own)
+    turns = Rotation.from_rotvec(np.zeros((3, 3)) if body.turns is None else body.turns)
+    expected = body.scale[:, None] * turns.apply(fitted) + body.trans
+    np.testing.assert_allclose(other.scale[:, None] * own + other.trans, expected, atol=1e-12)
+    np.testing.assert_allclose(about_pelvis(other, fitted).trans, about_pelvis(body, fitted).trans, atol=1e-12)
+
+
+def test_nothing_to_turn_leaves_everything_and_moves_with_the_cameras() -> None:
+    body = random_body(0, turned=False)
+    same = about_pelvis(body, np.array([0.1, -0.2, 0.3]))
+    assert np.array_equal(same.poses, body.poses)
+    assert np.array_equal(same.trans, body.trans)
+    assert np.array_equal(moved(body, np.array([1e6, -2.0, 3.0])).trans, body.trans - [1e6, -2.0, 3.0])
+
+
+def test_rows_in_any_order_and_shape() -> None:
+    poses, trans = np.arange(3 * 165.0).reshape(3, 1, 165), np.arange(9.0).reshape(3, 1, 3)
+    body = body_frames(FILE, [7, 2, 5], poses, trans, np.ones((3, 10)) * [[0], [1], [2]], 2.0, pelvis=[[1, 2, 3]])
+    assert (body.frames, body.kind, body.betas.tolist(), body.scale.tolist()) == ((2, 5, 7), "smplx", [1] * 10, [2] * 3)
+    assert body.poses.shape == (3, 55, 3)
+    assert body.poses[:, 0, 0].tolist() == [165, 330, 0]
+    assert body.trans[:, 0].tolist() == [3, 6, 0]
+    assert body.pelvis is not None
+    assert body.pelvis.tolist() == [1, 2, 3]
+    kinds = [body_frames(FILE, [0], np.zeros((1, w)), [[0, 0, 0]], [0.0]).kind for w in (72, 156, 165)]
+    assert kinds == ["smpl", "smplh", "smplx"]
+
+
+GOOD: dict[str, Any] = {
+    "frames": range(4),
+    "poses": np.zeros((4, 72)),
+    "trans": np.zeros((4, 3)),
+    "betas": np.zeros(10),
+    "scale": np.ones(4),
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"poses": np.zeros((4, 87))}, "'poses' has 87 numbers per frame; the known bodies have 72"),
+        ({"poses": np.zeros((4, 73))}, "'poses' has 73 numbers per frame"),
+        ({"poses": np.zeros((3, 72))}, "'poses' has 3 rows for 4 frames"),
+        ({"poses": np.zeros(())}, "'poses' has 1 rows for 4 frames"),
+        ({"poses": [[0.0] * 72] * 3 + [[0.0]]}, "'poses' must hold as many numbers"),
+        ({"poses": [["a"] * 72] * 4}, "'poses' must hold as many numbers"),
+        ({"poses": None}, "'poses' must hold as many numbers"),
+        ({"trans": np.zeros((5, 3))}, "'trans' has 5 rows for 4 frames"),
+        ({"trans": np.zeros((4, 4))}, "'trans' has 4 numbers per frame instead of 3"),
+        ({"trans": np.full((4, 3), np.nan)}, "'trans' of frame 0 holds NaN"),
+        ({"poses": np.where(np.arange(4)[:, None] == 2, np.inf, np.zeros(72))}, "'poses' of frame 2 holds NaN"),
+        ({"betas": [0, np.nan]}, "'betas' must hold finite numbers"),
+        ({"betas": np.zeros((3, 10))}, "'betas' has 3 rows for 4 frames"),
+        ({"scale": 0.0}, "'scale' must be positive"),
+        ({"scale": -np.ones(4)}, "'scale' must be positive"),
+        ({"scale": "big"}, "'scale' must hold as many numbers"),
+        ({"scale": np.ones(3)}, "'scale' has 3 rows"),
+        ({"turns": np.zeros((4, 4))}, "'turns' has 4 numbers per frame instead of 3"),
+        ({"pelvis": [0, 1]}, "'pelvis' must hold 3 finite numbers"),
+        ({"frames": [0, 1, 2, 1]}, "frame 1 has body parameters twice"),
+        ({"frames": []}, "holds no frame"),
+    ],
+)
+def test_bad_parameters(change: dict[str, Any], line: str) -> None:
+    assert body_frames(FILE, **GOOD).frames == (0, 1, 2, 3)
+    with pytest.raises(DyngsError, match=line) as caught:
+        body_frames(FILE, **{**GOOD, **change})
+    assert "body.npz" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def view_of(frame: int | None) -> View:
+    return View(f"v{frame}", Path(f"{frame}.png"), np.eye(4), np.eye(3), 4, 3, frame=frame)
+
+
+def test_views_find_their_rows_by_frame() -> None:
+    body = replace(random_body(0), frames=(2, 5, 9))
+    assert rows_of(FILE, body, [view_of(9), view_of(2), view_of(9)]).tolist() == [2, 0, 2]
+    with pytest.raises(DyngsError, match=r"2 frames that have pictures \(3, 4\).* 3 frames from 2 to 9"):
+        rows_of(FILE, body, [view_of(2), view_of(4), view_of(3), view_of(4)])
+    with pytest.raises(DyngsError, match=r"None\.png has no frame number"):
+        rows_of(FILE, body, [view_of(None)])
+
+
+def test_some() -> None:
+    assert (some([1, 2]), some(range(7))) == ("1, 2", "0, 1, 2, 3, 4 and 2 more")
+
+
+def test_numbers_in_another_shape() -> None:
+    assert numbers_of("f", [[[1], [2]]], (2,)).tolist() == [1, 2]
+    for value in ([1, 2, 3], "ab", [[1], [2, 3]], None, [1, np.inf], [True, {}]):
+        with pytest.raises(DyngsError, match="f must hold 2 finite numbers"):
+            numbers_of("f", value, (2,))
+
+
+@pytest.mark.parametrize(
+    ("person", "expected"),
+    [("white", [0, 1, 128, 255]), ("black", [255, 254, 127, 0]), ("nonzero", [0, 255, 255, 255])],
+)
+def test_silhouettes_become_alpha(tmp_path: Path, person: Any, expected: list[int]) -> None:
+    write_picture(tmp_path / "m.png", np.array([[[0], [1], [128], [255]]], np.uint8))
+    pixels = torch.from_numpy(random_pixels(1, 4, 3))
+    cut = cut_out(pixels, Silhouette(tmp_path / "m.png", person))
+    assert cut[0, :, 3].tolist() == expected
+    assert torch.equal(cut[..., :3], pixels)
+
+
+def test_silhouettes_and_alpha_multiply(tmp_path: Path) -> None:
+    write_picture(tmp_path / "m.png", np.array([[[0], [128], [255]]], np.uint8))
+    pixels = torch.tensor([[[9, 9, 9, 200]] * 3], dtype=torch.uint8)
+    assert cut_out(pixels, Silhouette(tmp_path / "m.png", "white"))[0, :, 3].tolist() == [0, 100, 200]
+
+
+def test_bad_silhouettes(tmp_path: Path) -> None:
+    write_picture(tmp_path / "m.png", np.zeros((2, 3, 1), np.uint8))
+    with pytest.raises(DyngsError, match=r"m\.png: the mask is 3x2 but its picture is 4x1"):
+        cut_out(torch.zeros(1, 4, 3, dtype=torch.uint8), Silhouette(tmp_path / "m.png", "white"))
+    with pytest.raises(DyngsError, match=r"n\.png: no such picture"):
+        cut_out(torch.zeros(1, 4, 3, dtype=torch.uint8), Silhouette(tmp_path / "n.png", "white"))
+
+
+def test_a_view_with_a_silhouette_stays_a_view() -> None:
+    view = person_view(view_of(3), Silhouette(Path("m.png"), "white"))
+    assert isinstance(view, View)
+    changed = replace(view, time=0.5)
+    assert (changed.silhouette, changed.frame, changed.name) == (view.silhouette, 3, "v3")
+    assert person_view(view, None).silhouette is None
+
+
+@pytest.fixture
+def hdf5(tmp_path: Path) -> Path:
+    h5py = pytest.importorskip("h5py", reason="needs dyngs[people]")
+    with h5py.File(tmp_path / "m.hdf5", "w") as file:
+        masks = np.zeros((5, 2, 3), np.uint8)
+        masks[3, 1, 2] = 1
+        file.create_dataset("masks", data=masks, compression="lzf")
+        file.create_dataset("deep", data=np.zeros((2, 2, 3)))
+        file.create_group("group")
+    return tmp_path / "m.hdf5"
+
+
+def test_silhouettes_in_hdf5(hdf5: Path) -> None:
+    pixels = torch.zeros(2, 3, 3, dtype=torch.uint8)
+    assert cut_out(pixels, Silhouette(hdf5, "nonzero", 3))[..., 3].tolist() == [[0, 0, 0], [0, 0, 255]]
+    assert (hdf5_length(hdf5, "masks"), read_hdf5(hdf5, "masks").shape) == (5, (5, 2, 3))
+    with pytest.raises(DyngsError, match="'masks' cannot be read as HDF5"):
+        cut_out(pixels, Silhouette(hdf5, "nonzero", 5))
+
+
+def test_bad_hdf5(hdf5: Path) -> None:
+    for key in ("pose", "group"):
+        with pytest.raises(DyngsError, match=f"the data set '{key}' is missing"):
+            read_hdf5(hdf5, key)
+    with pytest.raises(DyngsError, match="no such file"):
+        read_hdf5(hdf5.with_name("n.hdf5"), "masks")
+    hdf5.write_bytes(hdf5.read_bytes()[:100])
+    with pytest.raises(DyngsError, match="cannot be read as HDF5") as caught:
+        read_hdf5(hdf5, "masks")
+    assert "\n" not in str(caught.value)
+
+
+def test_without_h5py_the_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(DyngsError, match=r"x\.hdf5: HDF5 files need .* pip install 'dyngs\[people\]'"):
+        read_hdf5(tmp_path / "x.hdf5", "masks")
+
+
+def test_npz(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    with pytest.raises(DyngsError, match=r"a\.npz: no such file; it should hold the body parameters poses, trans"):
+        read_npz(path, ("poses", "trans"))
+    np.savez(path, poses=np.zeros(3), gender="neutral")
+    assert set(read_npz(path, ("poses",))) == {"poses", "gender"}
+    with pytest.raises(DyngsError, match="'trans' is missing"):
+        read_npz(path, ("poses", "trans"))
+    np.savez(path, poses=np.array([{}]))
+    with pytest.raises(DyngsError, match=r"a\.npz: cannot be read"):
+        read_npz(path, ("poses",))
+    np.save(tmp_path / "b.npy", np.zeros(3))
+    for damaged in (b"", b"PK\x03\x04", b"\x80\x04N.", (tmp_path / "b.npy").read_bytes()):
+        path.write_bytes(damaged)
+        with pytest.raises(DyngsError, match=r"a\.npz: cannot be read") as caught:
+            read_npz(path, ("poses",))
+        assert "\n" not in str(caught.value)
+
+
+def pickled(tmp_path: Path, content: bytes) -> Path:
+    (tmp_path / "a.pkl").write_bytes(content)
+    return tmp_path / "a.pkl"
+
+
+ATOMS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text() | st.binary(min_size=1)
+TREES = st.recursive(
+    ATOMS, lambda tree: st.lists(tree) | st.dictionaries(st.text(), tree) | st.tuples(tree, tree), max_leaves=12
+)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(TREES, st.integers(0, 5))
+def test_plain_values_come_back(tmp_path: Path, tree: object, protocol: int) -> None:
+    assert read_pickle(pickled(tmp_path, pickle.dumps(tree, protocol))) == tree
+
+
+ARRAYS = (
+    np.arange(6.0).reshape(2, 3),
+    np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+    np.arange(12, dtype=np.int16)[::2],
+    np.arange(3, dtype=">i4"),
+    np.array([True, False]),
+    np.array(7.5),
+    np.array(["ab", "c"]),
+    np.array([[1, None], ["x", 2.5]], dtype=object),
+    np.float32(2.5),
+    np.int64(-3),
+)
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_arrays_come_back(tmp_path: Path, protocol: int) -> None:
+    read: Any = read_pickle(pickled(tmp_path, pickle.dumps({"a": ARRAYS, "again": ARRAYS[0]}, protocol)))
+    for value, expected in zip(read["a"], ARRAYS, strict=True):
+        np.testing.assert_array_equal(np.asarray(value), expected)
+        assert np.asarray(value).dtype.kind == np.asarray(expected).dtype.kind
+    assert read["again"] is read["a"][0]
+
+
+def test_pickles_of_python_2(tmp_path: Path) -> None:
+    """As Python 2 wrote ``{'camera_f': numpy.array([1.5, 2.0]), 'width': 1080}`` with protocol 2."""
+    numbers = np.array([1.5, -2.0]).tobytes()
+    content = (
+        b"\x80\x02}q\x00(U\x08camera_fq\x01cnumpy.core.multiarray\n_reconstruct\nq\x02cnumpy\nndarray\nq\x03K\x00\x85"
+    )
+    content += b"U\x01b\x87Rq\x04(K\x01K\x02\x85cnumpy\ndtype\nq\x05U\x02f8K\x00K\x01\x87Rq\x06(K\x03U\x01<NNN"
+    content += b"J\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89U\x10" + numbers + b"tbU\x05widthM8\x04u."
+    read: Any = read_pickle(pickled(tmp_path, content))
+    assert (list(read["camera_f"]), read["width"]) == ([1.5, -2.0], 1080)
+
+
+class Wrapper:
+    """What joblib writes instead of an array; the bytes follow behind."""
+
+    __module__, __qualname__ = "joblib.numpy_pickle", "NumpyArrayWrapper"
+
+
+PythonPickler: Any = pickle._Pickler  # type: ignore[attr-defined]
+
+
+class JoblibPickler(PythonPickler):
+    """Writes the layout of ``joblib.dump`` without compression."""
+
+    alignment: int | None = 16
+
+    def save(self, obj: Any, save_persistent_id: bool = True) -> None:
+        if not isinstance(obj, np.ndarray):
+            super().save(obj, save_persistent_id)
+            return
+        wrapper = Wrapper()
+        order = "F" if obj.flags.f_contiguous and not obj.flags.c_contiguous else "C"
+        vars(wrapper).update(subclass=np.ndarray, shape=obj.shape, order=order, dtype=obj.dtype, allow_mmap=True)
+        if self.alignment:
+            vars(wrapper)["numpy_array_alignment_bytes"] = self.alignment
+        self.kept = [*getattr(self, "kept", []), wrapper]  # memo goes by id
+        super().save(wrapper, save_persistent_id)
+        if self.proto >= 4:
+            self.framer.commit_frame(force=True)
+        file = self.framer.file_write.__self__
+        if self.alignment:
+            padding = self.alignment - (file.tell() + 1) % self.alignment
+            file.write(bytes([padding]) + b"\xff" * padding)
+        file.write(obj.tobytes(order))
+
+
+@pytest.mark.parametrize("protocol", [2, 4])
+@pytest.mark.parametrize("alignment", [None, 16])
+def test_joblib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int, alignment: int | None) -> None:
+    for name in ("joblib", "joblib.numpy_pickle"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    monkeypatch.setattr(sys.modules["joblib.numpy_pickle"], "NumpyArrayWrapper", Wrapper, raising=False)
+    monkeypatch.setattr(JoblibPickler, "alignment", alignment)
+    arrays = [np.random.default_rng(i).normal(size=(3, 5 + i)) for i in range(4)] + [np.asfortranarray(np.eye(3) + 1)]
+    file = io.BytesIO()
+    JoblibPickler(file, protocol).dump({1: {"pose": arrays, "n": 5}})
+    read: Any = read_pickle(pickled(tmp_path, file.getvalue()))
+    for value, expected in zip(read[1]["pose"], arrays, strict=True):
+        np.testing.assert_array_equal(value, expected)
+    assert read[1]["n"] == 5
+    with pytest.raises(DyngsError, match="cannot be read as a pickle"):
+        read_pickle(pickled(tmp_path, file.getvalue()[:-40]))
+
+
+class Calls:
+    """Pickles as a call."""
+
+    def __init__(self, function: Any, *arguments: Any) -> None:
+        self.parts = function, arguments
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self.parts
+
+
+HOSTILE = {
+    "a command": Calls(os.system, "touch ran"),
+    "a file": Calls(open, "ran", "w"),
+    "eval": Calls(eval, "open('ran', 'w')"),
+    "getattr": Calls(getattr, "text", "__class__"),
+    "import": Calls(import_module, "os"),
+    "numpy.load": Calls(np.load, "x.npy"),
+    "a class": Rotation,
+    "torch": torch.zeros(1),
+    "structured": np.zeros(2, dtype=[("a", "O")]),
+    "times": np.zeros(2, dtype="M8[s]"),
+    "text": Calls(__import__("_codecs").encode, "uryyb", "rot13"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
+def test_nothing_else_is_read(tmp_path: Path, name: str, protocol: int) -> None:
+    path = pickled(tmp_path, pickle.dumps({"x": [HOSTILE[name]]}, protocol))
+    with pytest.raises(DyngsError, match=r"a\.pkl: cannot be read as a pickle \(") as caught:
+        read_pickle(path)
+    assert "\n" not in str(caught.value)
+    np.save(tmp_path / "a.npy", np.array({"x": HOSTILE[name]}, dtype=object), allow_pickle=True)
+    with pytest.raises(DyngsError, match=r"a\.npy: cannot be read"):
+        read_pickled_array(tmp_path / "a.npy")
+    assert not Path("ran").exists()
+
+
+def array_with_state(state: tuple[Any, ...]) -> bytes:
+    """A pickle of an array with a state that NumPy would not write."""
+
+    class Crafted:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return np.zeros(1).__reduce__()[0], (np.ndarray, (0,), b"b"), state
+
+    return pickle.dumps(Crafted(), 4)
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        (1, (2,), np.dtype(object), False, b"\x01" * 16),
+        (1, (1 << 40,), np.dtype(float), False, b""),
+        (1, (2,), np.dtype(float), False, b"\0" * 15),
+        (1, (-2,), np.dtype(float), False, b""),
+        (1, (2,), np.dtype(object), False, [1]),
+        (1, (2.0,), np.dtype(float), False, b"\0" * 16),
+        (1, (2,), "f8", False, b"\0" * 16),
+        (1, (2,)),
+    ],
+)
+def test_arrays_that_lie_about_themselves(tmp_path: Path, state: tuple[Any, ...]) -> None:
+    with pytest.raises(DyngsError, match="cannot be read as a pickle"):
+        read_pickle(pickled(tmp_path, array_with_state(state)))
+
+
+def test_a_file_cannot_change_what_the_next_one_sees(tmp_path: Path) -> None:
+    """BUILD on a class or function would set its attributes."""
+    expected = np.arange(3.0)
+    for name in ("numpy\nndarray", "numpy\ndtype", "numpy.core.multiarray\n_reconstruct", "_codecs\nencode"):
+        with pytest.raises(DyngsError, match="cannot be read as a pickle"):
+            read_pickle(pickled(tmp_path, f"c{name}\n(N}}V__defaults__\nNsV__new__\nI2\nstb.".encode()))
+        for protocol in (0, 5):
+            read = read_pickle(pickled(tmp_path, pickle.dumps(expected, protocol)))
+            np.testing.assert_array_equal(np.asarray(read), expected)
+
+
+def test_a_small_file_cannot_claim_memory(tmp_path: Path) -> None:
+    """LONG_BINPUT with the largest index makes the unpickler in C allocate 64 GB."""
+    assert read_pickle(pickled(tmp_path, b"Nr\xff\xff\xff\xff.")) is None
+
+
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_damaged_pickles_give_one_line(tmp_path: Path, data: st.DataObject) -> None:
+    content = bytearray(pickle.dumps({"a": np.arange(3.0), "b": ["x", 1, (2.5, None)]}, data.draw(st.integers(0, 5))))
+    if data.draw(st.booleans()):
+        content = content[: data.draw(st.integers(0, len(content) - 1))]
+    else:
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        read_pickle(pickled(tmp_path, bytes(content)))
+    except DyngsError as error:
+        assert "\n" not in str(error)  # noqa: PT017
+
+
+def test_pickled_arrays(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    with pytest.raises(DyngsError, match=r"a\.npy: no such file"):
+        read_pickled_array(path)
+    np.save(path, np.array({"K": [np.eye(3)]}, dtype=object), allow_pickle=True)
+    read: Any = read_pickled_array(path)
+    np.testing.assert_array_equal(read["K"][0], np.eye(3))
+    for array, line in ((np.zeros(3), "Python objects was expected"), (np.array([{}, {}]), "must hold one dictionary")):
+        np.save(path, array, allow_pickle=True)
+        with pytest.raises(DyngsError, match=line):
+            read_pickled_array(path)
+    path.write_bytes(b"\x93NUMPY\x01")
+    with pytest.raises(DyngsError, match="cannot be read"):
+        read_pickled_array(path)
