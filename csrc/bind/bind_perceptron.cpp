@@ -8,15 +8,13 @@
 #include <string>
 #include <vector>
 
+#include "bind/arrays.hpp"
 #include "cpu/perceptron.hpp"
 
 namespace nb = nanobind;
 
 namespace dyngs {
 namespace {
-
-template <class T>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
 
 template <class S>
 Perceptron<S> network(const std::vector<int64_t>& widths, int64_t skip, const Array<const S>& params, int threads) {

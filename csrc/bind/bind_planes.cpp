@@ -9,6 +9,7 @@
 #include <tuple>
 #include <vector>
 
+#include "bind/arrays.hpp"
 #include "cpu/planes.hpp"
 
 namespace nb = nanobind;
@@ -16,8 +17,6 @@ namespace nb = nanobind;
 namespace dyngs {
 namespace {
 
-template <class T, class... Config>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Config...>;
 template <class S>
 using Planes = Array<S, nb::shape<3, -1, -1, -1>>;
 template <class S>

@@ -8,6 +8,7 @@
 #include <optional>
 #include <tuple>
 
+#include "bind/arrays.hpp"
 #include "cpu/finite.hpp"
 #include "cpu/kernels.hpp"
 
@@ -16,8 +17,6 @@ namespace nb = nanobind;
 namespace dyngs {
 namespace {
 
-template <class T>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
 template <class T>
 using MaybeArray = std::optional<Array<T>>;
 

@@ -7,6 +7,7 @@
 #include <optional>
 #include <tuple>
 
+#include "bind/arrays.hpp"
 #include "cpu/skinning.hpp"
 
 namespace nb = nanobind;
@@ -14,8 +15,6 @@ namespace nb = nanobind;
 namespace dyngs {
 namespace {
 
-template <class T, class... Config>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Config...>;
 template <class S>
 using Rows = Array<S, nb::ndim<2>>;
 template <class S>

@@ -10,6 +10,7 @@
 #include <malloc.h>
 #endif
 
+#include "bind/arrays.hpp"
 #include "cpu/adam.hpp"
 #include "cpu/loss.hpp"
 
@@ -17,9 +18,6 @@ namespace nb = nanobind;
 
 namespace dyngs {
 namespace {
-
-template <class Scalar, class... Config>
-using Array = nb::ndarray<Scalar, nb::c_contig, nb::device::cpu, Config...>;
 
 double l1_ssim_arrays(Array<const float, nb::shape<-1, -1, 3>> rendered, Array<const float, nb::shape<-1, -1, 3>> target,
                std::optional<Array<const float, nb::ndim<2>>> mask,

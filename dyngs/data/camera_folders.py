@@ -5,7 +5,6 @@ What is common to such captures, however they are calibrated, is here, too; see 
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ from dyngs.data.capture import Capture, Split, View
 from dyngs.data.frame_cache import planned_frames
 from dyngs.data.images import SUFFIXES
 from dyngs.data.intrinsics import match_size, rescale_warning
+from dyngs.data.json_object import read_json_object
 from dyngs.data.poses import checked_pose, inverse_rigid
 from dyngs.data.transforms import Frame, FrameFile, read_views
 from dyngs.data.video import VIDEO_SUFFIXES, VideoInfo
@@ -194,14 +194,10 @@ def _rate_warning(cameras: Sequence[CameraSource]) -> list[str]:
 
 
 def _read_calibration(path: Path) -> dict[str, object]:
-    try:
-        fields = json.loads(path.read_text(encoding="utf-8-sig"))
-    except json.JSONDecodeError as error:
-        raise DyngsError(f"{path}, line {error.lineno} column {error.colno}: broken JSON ({error.msg})") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DyngsError(f"{path}: cannot be read ({error})") from None
-    if not isinstance(fields, dict) or not isinstance(fields.get("cameras"), dict) or not fields["cameras"]:
-        raise DyngsError(f"{path}: must be an object whose 'cameras' maps camera names to calibrations")
+    wrong = "must be an object whose 'cameras' maps camera names to calibrations"
+    fields = read_json_object(path, wrong)
+    if not isinstance(fields.get("cameras"), dict) or not fields["cameras"]:
+        raise DyngsError(f"{path}: {wrong}")
     fps = fields.get("fps")
     if fps is not None and (isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps < 1e6):
         raise DyngsError(f"{path}: 'fps' must be a positive number, got {fps!r:.40}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from dyngs.data.camera_folders import OPENGL_FROM_OPENCV
 from dyngs.data.capture import Capture, PointCloud, Split, View
 from dyngs.data.images import SUFFIXES, read_header
+from dyngs.data.json_object import read_json_object
 from dyngs.data.llff import read_number_array
 from dyngs.data.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
@@ -52,7 +52,7 @@ def read_nerfies(root: Path) -> Capture:
     Raises:
         DyngsError: anything missing, broken or inconsistent; names the file.
     """
-    dataset = _read_object(root / "dataset.json")
+    dataset = read_json_object(root / "dataset.json")
     lists = {key: _ids(root, dataset, key) for key in ("ids", "train_ids", "val_ids")}
     train = lists["train_ids"] or [name for name in lists["ids"] if name not in set(lists["val_ids"])]
     used = list(dict.fromkeys([*train, *lists["val_ids"]]))
@@ -83,18 +83,6 @@ def read_nerfies(root: Path) -> Capture:
     return Capture(root, "nerfies", splits, _points(root / "points.npy", scene), warnings=tuple(warnings))
 
 
-def _read_object(path: Path) -> dict[str, object]:
-    try:
-        fields = json.loads(path.read_text(encoding="utf-8-sig"))
-    except json.JSONDecodeError as error:
-        raise DyngsError(f"{path}, line {error.lineno} column {error.colno}: broken JSON ({error.msg})") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DyngsError(f"{path}: cannot be read ({error})") from None
-    if not isinstance(fields, dict):
-        raise DyngsError(f"{path}: must be a JSON object")
-    return fields
-
-
 def _ids(root: Path, dataset: dict[str, object], key: str) -> list[str]:
     value = dataset.get(key, [])
     if not isinstance(value, list) or not all(isinstance(item, str) and _is_plain(item) for item in value):
@@ -109,7 +97,7 @@ def _is_plain(name: str) -> bool:
 
 def _metadata(root: Path, names: list[str]) -> dict[str, dict[str, object]]:
     path = root / "metadata.json"
-    fields = _read_object(path) if path.is_file() else {}
+    fields = read_json_object(path) if path.is_file() else {}
     found: dict[str, dict[str, object]] = {}
     for name in names:
         own = fields.get(name, {} if not fields else None)
@@ -157,7 +145,7 @@ def _numbers(path: Path, fields: dict[str, object], key: str, shape: tuple[int, 
 def _scene(path: Path) -> _Scene:
     if not path.is_file():
         return _Scene()
-    fields = _read_object(path)
+    fields = read_json_object(path)
     scale = float(_numbers(path, fields, "scale", ()))
     if scale <= 0:
         raise DyngsError(f"{path}: 'scale' must be positive, got {scale:g}")
@@ -182,7 +170,7 @@ def _camera(path: Path, scene: _Scene, pictures: _Pictures, name: str, skewed: l
     """The camera as a frame of a transforms file, for pictures that are smaller by the factor of their folder."""
     if not path.is_file():
         raise DyngsError(f"{path}: no such camera file, although dataset.json lists it; restore it")
-    fields = _read_object(path)
+    fields = read_json_object(path)
     focal = float(_numbers(path, fields, "focal_length", ()))
     aspect = float(_numbers(path, fields, "pixel_aspect_ratio", ())) if "pixel_aspect_ratio" in fields else 1.0
     full, (cx, cy) = _numbers(path, fields, "image_size", (2,)), _numbers(path, fields, "principal_point", (2,))

@@ -16,19 +16,18 @@ from dyngs.errors import DyngsError
 
 
 @dataclass(frozen=True)
-class StillOptions:
-    """How the demo capture is taken.
+class PictureOptions:
+    """How pictures are taken.
 
     Attributes:
         size: width and height in pixels.
-        num_train, num_val, num_test: pictures per split.
+        num_val, num_test: pictures that are held out.
         seed: turns the training cameras; one seed gives the same bytes each time.
         distance: of the cameras from the origin, world units.
         samples: S, samples per pixel side.
     """
 
     size: int = 128
-    num_train: int = 48
     num_val: int = 0
     num_test: int = 8
     seed: int = 0
@@ -37,28 +36,32 @@ class StillOptions:
 
 
 @dataclass(frozen=True)
-class DynamicOptions:
-    """How a capture of a moving scene is taken.
+class StillOptions(PictureOptions):
+    """How the still scene is taken.
 
     Attributes:
-        size: width and height in pixels.
-        num_times: training times, evenly spaced in [0, 1]; in ``room`` each camera takes a picture at each.
-        num_test: test pictures, at times between the training times; for ``room`` 0 = no test camera, else one.
-        num_val: pictures of one fixed camera at evenly spaced times; for ``room`` 0 = no such camera, else one.
-        num_cameras: training cameras of ``room``.
-        seed: turns the training cameras and chooses which takes which time; one seed gives the same bytes each time.
-        distance: of the cameras from the origin, world units.
-        samples: S, samples per pixel side.
+        num_train: training pictures.
     """
 
-    size: int = 128
-    num_times: int = 48
+    num_train: int = 48
+
+
+@dataclass(frozen=True)
+class DynamicOptions(PictureOptions):
+    """How a moving scene is taken. The seed also chooses which camera takes which time.
+
+    Test pictures lie at times between the training times, those of ``num_val`` are of one fixed camera; in ``room`` both
+    numbers only say whether there is a camera of that kind, which is never trained on.
+
+    Attributes:
+        num_times: training times, evenly spaced in [0, 1]; in ``room`` each camera takes a picture at each.
+        num_cameras: training cameras of ``room``.
+    """
+
     num_test: int = 12
-    num_val: int = 0
-    num_cameras: int = 8
-    seed: int = 0
-    distance: float = 4.0
     samples: int = 2
+    num_times: int = 48
+    num_cameras: int = 8
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections import Counter
@@ -14,6 +13,7 @@ import numpy as np
 from dyngs.data.capture import Lens, View
 from dyngs.data.images import SUFFIXES, PictureHeader, read_header
 from dyngs.data.intrinsics import match_size, pinhole_matrix, rescale_warning
+from dyngs.data.json_object import read_json_object
 from dyngs.data.poses import cam_from_opengl, checked_pose, repair_warning
 from dyngs.errors import DyngsError
 
@@ -80,16 +80,13 @@ def read_frame_file(path: Path) -> FrameFile:
     Raises:
         DyngsError: unreadable, broken JSON (with line and column), or no list ``frames`` of objects.
     """
-    try:
-        fields = json.loads(path.read_text(encoding="utf-8-sig"))
-    except json.JSONDecodeError as error:
-        raise DyngsError(f"{path}, line {error.lineno} column {error.colno}: broken JSON ({error.msg})") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DyngsError(f"{path}: cannot be read ({error})") from None
-    if not isinstance(fields, dict) or not isinstance(fields.get("frames"), list):
-        raise DyngsError(f"{path}: the list 'frames' is missing; is this a transforms file?")
+    wrong = "the list 'frames' is missing; is this a transforms file?"
+    fields = read_json_object(path, wrong)
+    listed = fields.get("frames")
+    if not isinstance(listed, list):
+        raise DyngsError(f"{path}: {wrong}")
     frames = []
-    for index, own in enumerate(fields["frames"]):
+    for index, own in enumerate(listed):
         where = f"{path}, frame {index}"
         if not isinstance(own, dict):
             raise DyngsError(f"{where}: must be an object with file_path and transform_matrix")

@@ -166,7 +166,7 @@ def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path: Path) ->
 
 
 def test_the_command_knows_all_scenes() -> None:
-    assert ("still", *get_args(SceneName)) == SYNTHETIC_SCENES
+    assert ("still", *get_args(SceneName), "human") == SYNTHETIC_SCENES
 
 
 @pytest.mark.parametrize(

@@ -67,6 +67,17 @@ def _log(run_dir: Path) -> list[dict[str, float]]:
     return [json.loads(line) for line in (run_dir / "log.jsonl").read_text().splitlines()]
 
 
+def _stopped_and_resumed(config: Config, stop_at: int, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a run that was interrupted after step ``stop_at`` and then finished."""
+    assert config.run.dir is not None
+    with monkeypatch.context() as patch:
+        _interrupt_after(stop_at, patch)
+        with pytest.raises(KeyboardInterrupt, match="--resume"):
+            train(config)
+    assert load_run(config.run.dir).step == stop_at
+    return train(load_resolved(config.run.dir), resume_from=config.run.dir)
+
+
 def _interrupt_after(step: int, monkeypatch: pytest.MonkeyPatch, which: signal.Signals = signal.SIGINT) -> None:
     """Send ``which`` to this process during ``step``, once."""
     real = Trainer.step
@@ -145,12 +156,7 @@ def test_resumed_equals_uninterrupted(
     }
     whole = train(_config(capture, tmp_path / "whole", strategy=strategy, **changes))
     config = _config(capture, tmp_path / "parts", strategy=strategy, **changes)
-    with monkeypatch.context() as patch:
-        _interrupt_after(stop_at, patch)
-        with pytest.raises(KeyboardInterrupt, match="--resume"):
-            train(config)
-    assert load_run(tmp_path / "parts").step == stop_at
-    resumed = train(load_resolved(tmp_path / "parts"), resume_from=tmp_path / "parts")
+    resumed = _stopped_and_resumed(config, stop_at, monkeypatch)
     assert _final_bytes(resumed) == _final_bytes(whole)
     same = ("step", "loss", "psnr", "num_gaussians")
     assert [[r[k] for k in same] for r in _log(resumed)] == [[r[k] for k in same] for r in _log(whole)]
@@ -263,12 +269,7 @@ def test_a_resumed_moving_run_equals_an_uninterrupted_one(
     whole_run: Path, moving_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int
 ) -> None:
     config = busy_config(moving_capture, tmp_path / "parts", _kind_of(whole_run))
-    with monkeypatch.context() as patch:
-        _interrupt_after(stop_at, patch)
-        with pytest.raises(KeyboardInterrupt, match="--resume"):
-            train(config)
-    assert load_run(tmp_path / "parts").step == stop_at
-    resumed = train(load_resolved(tmp_path / "parts"), resume_from=tmp_path / "parts")
+    resumed = _stopped_and_resumed(config, stop_at, monkeypatch)
     assert _final_bytes(resumed) == _final_bytes(whole_run)
     same = ("step", "loss", "psnr", "num_gaussians", "num_moving")
     assert [[r[k] for k in same] for r in _log(resumed)] == [[r[k] for k in same] for r in _log(whole_run)]
