@@ -50,8 +50,8 @@ class StillOptions(PictureOptions):
 class DynamicOptions(PictureOptions):
     """How a moving scene is taken. The seed also chooses which camera takes which time.
 
-    Test pictures lie at times between the training times, those of ``num_val`` are of one fixed camera; in ``room`` both
-    numbers only say whether there is a camera of that kind, which is never trained on.
+    Test pictures lie at times between the training times, those of ``num_val`` are of one fixed camera; in ``room``
+    both numbers only say whether there is a camera of that kind, which is never trained on.
 
     Attributes:
         num_times: training times, evenly spaced in [0, 1]; in ``room`` each camera takes a picture at each.
