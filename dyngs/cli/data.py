@@ -1,22 +1,27 @@
-"""``dyngs data``: look at a capture, estimate poses, make a synthetic one."""
+"""``dyngs data``: look at a capture, estimate poses, convert a motion, make a synthetic capture."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dyngs.errors import DyngsError
 
-SYNTHETIC_SCENES = ("still", "spin", "wave", "merge", "room")
+if TYPE_CHECKING:
+    from dyngs.human.motion import Motion
+
+SYNTHETIC_SCENES = ("still", "spin", "wave", "merge", "room", "human")
 """The scenes of ``dyngs data synth``: named here because the parser must not import numpy."""
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``data`` and its own commands to the commands."""
-    parser = commands.add_parser("data", help="inspect a capture, estimate poses, make a synthetic capture")
+    parser = commands.add_parser("data", help="inspect a capture, estimate poses, convert a motion, synthesise")
     verbs = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_inspect(verbs)
     _add_sfm(verbs)
+    _add_motion(verbs)
     _add_synth(verbs)
 
 
@@ -28,7 +33,8 @@ def _add_inspect(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     )
     parser.add_argument("path", type=Path, metavar="PATH", help="capture folder")
     formats = ("auto", "blender", "nerfstudio", "colmap", "nerfies", "llff", "camera_folders")
-    parser.add_argument("--format", choices=formats, default="auto")
+    people = ("body_json", "zju_mocap", "people_snapshot", "neuman")
+    parser.add_argument("--format", choices=(*formats, *people), default="auto")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw cameras and points into this picture")
     parser.add_argument("--deep", action="store_true", help="decode every picture in full (slow)")
     parser.set_defaults(run=run_inspect)
@@ -48,21 +54,40 @@ def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
     parser.set_defaults(run=run_sfm)
 
 
+def _add_motion(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = verbs.add_parser(
+        "motion",
+        help="convert a motion of AMASS, BVH or glTF into one of the body template",
+        description="Read how a body moves, retarget it to the template if it was made for another skeleton, and write "
+        "it as an .npz in the layout of AMASS SMPL-X, y up.",
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="an AMASS .npz, a .bvh, a .glb or a .gltf")
+    parser.add_argument("out", type=Path, metavar="OUT.npz", help="a new file")
+    parser.add_argument("--fps", type=float, metavar="F", help="resample to F frames per second (default: as in FILE)")
+    parser.add_argument("--up", choices=("auto", "y", "z"), default="auto", help="up axis of an .npz (default auto)")
+    parser.add_argument("--clip", metavar="NAME", help="animation of a glTF file that has several")
+    parser.add_argument("--body", type=Path, metavar="BODY", help="body template (default: the one of dyngs)")
+    parser.set_defaults(run=run_motion)
+
+
 def _add_synth(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "synth",
         help="write an embedded synthetic scene as a capture",
         description="Ray trace an embedded scene into a capture in the layout of NeRF-synthetic, or of D-NeRF if it "
         "moves. still: a still life. spin: a turning die and a rolling ball. wave: a rippling cloth. merge: balls that "
-        "appear, merge and vanish. room: video of fixed cameras of a still room in which one ball hops.",
+        "appear, merge and vanish. room: video of fixed cameras of a still room in which one ball hops. human: a "
+        "walking person from all around, with the exact parameters of the body.",
     )
     parser.add_argument("scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES))
     parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
     parser.add_argument("--size", type=int, default=128, metavar="PX", help="width and height (default 128)")
-    parser.add_argument("--views", type=int, default=48, metavar="N", help="training views, of room times (default 48)")
-    parser.add_argument("--cameras", type=int, metavar="N", help="training cameras of room (default 8)")
     parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="another one places the cameras differently (default 0)"
+        "--views", type=int, metavar="N", help="training views, of room and human times (default 48, of human 12)"
+    )
+    parser.add_argument("--cameras", type=int, metavar="N", help="training cameras of room and human (default 8)")
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="places the cameras, of human colours the clothes (default 0)"
     )
     parser.set_defaults(run=run_synth)
 
@@ -98,23 +123,56 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def run_motion(arguments: argparse.Namespace) -> int:
+    """Convert the motion and say what it is."""
+    from dyngs.human.body import default_body
+    from dyngs.human.body_files import load_body
+    from dyngs.human.motion import read_motion, save_motion
+
+    out: Path = arguments.out
+    if out.exists():
+        raise DyngsError(f"{out} exists already; name a new file for the motion")
+    if out.suffix.lower() != ".npz":
+        raise DyngsError(f"cannot write {out}: a motion is written as .npz")
+    body = default_body() if arguments.body is None else load_body(arguments.body)
+    motion = read_motion(arguments.file, body, arguments.fps, arguments.up, arguments.clip)
+    save_motion(motion, out)
+    print(f"written: {out}\n         {_summary(motion)}")
+    return 0
+
+
+def _summary(motion: Motion) -> str:
+    """Frames, seconds, how many joints change their angle, and how fast the root gets."""
+    count, joints = motion.poses.shape[:2]
+    turning = int(((motion.poses - motion.poses[:1]).norm(dim=-1).amax(0) > 1e-3).sum())
+    speeds = motion.trans.diff(dim=0).norm(dim=-1) * motion.fps
+    speed = speeds.max().item() if count > 1 else 0.0
+    length = f"{count} frame{'s' * (count != 1)}, {(count - 1) / motion.fps:.2f} s at {motion.fps:g} frames per second"
+    return f"{length}; {turning} of {joints} joints turn, the root moves at up to {speed:.2f} m/s"
+
+
 def run_synth(arguments: argparse.Namespace) -> int:
     """Write the capture and say how to train on it."""
     from dyngs.data import synthetic
 
     out: Path = arguments.out
-    if arguments.size < 1 or arguments.views < 1 or arguments.seed < 0:
+    scene, size, seed = arguments.scene, arguments.size, arguments.seed
+    views = (12 if scene == "human" else 48) if arguments.views is None else arguments.views
+    if size < 1 or views < 1 or seed < 0:
         raise DyngsError("--size and --views must be at least 1, --seed at least 0")
-    if arguments.cameras is not None and (arguments.scene != "room" or arguments.cameras < 1):
-        raise DyngsError("--cameras must be at least 1, and is for the scene room only")
+    if arguments.cameras is not None and (scene not in ("room", "human") or arguments.cameras < 1):
+        raise DyngsError("--cameras must be at least 1, and is for the scenes room and human only")
+    cameras = 8 if arguments.cameras is None else arguments.cameras
     synthetic.require_new_folder(out)
-    size, seed = arguments.size, arguments.seed
-    if arguments.scene == "still":
-        synthetic.write_still_capture(out, synthetic.StillOptions(size=size, num_train=arguments.views, seed=seed))
+    if scene == "human":
+        from dyngs.human.synthetic import HumanOptions, write_human_capture
+
+        write_human_capture(out, HumanOptions(size=size, num_frames=views, num_cameras=cameras, seed=seed))
+    elif scene == "still":
+        synthetic.write_still_capture(out, synthetic.StillOptions(size=size, num_train=views, seed=seed))
     else:
-        cameras = 8 if arguments.cameras is None else arguments.cameras
-        options = synthetic.DynamicOptions(size=size, num_times=arguments.views, num_cameras=cameras, seed=seed)
-        synthetic.write_dynamic_capture(arguments.scene, out, options)
-    preset = "static" if arguments.scene == "still" else "dynamic"
+        options = synthetic.DynamicOptions(size=size, num_times=views, num_cameras=cameras, seed=seed)
+        synthetic.write_dynamic_capture(scene, out, options)
+    preset = {"still": "static", "human": "human"}.get(scene, "dynamic")
     print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={out}")
     return 0

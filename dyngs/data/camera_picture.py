@@ -13,13 +13,13 @@ from dyngs.data.write import write_image
 from dyngs.errors import DyngsError
 
 PAPER = np.array([24, 26, 30], np.uint8)
-SPLIT_COLORS = {"train": (255, 170, 60), "val": (120, 230, 120), "test": (80, 190, 255)}
+SPLIT_COLORS = {"train": (255, 170, 60), "val": (120, 230, 120), "test": (80, 190, 255), "pose": (80, 190, 255)}
 
 
 def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
     """Write a picture, 2 ``size`` x ``size``: the scene from above and from the side, orthographic.
 
-    Frusta of training cameras are orange, of validation green, of test blue; points have their colours. Up is the
+    Frusta of training cameras are orange, of validation green, of test and new poses blue; points have their colours. Up is the
     cameras' mean up. Points far beyond the cameras are left out; views whose pose is not rigid too.
 
     Raises:

@@ -1,0 +1,154 @@
+"""``dyngs data motion`` and ``dyngs data synth human`` as a user calls them; the other commands are in other tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+import torch
+from motion_files import Clip, as_local, glb_of, pelvis_path, random_motion, skeleton, tiny_body
+
+from dyngs.cli import data, main
+from dyngs.config import DataConfig
+from dyngs.data.read import read_capture
+from dyngs.human import body as body_module
+from dyngs.human.body_files import load_body
+from dyngs.human.motion import Motion, read_motion, save_motion
+
+PrintedOutput = pytest.CaptureFixture[str]
+
+TEMPLATE = Path(body_module.__file__).parent / "templates" / "anny_smplx55.npz"
+
+
+def known_motion() -> Motion:
+    """3 frames at 2 per second: two joints turn, a third stays turned; the root moves by 0.5 m, then by 0.1 m."""
+    poses = torch.zeros(3, 55, 3)
+    poses[:, 16, 2] = torch.tensor([0.0, 0.2, 0.4])
+    poses[1, 15, 0] = 0.1
+    poses[:, 17, 1] = 0.3
+    trans = torch.tensor([[0.0, 1.0, 0.0], [0.3, 1.4, 0.0], [0.3, 1.4, 0.1]])
+    return Motion(poses, trans, torch.zeros(10), 2.0, torch.ones(3))
+
+
+def test_a_motion_is_converted_and_summed_up(tmp_path: Path, capsys: PrintedOutput) -> None:
+    save_motion(known_motion(), tmp_path / "in.npz")
+    out = tmp_path / "new" / "out.npz"
+    assert main(["data", "motion", str(tmp_path / "in.npz"), str(out)]) == 0
+    printed = capsys.readouterr().out
+    for part in (str(out), "3 frames, 1.00 s at 2 frames per second", "2 of 55 joints", "up to 1.00 m/s"):
+        assert part in printed
+    assert out.read_bytes() == (tmp_path / "in.npz").read_bytes(), "what is of the template already stays as it is"
+
+
+def test_one_frame_has_no_speed(tmp_path: Path, capsys: PrintedOutput) -> None:
+    save_motion(random_motion(1), tmp_path / "in.npz")
+    assert main(["data", "motion", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 0
+    text = "1 frame, 0.00 s at 30 frames per second; 0 of 55 joints turn, the root moves at up to 0.00 m/s"
+    assert text in capsys.readouterr().out
+
+
+def test_frames_per_second_and_the_up_axis_are_passed_on(tmp_path: Path, capsys: PrintedOutput) -> None:
+    """Five frames of three; what moved along the file's z moves along y, what moved along y away from z."""
+    save_motion(known_motion(), tmp_path / "in.npz")
+    words = ["--up", "z", "--fps", "4"]
+    assert main(["data", "motion", str(tmp_path / "in.npz"), str(tmp_path / "out.npz"), *words]) == 0
+    assert "5 frames, 1.00 s at 4 frames" in capsys.readouterr().out
+    found = read_motion(tmp_path / "out.npz").trans
+    np.testing.assert_allclose(found[2] - found[0], [0.3, 0.0, -0.4], atol=1e-6)
+    np.testing.assert_allclose(found[4] - found[2], [0.0, 0.1, 0.0], atol=1e-6)
+
+
+def test_the_clip_and_the_body_are_passed_on(tmp_path: Path) -> None:
+    """A body of half the size, and one of two animations."""
+    own, motion = skeleton(), random_motion(3, angle=0.2)
+    glb = glb_of(own, Clip(as_local(motion, own), pelvis_path(tiny_body(), motion)))
+    first = glb.json["animations"][0]
+    glb.json["animations"] = [first | {"name": "walk"}, first | {"name": "still", "channels": first["channels"][:1]}]
+    clip = glb.write(tmp_path / "x.glb")
+    with np.load(TEMPLATE) as arrays:
+        small = {key: arrays[key] * (0.5 if key in ("v_template", "J") else 1) for key in arrays.files}
+    np.savez(tmp_path / "small.npz", **small)
+    for words, body, name in (
+        (["--clip", "walk"], None, "walk"),
+        (["--clip", "still"], None, "still"),
+        (["--clip", "walk", "--body", str(tmp_path / "small.npz")], load_body(tmp_path / "small.npz"), "walk"),
+    ):
+        out = tmp_path / f"{name}_{len(words)}.npz"
+        assert main(["data", "motion", str(clip), str(out), *words]) == 0
+        found, expected = read_motion(out), read_motion(clip, body, clip=name)
+        assert torch.equal(found.poses, expected.poses)
+        assert torch.equal(found.trans, expected.trans)
+    written = {path.read_bytes() for path in tmp_path.glob("*_*.npz")}
+    assert len(written) == 3, "no two of them alike"
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("in.npz used.npz", "used.npz exists already; name a new file"),
+        ("in.npz new.bvh", "new.bvh: a motion is written as .npz"),
+        ("nowhere.npz new.npz", "nowhere.npz: no such file"),
+        ("in.txt new.npz", "in.txt: unknown kind of motion"),
+        ("in.npz new.npz --clip walk", "do not ask for 'walk'"),
+        ("in.npz new.npz --fps 0", "0 frames per second"),
+        ("in.npz new.npz --fps nan", "nan frames per second"),
+        ("in.npz new.npz --fps fast", "invalid float value: 'fast'"),
+        ("in.npz new.npz --up x", "invalid choice: 'x'"),
+        ("in.npz new.npz --body nowhere.npz", "nowhere.npz"),
+        ("in.npz", "OUT.npz"),
+    ],
+)
+def test_motion_is_refused_in_one_line(
+    words: str, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: PrintedOutput
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_motion(known_motion(), Path("in.npz"))
+    Path("used.npz").write_text("keep")
+    assert main(["data", "motion", *words.split()]) != 0
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert part in lines[0]
+    assert Path("used.npz").read_text() == "keep"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.npz", "used.npz"]
+
+
+def test_motion_explains_itself(capsys: PrintedOutput) -> None:
+    assert main(["data", "motion", "--help"]) == 0
+    assert "usage: dyngs data motion" in capsys.readouterr().out
+
+
+def test_inspect_offers_every_format(capsys: PrintedOutput) -> None:
+    assert main(["data", "inspect", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert [name for name in get_args(DataConfig.model_fields["format"].annotation) if name not in text] == []
+
+
+def test_a_person_is_synthesised_and_inspected(tmp_path: Path, capsys: PrintedOutput) -> None:
+    out = tmp_path / "new"
+    words = ["--size", "12", "--views", "2", "--cameras", "3", "--seed", "4"]
+    assert main(["data", "synth", "human", str(out), *words]) == 0
+    assert f"dyngs train configs/human.yaml data.root={out}" in capsys.readouterr().out
+    capture = read_capture(DataConfig(root=out))  # type: ignore[call-arg]
+    assert {(view.frame, view.camera_id) for view in capture.splits["train"]} == {
+        (f, c) for f in (0, 1) for c in range(3)
+    }
+    assert {(view.width, view.height) for view in capture.splits["train"]} == {(12, 12)}
+    assert main(["data", "inspect", str(out), "--format", "body_json"]) == 0
+    assert "body_json" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "part"), [("--views 0", "--views"), ("--cameras 0", "--cameras"), ("--seed -1", "--seed")]
+)
+def test_a_person_is_refused_in_one_line(words: str, part: str, tmp_path: Path, capsys: PrintedOutput) -> None:
+    assert main(["data", "synth", "human", str(tmp_path / "new"), *words.split()]) != 0
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert part in lines[0]
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_scene_is_listed() -> None:
+    assert "human" in data.SYNTHETIC_SCENES
