@@ -19,8 +19,8 @@ SPLIT_COLORS = {"train": (255, 170, 60), "val": (120, 230, 120), "test": (80, 19
 def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
     """Write a picture, 2 ``size`` x ``size``: the scene from above and from the side, orthographic.
 
-    Frusta of training cameras are orange, of validation green, of test and new poses blue; points have their colours. Up is the
-    cameras' mean up. Points far beyond the cameras are left out; views whose pose is not rigid too.
+    Frusta of training cameras are orange, of validation green, of test and new poses blue; points have their colours.
+    Up is the cameras' mean up. Points far beyond the cameras are left out; views whose pose is not rigid too.
 
     Raises:
         DyngsError: no view has a usable pose, or the file cannot be written.
