@@ -100,6 +100,7 @@ def demo_config(capture: Path, run_dir: Path, options: DemoOptions) -> Config:
         f"init.num_random={options.num_points}",
         f"model.seeds={options.num_points // 3}",
         f"train.steps={options.steps}",
+        "train.coarsest=2",  # the pictures are small
         "run.name=demo",
         f"run.threads={options.threads}",
     )
