@@ -175,6 +175,38 @@ class DynamicModel(SceneModel):
     time_jitter: float = Field(default=0.0, ge=0, description="of the step between times, annealed; 0.1 suits videos")
 
 
+class HumanModel(SceneModel):
+    """A person: Gaussians on the texels of a body template, moved by its skeleton (docs/human.md)."""
+
+    kind: Literal["human"] = "human"
+    body: Path | None = Field(default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template")
+    uv: Path | None = Field(default=None, description=".obj with the texture coordinates of the body")
+    resolution: int = Field(default=128, ge=8, le=1024, description="texels per side of the atlas")
+    heights: tuple[float, ...] = Field(
+        default=(0.0, 0.02), min_length=1, description="of the scaffolds above the skin, m"
+    )
+    carve: Fraction = Field(
+        default=0.9, description="share of the silhouettes that a scaffold above the skin must lie inside of"
+    )
+    refine: bool = Field(default=True, description="learn poses, skeleton and skinning weights together with the rest")
+    refine_from: Fraction = Field(default=0.1, description="share of the run after which that begins")
+    lr_poses: Positive = Field(default=1e-3, description="of the poses of single frames, rad")
+    lr_trans: Positive = Field(default=5e-4, description="of the places of single frames, m")
+    lr_turns: Positive = Field(default=1e-3, description="of what is added to the poses of all frames, rad")
+    lr_joints: Positive = Field(default=5e-4, description="of the joints at rest, m")
+    lr_log_scale: Positive = 2e-4
+    lr_weights: Positive = Field(default=5e-3, description="of the logarithms of skinning weights")
+    lr_decay: Fraction = Field(default=0.1, description="last over first rate of all these")
+    pose_offsets: bool = Field(default=False, description="learn offsets that depend on the turns of nearby joints")
+    lr_pose_offsets: Positive = Field(default=1e-4, description="m per unit of a rotation matrix")
+    pose_weight: float = Field(default=1e-4, ge=0, description="of the squared corrections of the fit")
+    weights_weight: float = Field(default=1e-3, ge=0, description="of the squared corrections of skinning weights")
+    offset_weight: float = Field(default=2e-4, ge=0, description="of squared distances from the scaffold, cm")
+    scale_weight: float = Field(default=1e-2, ge=0, description="of Gaussians that outgrow their texel")
+    rigidity: float = Field(default=1e-2, ge=0, description="of changed distances to five neighbours, cm")
+    smoothness: float = Field(default=1e-3, ge=0, description="of what the offsets of five neighbours differ, cm")
+
+
 class DefaultStrategy(Section):
     """Clone, split and prune by the gradient of the 2D means (3DGS, AbsGS as an option).
 
@@ -237,6 +269,7 @@ class TrainConfig(Section):
     sharpen_from: Fraction = Field(default=0.4, description="share of the run after which that is halved first")
     sharpen_to: Fraction = Field(default=0.7, description="share of the run after which it is halved last")
     ssim_weight: Fraction = 0.2
+    alpha_weight: float = Field(default=0.0, ge=0, description="of the error of opacity where pictures have alpha")
     sh_every: int = Field(default=1000, ge=1, description="steps (of 30,000) between SH degree increments")
     log_every: int = Field(default=10, ge=1)
     save_every: int = Field(default=0, ge=0, description="steps between checkpoints; 0 = only the last")
@@ -259,7 +292,7 @@ class Config(Section):
     """Everything that decides a run."""
 
     data: DataConfig
-    model: Annotated[StaticModel | DynamicModel, Field(discriminator="kind")] = StaticModel()
+    model: Annotated[StaticModel | DynamicModel | HumanModel, Field(discriminator="kind")] = StaticModel()
     init: Annotated[PointsInit | RandomInit, Field(discriminator="kind")] = PointsInit()
     strategy: Annotated[DefaultStrategy | McmcStrategy, Field(discriminator="kind")] = DefaultStrategy()
     optim: OptimConfig = OptimConfig()

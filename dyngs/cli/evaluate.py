@@ -48,6 +48,8 @@ def report_table(report: EvalReport) -> Table:
     table = Table("metric", "value", title=f"{report.num_views} views of the {report.split} split")
     table.add_row("PSNR", f"{report.psnr:.2f} dB")
     table.add_row("SSIM", f"{report.ssim:.4f}")
+    if report.psnr_person is not None and report.ssim_person is not None:
+        table.add_row("in the person's box", f"{report.psnr_person:.2f} dB, SSIM {report.ssim_person:.4f}")
     for label, name, value in (
         ("FLIP", "flip", report.flip),
         (f"LPIPS ({report.lpips_net})", "lpips", report.lpips),

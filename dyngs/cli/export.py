@@ -19,6 +19,7 @@ examples:
   dyngs export runs/dance --time 0.5 --out middle.ply             one moment
   dyngs export runs/dance --times 0:1:30 --out frames             frame_0000.ply ... for players of sequences
   dyngs export runs/dance --static --out stage.ply                only what never moves
+  dyngs export runs/ann --motion walk.npz --out walk              a person (model.kind=human), one file per frame
   dyngs export runs/dance --format tracks --dynamic               where everything that moves is, as .npz
 """
 
@@ -41,6 +42,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     when = parser.add_mutually_exclusive_group()
     when.add_argument("--time", type=moment, metavar="T", help="this moment, from 0 to 1 (default 0)")
     when.add_argument("--times", metavar="A:B:N", help="N moments from A to B (tracks: default those of training)")
+    parser.add_argument(
+        "--motion", type=Path, metavar="FILE", help="what the person of a run does: AMASS .npz, .bvh, .glb or .gltf"
+    )
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--static", action="store_true", help="only the Gaussians that never move")
     part.add_argument("--dynamic", action="store_true", help="only the Gaussians that move")
@@ -55,6 +59,11 @@ def run(arguments: argparse.Namespace) -> int:
         raise DyngsError("--static goes with --format ply; what never moves has no tracks")
     times = _times(arguments)
     loaded = load_run(arguments.run_dir)
+    if arguments.motion is not None:
+        from dyngs.train.playing import playing_motion
+
+        loaded = playing_motion(loaded, arguments.motion).run
+        times = loaded.scene.times if times is None else times
     if loaded.scene.is_still and times is not None:
         say(("nothing moves in this run: it is the same at all times",))
     write = _export_tracks if arguments.format == "tracks" else _export_ply
@@ -84,15 +93,16 @@ def _export_ply(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[f
     part: Part = "still" if arguments.static else "moving" if arguments.dynamic else "all"
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
-    if arguments.times is None or arguments.static:
-        if out is not None and out.suffix.lower() != ".ply" and (out.is_dir() or arguments.times is not None):
+    is_sequence = arguments.times is not None or (arguments.motion is not None and arguments.time is None)
+    if not is_sequence or arguments.static:
+        if out is not None and out.suffix.lower() != ".ply" and (out.is_dir() or is_sequence):
             out = out / f"{stem}.ply"
         if times is None and not arguments.static and not loaded.scene.is_still:
             say(("this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence",))
         time = 0.0 if times is None else times[0]
         return [write_moment(loaded, out or arguments.run_dir / f"{stem}.ply", time, part)]
     if out is not None and out.suffix.lower() == ".ply":
-        raise DyngsError(f"{out}: --times writes a folder of files; give --out DIR, or --time for one file")
+        raise DyngsError(f"{out}: a sequence is a folder of files; give --out DIR, or --time for one file")
     return write_moments(loaded, out or arguments.run_dir / stem, times or (), part)
 
 

@@ -20,6 +20,8 @@ examples:
   dyngs render runs/bench --out frames --path orbit --video orbit.mp4
   dyngs render runs/dance --path orbit --time 0.5 --video frozen.mp4       the camera moves, the scene does not
   dyngs render runs/dance --times 0:1:60 --view 3 --video standing.mp4     the scene moves, the camera does not
+  dyngs render runs/ann --motion walk.npz --video walk.mp4                 a person (model.kind=human) walks
+  dyngs render runs/ann --pose rest --path orbit --video rest.mp4          the same person in the template's pose
   dyngs render splats.ply --path spiral --video spiral.mp4 --up=-y --size 1280x720
 """
 
@@ -46,6 +48,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--view", metavar="NAME|N", help="whose camera stands still where there is no --path (default: the first view)"
     )
+    whom = parser.add_mutually_exclusive_group()
+    whom.add_argument(
+        "--motion", type=Path, metavar="FILE", help="what the person of a run does: AMASS .npz, .bvh, .glb or .gltf"
+    )
+    whom.add_argument("--pose", choices=("rest",), help="the person of a run in the pose of the template")
     parser.add_argument("--video", type=Path, metavar="FILE.mp4", help="write a video too")
     parser.add_argument("--frames", type=_count, metavar="N", help="of orbit and spiral (default 120)")
     parser.add_argument("--fps", type=float, metavar="F", help="of the video (default 30, or what the .json says)")
@@ -97,7 +104,7 @@ def _checked(arguments: argparse.Namespace) -> argparse.Namespace:
 
 def _stands_still(arguments: argparse.Namespace) -> bool:
     """One camera is asked for, at one or many times."""
-    given = (arguments.time, arguments.times, arguments.view)
+    given = (arguments.time, arguments.times, arguments.view, arguments.motion, arguments.pose)
     return not arguments.path and any(x is not None for x in given)
 
 
@@ -131,10 +138,10 @@ def _render_shot(arguments: argparse.Namespace) -> list[Path]:
 def _shot(arguments: argparse.Namespace) -> Shot:
     """What the arguments ask for."""
     from dyngs.view.paths import parse_times
-    from dyngs.view.shots import DEFAULT_FRAMES, ShotOptions, shot_of_ply, shot_of_run
+    from dyngs.view.shots import ShotOptions, shot_of_ply, shot_of_run
 
     times = None if arguments.time is None else (arguments.time,)
-    num_frames = arguments.frames or DEFAULT_FRAMES
+    num_frames = arguments.frames
     if arguments.times is not None:
         times = parse_times(arguments.times)
         num_frames = len(times)
@@ -148,6 +155,8 @@ def _shot(arguments: argparse.Namespace) -> Shot:
         times=times,
         view=arguments.view,
         split=arguments.split,
+        motion=arguments.motion,
+        at_rest=arguments.pose == "rest",
     )
     return shot_of_ply(arguments.source, options) if is_file else shot_of_run(arguments.source, options)
 

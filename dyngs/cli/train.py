@@ -18,7 +18,8 @@ examples:
   dyngs train configs/static.yaml data.root=scans/bench train.steps=30000 run.dir=runs/bench run.threads=8
   dyngs train --resume runs/bench
 
-CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip.
+CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip, dynamic,
+human.
 All keys are listed in docs/cli.md; a wrong one is answered with what is allowed.
 """
 

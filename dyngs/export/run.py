@@ -9,10 +9,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
-from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.export.ply import write_ply
 from dyngs.train.checkpoint import LoadedRun, load_run
+from dyngs.train.scene import Scene
 
 Part = Literal["all", "moving", "still"]
 
@@ -83,7 +83,7 @@ def frame_names(count: int) -> list[str]:
     return [f"frame_{i:0{digits}d}.ply" for i in range(count)]
 
 
-def scene_part(scene: TrainedScene, part: Part) -> TrainedScene:
+def scene_part(scene: Scene, part: Part) -> Scene:
     """The part of a scene. Raises DyngsError where there is none."""
     if part == "all":
         return scene
@@ -94,7 +94,7 @@ def scene_part(scene: TrainedScene, part: Part) -> TrainedScene:
     return found
 
 
-def _write(run: LoadedRun, scene: TrainedScene, path: Path, time: float) -> Path:
+def _write(run: LoadedRun, scene: Scene, path: Path, time: float) -> Path:
     model = run.config.model
     comments = [f"step: {run.step}"] if scene.is_still else [f"step: {run.step}", f"dyngs time {time!r}"]
     return write_ply(

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from dyngs.data.write import whole_file
-from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.export.run import scene_part
+from dyngs.train.scene import Scene
 
 MAX_BYTES = 4_000_000_000
 """Of the positions, which are held in memory before they are written."""
@@ -37,7 +37,7 @@ class Tracks:
 
 
 def tracks_of(
-    scene: TrainedScene, times: Sequence[float], world_offset: Sequence[float] = (0.0, 0.0, 0.0), *, part: str = "all"
+    scene: Scene, times: Sequence[float], world_offset: Sequence[float] = (0.0, 0.0, 0.0), *, part: str = "all"
 ) -> Tracks:
     """The tracks of a scene.
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import Config, DataConfig, DynamicModel, McmcStrategy
+from dyngs.config import Config, DataConfig, DynamicModel, HumanModel, McmcStrategy
 from dyngs.data.capture import Capture, View
 from dyngs.data.images import target_size
 from dyngs.data.intrinsics import scaled_intrinsics
@@ -17,7 +17,13 @@ from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.deform.model import DynamicScene, Surroundings4D
 from dyngs.deform.residual import residual_scores
+from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.human.avatar import Skeleton, first_gaussians
+from dyngs.human.clips import footage
+from dyngs.human.model import HumanScene, Subject, first_look
+from dyngs.human.person import rest_shape, template
+from dyngs.human.uv import texels_of
 from dyngs.rendering import RenderOptions
 from dyngs.static.densify import DefaultDensifier, Densifier
 from dyngs.static.init import StartValues, Surroundings, initial_gaussians
@@ -50,13 +56,17 @@ def assemble(config: Config) -> Trainer:
     scene = surroundings(capture)
     generator = torch.Generator().manual_seed(config.run.seed)
     start = StartValues.for_strategy(config.strategy)
-    gaussians = initial_gaussians(scene, config.init, start, config.model.sh_degree, generator)
-    background = resolved_background(config, capture)
     pictures = PictureLoader(capture.splits["train"], config.data)
+    if isinstance(config.model, HumanModel):
+        gaussians, model = human_model(config, capture, pictures)
+    else:
+        gaussians = initial_gaussians(scene, config.init, start, config.model.sh_degree, generator)
+        model = _model(config, capture, pictures, scene.extent, generator)
+    background = resolved_background(config, capture)
     x, y, z = (float(value) for value in capture.world_offset)
     return Trainer(
         config=config,
-        model=_model(config, capture, pictures, scene.extent, generator),
+        model=model,
         optimizer=GaussianOptimizer(gaussians, config.optim),
         densifier=_densifier(config, background, scene.extent),
         pictures=pictures,
@@ -68,6 +78,27 @@ def assemble(config: Config) -> Trainer:
         has_test_views=bool(capture.splits.get("test")),
         generator=generator,
     )
+
+
+def human_model(config: Config, capture: Capture, pictures: PictureLoader) -> tuple[Gaussians, HumanScene]:
+    """The first Gaussians of a person, and the model that poses them.
+
+    Raises:
+        DyngsError: a capture without body parameters, or a template that cannot be read.
+    """
+    model = config.model
+    if not isinstance(model, HumanModel) or capture.body is None:
+        raise DyngsError(f"{capture.root}: has no body parameters, which model.kind=human needs; see docs/human.md")
+    if model.sh_degree > 1:
+        raise DyngsError(f"model.sh_degree={model.sh_degree}: colours of a person turn with it up to 1; give 0 or 1")
+    given, body = capture.body["train"], template(model)
+    vertices, joints = rest_shape(body, torch.from_numpy(given.betas).float())
+    texels = texels_of(body, model.resolution, vertices)
+    gaussians, anchors = first_gaussians(texels, sorted(set(model.heights)), model.sh_degree)
+    filmed = footage(capture.root, given, capture.splits["train"], joints)
+    subject = Subject(Skeleton(joints, body.parents), anchors, filmed)
+    gaussians, subject = first_look(gaussians, texels, subject, _spread(pictures, 1), model.carve)
+    return gaussians, HumanScene(model, subject, config.train.steps)
 
 
 def surroundings(capture: Capture) -> Surroundings:

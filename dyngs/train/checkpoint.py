@@ -17,12 +17,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dyngs.config import Config, SceneModel
+from dyngs.config import Config, HumanModel, SceneModel
 from dyngs.config_io import load_resolved
 from dyngs.data.write import whole_file, write_text
-from dyngs.deform.trained import TrainedScene, trained_scene
+from dyngs.deform.trained import trained_scene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.human.trained import trained_avatar
+from dyngs.train.scene import Scene
 
 FORMAT_VERSION = 1
 KEEP_CHECKPOINTS = 2
@@ -72,7 +74,7 @@ class LoadedRun:
     """
 
     config: Config
-    scene: TrainedScene
+    scene: Scene
     step: int
     seconds_train: float
     info: CheckpointInfo
@@ -154,12 +156,17 @@ def load_run(run_dir: Path) -> LoadedRun:
     return LoadedRun(config, scene, step, seconds_at(run_dir, step), checkpoint.info)
 
 
-def stored_scene(checkpoint: Checkpoint, model: SceneModel) -> TrainedScene:
+def stored_scene(checkpoint: Checkpoint, model: SceneModel) -> Scene:
     """The scene of a checkpoint of ``model``."""
     part = checkpoint.part("gaussians")
     try:
         gaussians = Gaussians(**{name: part[name] for name in _FIELDS})
-        return trained_scene(gaussians, checkpoint.part("model"), model)
+        state = checkpoint.part("model")
+        return (
+            trained_avatar(gaussians, state)
+            if isinstance(model, HumanModel)
+            else trained_scene(gaussians, state, model)
+        )
     except KeyError as missing:
         raise DyngsError(f"the checkpoint of step {checkpoint.info.step} lacks {missing}") from None
 

@@ -10,21 +10,24 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import fmean, median
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from dyngs.config import DynamicModel, SceneModel
-from dyngs.data.capture import Capture, View
+from dyngs.data.capture import Capture, Split, View
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.write import write_text
-from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
+from dyngs.human.clips import footage, same_clip
+from dyngs.human.trained import AvatarScene
 from dyngs.rendering import RenderOptions, render
 from dyngs.train.background import evaluation_background
 from dyngs.train.checkpoint import LoadedRun, load_run
 from dyngs.train.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
+from dyngs.train.scene import Scene
 from dyngs.train.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
 
 
@@ -32,7 +35,8 @@ from dyngs.train.temporal import Drawing, TimeScore, flicker_error, flicker_of_s
 class ViewScore:
     """Metrics of one view; None where a metric cannot be had (``EvalReport.reasons`` says why).
 
-    ``render_seconds`` holds ``deform_seconds``; ``time`` is None for a still capture.
+    ``render_seconds`` holds ``deform_seconds``; ``time`` is None for a still capture. ``psnr_person`` and
+    ``ssim_person`` are those inside the person's box.
     """
 
     name: str
@@ -45,6 +49,8 @@ class ViewScore:
     render_seconds: float
     deform_seconds: float
     time: float | None = None
+    psnr_person: float | None = None
+    ssim_person: float | None = None
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,8 @@ class EvalReport:
         reasons: metric name to why it is None.
         notes: anything else that a reader of the numbers should know.
         per_view: the single views.
+        psnr_person, ssim_person: means inside the box around the person, where the true picture is not transparent;
+            only of a human model, and None where pictures have no alpha.
     """
 
     split: str
@@ -98,6 +106,8 @@ class EvalReport:
     reasons: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     per_view: tuple[ViewScore, ...] = ()
+    psnr_person: float | None = None
+    ssim_person: float | None = None
 
     def to_json(self) -> str:
         """The report as strict JSON (no NaN or Infinity), ending in a newline."""
@@ -120,12 +130,13 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
     capture = read_capture(run.config.data)
     views = split_views(capture, split)
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
-    drawing = Drawing(run.scene, render_options(run.config.model), colour)
+    scene = scene_of_split(run, capture, split)
+    drawing = Drawing(scene, render_options(run.config.model), colour)
     lpips = load_lpips(lpips_net)
     with _num_threads(threads):
         loader = PictureLoader(views, run.config.data)
         pictures = (loader[i] for i in range(len(loader)))
-        scores, reasons = score_views(run.scene, pictures, drawing.options, colour, lpips)
+        scores, reasons = score_views(scene, pictures, drawing.options, colour, lpips)
         temporal = {
             "flicker": flicker_of_split(drawing, loader, views),
             "flicker_error": flicker_error(drawing, loader, views),
@@ -142,11 +153,11 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
         flip=_mean([s.flip for s in scores]),
         lpips=_mean([s.lpips for s in scores]),
         lpips_net=lpips_net,
-        num_gaussians=len(run.scene),
-        num_moving=0 if run.scene.is_still else len(run.scene.rows),
-        moving_share=run.scene.moving_share,
-        model_mb=parameter_megabytes(run.scene),
-        field_mb=4e-6 * run.scene.num_field_values,
+        num_gaussians=len(scene),
+        num_moving=0 if scene.is_still else len(scene.rows),
+        moving_share=scene.moving_share,
+        model_mb=parameter_megabytes(scene),
+        field_mb=4e-6 * scene.num_field_values,
         fps=1 / median(s.render_seconds for s in scores),
         deform_share=median(s.deform_seconds / s.render_seconds for s in scores),
         seconds_train=run.seconds_train,
@@ -157,6 +168,8 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
         reasons=reasons,
         notes=_notes(run, scores),
         per_view=tuple(scores),
+        psnr_person=_mean([s.psnr_person for s in scores]),
+        ssim_person=_mean([s.ssim_person for s in scores]),
     )
     write_text(report_path(run_dir, split), report.to_json())
     return report
@@ -168,7 +181,7 @@ def report_path(run_dir: Path, split: str) -> Path:
 
 
 def score_views(
-    scene: TrainedScene, pictures: Iterable[Picture], options: RenderOptions, background: Tensor, lpips: Lpips
+    scene: Scene, pictures: Iterable[Picture], options: RenderOptions, background: Tensor, lpips: Lpips
 ) -> tuple[list[ViewScore], dict[str, str]]:
     """Scores of the Gaussians against pictures, and the reasons for metrics that are None.
 
@@ -191,6 +204,7 @@ def score_views(
         if not rendered.isfinite().all():
             raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
         truth, mask = picture.composite(background), picture.mask
+        box = person_box(picture) if isinstance(scene, AvatarScene) else None
         optional = {"flip": flip(rendered, truth, mask), "lpips": lpips(rendered, truth, mask)}
         for name, metric in optional.items():
             if metric.reason is not None:
@@ -206,10 +220,21 @@ def score_views(
             render_seconds=seconds,
             deform_seconds=deform_seconds,
             time=picture.time,
+            psnr_person=None if box is None else psnr(rendered[box], truth[box], None if mask is None else mask[box]),
+            ssim_person=None if box is None else ssim(rendered[box], truth[box], None if mask is None else mask[box]),
         )
         _require_finite(score, mask)
         scores.append(score)
     return scores, reasons
+
+
+def person_box(picture: Picture) -> tuple[slice, slice] | None:
+    """Rows and columns of the smallest box around what is not transparent; None without alpha or where nothing is."""
+    if picture.alpha is None or not bool((picture.alpha > 0).any()):
+        return None
+    shown = picture.alpha > 0
+    rows, columns = (torch.nonzero(shown.any(axis))[:, 0] for axis in (1, 0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
 def split_views(capture: Capture, split: str) -> Sequence[View]:
@@ -222,18 +247,32 @@ def split_views(capture: Capture, split: str) -> Sequence[View]:
     raise DyngsError(f"{capture.root}: the split {split!r} has no views; there is {there or 'none'}")
 
 
+def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
+    """The scene of a run as the views of ``split`` show it: a person plays the clip of that split.
+
+    Frames that were trained on keep their refined poses; others have those of their files.
+    """
+    if not isinstance(run.scene, AvatarScene) or capture.body is None:
+        return run.scene
+    given, trained = capture.body[cast(Split, split)], capture.body["train"]
+    if same_clip(given, trained):
+        return run.scene
+    shown = footage(capture.root, given, split_views(capture, split), run.scene.given_joints)
+    return run.scene.playing(shown.clip)
+
+
 def render_options(model: SceneModel) -> RenderOptions:
     """How a trained model wants to be drawn."""
     return RenderOptions(near=model.near, eps2d=model.eps2d, mode=model.rasterize_mode)
 
 
-def parameter_megabytes(scene: TrainedScene) -> float:
+def parameter_megabytes(scene: Scene) -> float:
     """Size in MB (1e6 bytes) as float32: 236 bytes per Gaussian at SH degree 3, and the field where something moves."""
     return 4e-6 * (sum(x.numel() for x in scene.gaussians.tensors().values()) + scene.num_field_values)
 
 
 def _timed_render(
-    scene: TrainedScene, picture: Picture, options: RenderOptions, background: Tensor
+    scene: Scene, picture: Picture, options: RenderOptions, background: Tensor
 ) -> tuple[Tensor, float, float]:
     """(H, W, 3) rendered picture, the seconds that it took, and those of them that the deformation took."""
     with torch.no_grad():

@@ -22,9 +22,6 @@ from dyngs.train.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.train.sampler import ViewSampler
 from dyngs.train.schedule import active_sh_degree, means_rate, picture_divisor
 
-COARSE_DAMPING = 1.5
-"""Power of a picture's divisor by which gradients that make Gaussians multiply are divided."""
-
 
 class Model(Protocol):
     """What turns the parameters stored per Gaussian into the Gaussians of a picture."""
@@ -123,13 +120,15 @@ class Trainer:
         rendering = render(drawn.gaussians, picture.cameras, options, background=background, probe=probe)
         rendered, truth = rendering.rgb[0], picture.composite(background)
         terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
+        if config.train.alpha_weight > 0 and picture.alpha is not None:
+            terms["alpha"] = config.train.alpha_weight * (rendering.alpha[0] - picture.alpha).abs().mean()
         terms |= drawn.penalties | self.densifier.regularizers(parameters)
         loss = _finite_sum(terms, step, picture)
         sum(terms.values(), torch.zeros(())).backward()
         if probe is not None and probe.grad is not None:
             size = (picture.cameras.width, picture.cameras.height)
             # Fewer Gaussians suit small pictures: a gradient counts for less there.
-            self.densifier.after_backward(step, probe.grad / divisor**COARSE_DAMPING, rendering.radii, size)
+            self.densifier.after_backward(step, probe.grad / divisor, rendering.radii, size)
         self._update(step)
         return StepReport(step, loss, picture, rendered.detach(), truth)
 

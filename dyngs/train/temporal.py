@@ -19,10 +19,10 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Picture, PictureLoader
-from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.rendering import RenderOptions, render
 from dyngs.train.metrics import MetricValue
+from dyngs.train.scene import Scene
 
 MAX_MOMENTS = 60
 """Up to so many training times, flicker is measured at all of them."""
@@ -50,7 +50,7 @@ class Drawing:
         background: (3,) colour.
     """
 
-    scene: TrainedScene
+    scene: Scene
     options: RenderOptions
     background: Tensor
 

@@ -15,14 +15,14 @@ from dyngs.camera import Cameras
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.write import to_uint8, write_image
-from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.export.ply import SplatFile
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, render
 from dyngs.train.checkpoint import load_run
-from dyngs.train.evaluate import evaluation_background, render_options, split_views
+from dyngs.train.evaluate import evaluation_background, render_options, scene_of_split, split_views
 from dyngs.train.metrics import psnr
+from dyngs.train.scene import Scene
 from dyngs.view.paths import CameraPath
 from dyngs.view.sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
 from dyngs.view.video import VideoWriter
@@ -76,7 +76,7 @@ class Shot:
         notes: lines for people, about what was chosen for them.
     """
 
-    scene: TrainedScene
+    scene: Scene
     path: CameraPath
     options: RenderOptions = DEFAULT_OPTIONS
     background: Tensor | None = None
@@ -161,12 +161,13 @@ def write_split(run_dir: Path, split: str, out_dir: Path, output: OutputOptions 
     loader = PictureLoader(views, run.config.data)
     _, background = evaluation_background(run.config.data.background, capture.has_alpha)
     options = _with_depth(render_options(run.config.model), output)
+    scene = scene_of_split(run, capture, split)
     shown = set(np.linspace(0, len(loader) - 1, min(len(loader), _SHEET_ROWS)).round().astype(int).tolist())
     rows: list[SheetRow] = []
     with _FrameWriter(out_dir, output) as writer:
         for i, stem in enumerate(file_stems([view.name for view in views])):
             picture = loader[i]
-            frame = render_frame(run.scene.at(picture.time), picture.cameras, options, background)
+            frame = render_frame(scene.at(picture.time), picture.cameras, options, background)
             writer.write(stem, frame)
             if i in shown:
                 truth = picture.composite(background)

@@ -17,7 +17,8 @@ from dyngs.errors import DyngsError
 from dyngs.export.ply import read_ply
 from dyngs.train.assemble import training_cameras
 from dyngs.train.checkpoint import LoadedRun, load_run
-from dyngs.train.evaluate import evaluation_background, render_options, split_views
+from dyngs.train.evaluate import evaluation_background, render_options, scene_of_split, split_views
+from dyngs.train.playing import at_rest, playing_motion
 from dyngs.view.frames import Shot, file_stems, splat_options
 from dyngs.view.paths import (
     CameraPath,
@@ -40,7 +41,7 @@ class ShotOptions:
 
     Attributes:
         path: "orbit", "spiral", a JSON file of cameras (docs/camera_paths.md), or None: one camera that stands still.
-        num_frames: of orbit and spiral.
+        num_frames: of orbit and spiral; None is as many as a motion has, else 120.
         size: width and height in pixels; None keeps that of the pictures, of the JSON, or 960x720 for a bare file.
         background: "white" or "black"; None is that of training, black for a bare file.
         up: axis of a bare file's world that points up, for instance "z" or "-y".
@@ -48,16 +49,20 @@ class ShotOptions:
             view for a camera that stands still, from 0 to 1 along a path.
         view: whose camera it is that stands still: a view's name, the name of its picture, or its number from 0.
         split: of that view; None is test, or val or train where there is none.
+        motion: file of the motion that the person of a run plays; None is that of training.
+        at_rest: the person is in the pose of the template.
     """
 
     path: str | None = "orbit"
-    num_frames: int = DEFAULT_FRAMES
+    num_frames: int | None = None
     size: tuple[int, int] | None = None
     background: str | None = None
     up: str = "z"
     times: tuple[float, ...] | None = None
     view: str | None = None
     split: str | None = None
+    motion: Path | None = None
+    at_rest: bool = False
 
 
 def shot_of_run(run_dir: Path, options: ShotOptions) -> Shot:
@@ -66,8 +71,15 @@ def shot_of_run(run_dir: Path, options: ShotOptions) -> Shot:
     Raises:
         DyngsError: no such run or view, its capture is gone, a broken path file, or times that do not fit its frames.
     """
-    run = load_run(run_dir)
+    run, fps = load_run(run_dir), None
+    if options.motion is not None:
+        played = playing_motion(run, options.motion)
+        run, fps = played.run, played.fps
+    elif options.at_rest:
+        run = at_rest(run)
     capture = read_capture(run.config.data)
+    if options.split is not None and options.motion is None and not options.at_rest:
+        run = replace(run, scene=scene_of_split(run, capture, options.split))
     _, background = evaluation_background(options.background or run.config.data.background, capture.has_alpha)
     path = _standing_path(run, capture, options) if options.path is None else _moving_path(run, capture, options)
     notes: tuple[str, ...] = ()
@@ -78,6 +90,8 @@ def shot_of_run(run_dir: Path, options: ShotOptions) -> Shot:
         notes = ("time runs from 0 to 1 along the path; --time or --times choose other moments",)
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
+    if fps is not None:
+        path = replace(path, fps=fps)
     return Shot(run.scene, path, render_options(run.config.model), background, notes)
 
 
@@ -89,6 +103,8 @@ def shot_of_ply(file: Path, options: ShotOptions) -> Shot:
     """
     if options.path is None or options.times is not None or options.view is not None:
         raise DyngsError(f"{file}: a .ply holds one moment and no views; leave out --time, --times and --view")
+    if options.motion is not None or options.at_rest:
+        raise DyngsError(f"{file}: a .ply has no skeleton; give the run of a person for --motion and --pose")
     splat = read_ply(file, nonfinite="skip")
     path_file = _path_file(options.path)
     if path_file is not None:
@@ -143,7 +159,8 @@ def _standing_path(run: LoadedRun, capture: Capture, options: ShotOptions) -> Ca
     """One camera of the capture at ``options.times``, or at its own time."""
     view = view_to_show(capture, options.view, options.split)
     (camera,) = training_cameras([view], run.config.data)
-    return frozen_path(camera, (view.time or 0.0,) if options.times is None else options.times)
+    times = run.scene.times if options.motion is not None else (view.time or 0.0,)
+    return frozen_path(camera, times if options.times is None else options.times)
 
 
 def _moving_path(run: LoadedRun, capture: Capture, options: ShotOptions) -> CameraPath:
@@ -154,7 +171,8 @@ def _moving_path(run: LoadedRun, capture: Capture, options: ShotOptions) -> Came
         found = read_path(file, capture.world_offset)
     else:
         place = orbit_path if path == "orbit" else spiral_path
-        found = CameraPath(place(cameras_for_paths(capture, run.config.data), options.num_frames))
+        frames = len(run.scene.times) if options.motion is not None else DEFAULT_FRAMES
+        found = CameraPath(place(cameras_for_paths(capture, run.config.data), options.num_frames or frames))
     if options.times is None:
         return found
     times = options.times * len(found) if len(options.times) == 1 else options.times
@@ -178,11 +196,11 @@ def _around_points(means: np.ndarray, options: ShotOptions) -> Cameras:
     up = (sign * axis[0], sign * axis[1], sign * axis[2])
     size = options.size or _DEFAULT_SIZE
     if options.path == "orbit":
-        return frame_orbit_for_points(means, options.num_frames, size, up)
+        return frame_orbit_for_points(means, options.num_frames or DEFAULT_FRAMES, size, up)
     ring = frame_orbit_for_points(means, 24, size, up)
     front = [-1, 0, 1]
     arc = replace(ring, cam_from_world=ring.cam_from_world[front], intrinsics=ring.intrinsics[front])
-    return spiral_path(arc, options.num_frames)
+    return spiral_path(arc, options.num_frames or DEFAULT_FRAMES)
 
 
 def _path_file(path: str) -> Path | None:

@@ -125,7 +125,9 @@ def test_report_of_a_run(tmp_path) -> None:
     stored = json.loads((run_dir / "metrics.json").read_text())
     assert stored == json.loads(report.to_json())
     keys = "split num_views width height background psnr ssim flip lpips lpips_net num_gaussians model_mb fps"
-    over_time = "num_moving moving_share field_mb deform_share flicker flicker_error psnr_per_time"
+    over_time = (
+        "num_moving moving_share field_mb deform_share flicker flicker_error psnr_per_time psnr_person ssim_person"
+    )
     rest = {"seconds_train", "step", "reasons", "notes", "per_view"}
     assert set(keys.split()) | set(over_time.split()) | rest == set(stored)
     facts = {"split": "test", "num_views": 3, "width": 16, "height": 16, "background": "white", "lpips_net": "alex"}
