@@ -395,7 +395,7 @@ def test_export_of_a_moving_run(moving_run: Path, tmp_path: Path, capsys: Captur
         export(*words)
         assert x_of(path) == pytest.approx(moved_x(still, 0.0).tolist())
     wrong = ["--times", "0:1:3", "--out", tmp_path / "a.ply"]
-    assert "--times writes a folder" in error_line(capsys, "export", moving_run, *wrong)
+    assert "a sequence is a folder of files" in error_line(capsys, "export", moving_run, *wrong)
 
 
 def test_export_of_tracks(moving_run: Path, tmp_path: Path, capsys: Capture) -> None:
