@@ -9,7 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from dyngs.config import Config
+from dyngs.config import Config, HumanModel, SceneModel
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -115,7 +115,7 @@ class Trainer:
         drawn = self.model.gaussians_at(parameters, picture, step)
         probe = torch.zeros(1, len(parameters), 4, requires_grad=True) if self.densifier.wants_signal(step) else None
         if self.model.num_moving(len(parameters)):
-            _require_finite(drawn.gaussians, step, picture)
+            _require_finite(drawn.gaussians, step, picture, config.model)
         options = replace(self.options, sh_degree=active_sh_degree(config.train, step, parameters.sh_degree))
         rendering = render(drawn.gaussians, picture.cameras, options, background=background, probe=probe)
         rendered, truth = rendering.rgb[0], picture.composite(background)
@@ -187,11 +187,12 @@ def _finite_sum(terms: dict[str, Tensor], step: int, picture: Picture) -> float:
     return sum(values.values())
 
 
-def _require_finite(gaussians: Gaussians, step: int, picture: Picture) -> None:
+def _require_finite(gaussians: Gaussians, step: int, picture: Picture, model: SceneModel) -> None:
     """A field may explode unseen, because Gaussians that are not finite are not drawn."""
     broken = [name for name, x in gaussians.tensors().items() if not bool(x.detach().isfinite().all())]
     if broken:
+        what, rates = ("pose", "model") if isinstance(model, HumanModel) else ("field", "model.deform")
         raise DyngsError(
-            f"step {step}, view {picture.name!r}: the field makes {', '.join(broken)} at {picture.time or 0:g} not "
-            "finite; lower the rates in model.deform"
+            f"step {step}, view {picture.name!r}: the {what} makes {', '.join(broken)} at {picture.time or 0:g} not "
+            f"finite; lower the rates in {rates}"
         )
