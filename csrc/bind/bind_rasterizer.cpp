@@ -231,7 +231,7 @@ void bind_blending(nb::module_& module) {
                expect(background, s.num_views * s.channels, "background"), expect(color, pixels * s.channels, "color");
                expect(transmittance, pixels, "transmittance"), expect(stop, pixels, "stop");
                expect(tally, s.num_views * s.num_gaussians, "tally");
-               if (tallied < 0 || tallied > 3 || tally.has_value() != (tallied > 0))
+               if (tallied < 0 || tallied > 4 || tally.has_value() != (tallied > 0))
                  throw nb::value_error("rasterize: a tally needs its array");
                const Image<S> image{color.data(), transmittance.data(), stop.data(), data_or_null(background),
                                     data_or_null(tally), static_cast<Tally>(tallied)};

@@ -103,6 +103,7 @@ enum class Tally {
   kWeights,  // alpha T: its share of the picture
   kPixels,   // pixels that it was blended into
   kLanes,    // pixels that were computed for it, blended or not
+  kSquaredSlopes,  // squares of d(sum of channels) / dG, G the 2D Gaussian's value at the pixel, before its opacity
 };
 
 template <class S>

@@ -1,5 +1,7 @@
 // Front-to-back blending of each tile's Gaussians. Pixel state (transmittance, colour) of one 4x4 block stays in
 // registers while the block's own list is walked.
+#include <numeric>
+
 #include "cpu/parallel.hpp"
 #include "cpu/tile.hpp"
 
@@ -10,6 +12,7 @@ template <class S, int D>
 struct BlockState {
   Packet<S> transmittance, threshold;
   Packet<S> color[D == kDynamic ? kMaxChannels : D];
+  Packet<S> behind;  // kSquaredSlopes: the light, over all channels, that reaches the pixel from here on
   int32_t stop[kLanes];
 };
 
@@ -41,14 +44,16 @@ void blend_block(const Splats<S>& s, const TileFrame<S>& frame, int block, int32
     const int i = scratch.list[k];
     const Record<S>& g = scratch.chunk.records[i];
     const P x = log2_alpha(g, g.x - px, g.y - py, lane);
-    const P alpha = select(x >= state.threshold, min_of(exp2_of(x), alpha_max), zero);
-    P weight = alpha * state.transmittance;
+    const Mask<S> drawn = x >= state.threshold;
+    const P alpha = select(drawn, min_of(exp2_of(x), alpha_max), zero);
+    const P before = state.transmittance;
+    P weight = alpha * before;
     P next = state.transmittance - weight;
     const Mask<S> full = (next < transmittance_min) & (alpha > zero);
     if (any(full)) [[unlikely]] {
       mark_full(full, chunk_begin + i, state);
       weight = select(full, zero, weight);
-      next = select(full, state.transmittance, next);
+      next = select(full, before, next);
     }
     state.transmittance = next;
     const S* color = scratch.chunk.template color<D>(i);
@@ -57,6 +62,16 @@ void blend_block(const Splats<S>& s, const TileFrame<S>& frame, int block, int32
     if constexpr (kTally == Tally::kPixels)
       scratch.sums[i] += static_cast<S>(__builtin_popcount(to_bits(weight > zero)));
     if constexpr (kTally == Tally::kLanes) scratch.sums[i] += static_cast<S>(kLanes);
+    if constexpr (kTally == Tally::kSquaredSlopes) {
+      // With s the colour, T the transmittance before it: behind = T (alpha s + (1 - alpha) B), dI/dalpha = T (s - B).
+      const S shade = std::accumulate(color, color + channels, S(0));
+      const P own = weight * P(shade);
+      const P slope = before * P(shade) - (state.behind - own) / (P(S(1)) - alpha);
+      const P scaled = P(std::exp2(g.log2_opacity)) * slope;
+      const Mask<S> free = drawn & !full & (alpha < alpha_max);  // the clamp stops the gradient
+      scratch.sums[i] += horizontal_sum(select(free, scaled * scaled, zero));
+      state.behind -= own;
+    }
   }
   block_state = state;
 }
@@ -80,6 +95,17 @@ bool any_open(const BlockState<S, D>& state) {
   return any(state.threshold < Packet<S>(std::numeric_limits<S>::infinity()));
 }
 
+// All channels of a block's finished pixels, added up.
+template <class S>
+Packet<S> light_of_block(const Splats<S>& s, const TileFrame<S>& frame, int block, const Image<S>& image) {
+  Packet<S> light(S(0));
+  for_each_pixel(s, frame, block, [&](int i, int64_t pixel) {
+    const S* color = image.color + pixel * s.channels;
+    light[i] = std::accumulate(color, color + s.channels, S(0));
+  });
+  return light;
+}
+
 template <class S, int D, Tally kTally>
 void blend_tile(const Splats<S>& s, const Entries& entries, const Image<S>& image, int64_t tile, S* slot_sums) {
   const TileFrame<S> frame = tile_frame(s, tile);
@@ -90,6 +116,7 @@ void blend_tile(const Splats<S>& s, const Entries& entries, const Image<S>& imag
     state[b].transmittance = Packet<S>(S(1));
     state[b].threshold = pixel_threshold(s, frame, b);
     std::fill(state[b].stop, state[b].stop + kLanes, std::numeric_limits<int32_t>::max());
+    if constexpr (kTally == Tally::kSquaredSlopes) state[b].behind = light_of_block(s, frame, b, image);
   }
   Scratch<S> scratch;
   uint32_t open = frame.inside;
@@ -147,6 +174,9 @@ void rasterize_forward(const Splats<S>& s, const Entries& entries, const Image<S
     case Tally::kWeights: return blend_with_tally<S, Tally::kWeights>(s, entries, image);
     case Tally::kPixels: return blend_with_tally<S, Tally::kPixels>(s, entries, image);
     case Tally::kLanes: return blend_with_tally<S, Tally::kLanes>(s, entries, image);
+    case Tally::kSquaredSlopes:
+      blend(s, entries, image);  // what lies behind a Gaussian is taken from the finished picture
+      return blend_with_tally<S, Tally::kSquaredSlopes>(s, entries, image);
     case Tally::kNone: return blend(s, entries, image);
   }
 }

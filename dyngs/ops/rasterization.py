@@ -290,6 +290,9 @@ class Tally(IntEnum):
     """pixels that it was blended into"""
     LANES = 3
     """pixels that were computed for it, blended or not"""
+    SQUARED_SLOPES = 4
+    """squares of the derivative of the picture, its channels added up, with respect to G, the value of the 2D Gaussian
+    there (Tu et al. 2026)"""
 
 
 def tally(
@@ -298,18 +301,23 @@ def tally(
     size: tuple[int, int],
     kind: Tally,
     options: BlendOptions = BlendOptions(),
+    *,
+    colors: Tensor | None = None,
+    background: Tensor | None = None,
 ) -> Tensor:
     """(V, N) sums over pixels of what ``kind`` says, for every Gaussian; not differentiable.
 
-    Other arguments as for ``rasterize``.
+    Other arguments as for ``rasterize``; colours and background matter to ``SQUARED_SLOPES`` only.
     """
     entries = bin_tiles(projection, opacities, size, options)
     shape = (opacities.shape[0], size[1], size[0])
-    colors = torch.zeros_like(opacities)[..., None]
+    colors = torch.zeros_like(opacities)[..., None] if colors is None else colors
     sums = torch.empty_like(opacities, memory_format=torch.contiguous_format)
-    image = (colors.new_empty(*shape, 1), colors.new_empty(shape), torch.empty(shape, dtype=torch.int32), sums)
+    color, transmittance = colors.new_empty(*shape, colors.shape[2]), colors.new_empty(shape)
+    image = (color, transmittance, torch.empty(shape, dtype=torch.int32), sums)
     splats = _arrays(projection.means2d, projection.factors, opacities, projection.radii)
     lists = tuple(array(x) for x in entries.tensors())
     settings = _settings(list(size), options.thresholds)
-    core.rasterize_forward(splats, array(colors), None, lists, settings, tuple(array(x) for x in image), int(kind))
+    behind = None if background is None else array(background)
+    core.rasterize_forward(splats, array(colors), behind, lists, settings, tuple(array(x) for x in image), int(kind))
     return sums

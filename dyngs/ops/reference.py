@@ -140,7 +140,36 @@ def rasterize(
     options: BlendOptions = BlendOptions(),
 ) -> Blended:
     """As ``dyngs.ops.rasterization.rasterize``, without probe: a loop over Gaussians, vectorised over pixels."""
-    width, height = size
+    raised = torch.zeros(*opacities.shape, size[1], size[0], dtype=colors.dtype)
+    return _rasterize(projection, opacities, colors, raised, background, options)
+
+
+def squared_slopes(
+    projection: Projection,
+    opacities: Tensor,
+    colors: Tensor,
+    size: tuple[int, int],
+    *,
+    background: Tensor | None = None,
+    options: BlendOptions = BlendOptions(),
+) -> Tensor:
+    """As ``dyngs.ops.rasterization.tally`` of ``SQUARED_SLOPES``: (V, N), from autograd pixel for pixel."""
+    raised = torch.zeros(*opacities.shape, size[1], size[0], dtype=colors.dtype, requires_grad=True)
+    picture = _rasterize(projection, opacities.detach(), colors.detach(), raised, background, options).color
+    (slopes,) = torch.autograd.grad(picture.sum(), raised)  # a pixel depends on its own values only
+    return slopes.square().sum((2, 3))
+
+
+def _rasterize(
+    projection: Projection,
+    opacities: Tensor,
+    colors: Tensor,
+    raised: Tensor,
+    background: Tensor | None,
+    options: BlendOptions,
+) -> Blended:
+    """As ``rasterize``, with ``raised`` (V, N, H, W) added to each 2D Gaussian's value in each pixel."""
+    height, width = raised.shape[2:]
     rows, columns = (torch.arange(n, dtype=colors.dtype) + 0.5 for n in (height, width))
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     pictures, remains = [], []
@@ -153,7 +182,7 @@ def rasterize(
             u_x, u_y, v_y = projection.factors[v, i]
             dx, dy = projection.means2d[v, i, 0] - x, projection.means2d[v, i, 1] - y
             power = -0.5 * ((u_x * dx + u_y * dy) ** 2 + (v_y * dy) ** 2)
-            alpha = (opacities[v, i] * power.exp()).clamp_max(options.alpha_max)
+            alpha = (opacities[v, i] * (power.exp() + raised[v, i])).clamp_max(options.alpha_max)
             alpha = torch.where((alpha >= options.alpha_min) & ~full, alpha, 0.0)
             after = transmittance * (1 - alpha)
             full = full | ((after < options.transmittance_min) & (alpha > 0))

@@ -128,7 +128,10 @@ def test_threads_do_not_matter(set_threads: Callable[[int], None]) -> None:
         set_threads(n)
         blended = draw(scene).blended
         sums = tally(*splats_of(scene), scene.size, Tally.WEIGHTS)
-        found.append([blended.color, blended.transmittance, sums, *gradients(scene).values()])
+        projection, opacities = splats_of(scene)
+        colors = projection.depths[..., None]
+        slopes = tally(projection, opacities, scene.size, Tally.SQUARED_SLOPES, colors=colors)
+        found.append([blended.color, blended.transmittance, sums, slopes, *gradients(scene).values()])
     for other in found[1:]:
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
@@ -245,6 +248,36 @@ def test_tally_of_pixels_counts_those_that_a_gaussian_was_blended_into() -> None
     lanes = tally(projection, opacities, scene.size, Tally.LANES)
     assert (lanes >= pixels).all()
     assert not (lanes % 16).any()  # whole 4x4 blocks
+
+
+@pytest.mark.parametrize("channels", [1, 3, 5])
+@pytest.mark.parametrize("exact", [True, False])
+def test_squared_slopes_equal_autograd_pixel_for_pixel(channels: int, exact: bool) -> None:
+    """Some pixels fill up, some alphas are clamped; 1e-10 because the light behind is what is left of a sum."""
+    scene = random_scene(n=30, views=2, seed=13)
+    scene = replace(scene, opacities=scene.opacities**0.2, scales=2 * scene.scales)
+    projection, opacities, colors, background = with_channels(scene, channels)
+    options = EXACT.blending if exact else USUAL.blending
+    for behind in (None, background):
+        found = tally(
+            projection, opacities, scene.size, Tally.SQUARED_SLOPES, options, colors=colors, background=behind
+        )
+        truth = reference.squared_slopes(projection, opacities, colors, scene.size, background=behind, options=options)
+        assert float(truth.median()) > 0
+        torch.testing.assert_close(found, truth, rtol=1e-10, atol=1e-10)
+
+
+def test_squared_slopes_in_float(isa: str) -> None:
+    """1e-4 of the largest, for differences of sums of colours, squared; for nearly all: a rounding error may let
+    a pixel count for a Gaussian or not.
+    """
+    scene = random_scene(n=200, seed=5).to(torch.float32)
+    found = []
+    for one in (scene, scene.to(torch.float64)):
+        projection, opacities, colors, behind = with_channels(one, 3)
+        found.append(tally(projection, opacities, one.size, Tally.SQUARED_SLOPES, colors=colors, background=behind))
+    error = (found[0] - found[1]).abs() / found[1].max()
+    assert float(error.quantile(0.98)) < 1e-4
 
 
 def test_order_of_the_gaussians_does_not_matter(scene: Scene) -> None:
