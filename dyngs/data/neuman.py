@@ -21,10 +21,9 @@ from dyngs.data.people import (
     of_one_clip,
     person_view,
     read_npz,
-    read_pickle,
-    read_pickled_array,
     some,
 )
+from dyngs.data.pickles import read_pickle, read_pickled_array
 from dyngs.data.poses import checked_pose
 from dyngs.errors import DyngsError
 

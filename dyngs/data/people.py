@@ -1,4 +1,4 @@
-"""What captures of people have beside pictures: body parameters per frame, silhouettes, and safe reading of files.
+"""What captures of people have beside pictures: body parameters per frame and silhouettes, and arrays in files.
 
 Local letters: F frames, J joints, B shape coefficients. The bodies are those of SMPL (Loper et al. 2015) and its heirs.
 """
@@ -6,16 +6,12 @@ Local letters: F frames, J joints, B shape coefficients. The bodies are those of
 from __future__ import annotations
 
 import math
-import pickle
-import re
-from collections import OrderedDict
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import EllipsisType
-from typing import Any, BinaryIO, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -277,29 +273,6 @@ def hdf5_length(path: Path, key: str) -> int:
     return int(_hdf5(path, key, None)[0])
 
 
-def read_pickle(path: Path) -> object:
-    """What a pickle holds, if that is numbers, text, containers and NumPy arrays; nothing of the file is executed.
-
-    Pickles of Python 2 and uncompressed ones of joblib are read, too.
-
-    Raises:
-        DyngsError: the file is missing or damaged, or holds anything else.
-    """
-    return _unpickled(path, is_array=False)
-
-
-def read_pickled_array(path: Path) -> object:
-    """The Python object that ``numpy.save`` wrapped into an array without axes, read as ``read_pickle`` does.
-
-    Raises:
-        DyngsError: the file is missing or damaged, or holds something else.
-    """
-    array = _unpickled(path, is_array=True)
-    if not isinstance(array, np.ndarray) or array.shape != () or array.dtype.kind != "O":
-        raise DyngsError(f"{path}: must hold one dictionary, saved with numpy.save; export it again")
-    return array.item()
-
-
 def _levels(silhouette: Silhouette) -> Tensor:
     """(H, W) uint8, 255 where the person is."""
     if silhouette.row is None:
@@ -374,127 +347,3 @@ def _hdf5(path: Path, key: str, rows: int | EllipsisType | None) -> Any:
             return found.shape if rows is None else found[rows]
     except (OSError, ValueError, TypeError, KeyError, IndexError, RuntimeError, MemoryError) as error:
         raise DyngsError(f"{path}: '{key}' cannot be read as HDF5 ({_reason(error)}); copy the file again") from None
-
-
-class _Dtype:
-    """Stands for ``numpy.dtype`` in a pickle: plain numbers, text and objects only."""
-
-    def __init__(self, text: object = None, *_: object) -> None:
-        if not isinstance(text, str) or not re.fullmatch(r"[<>|=]?[biufcSUO]\d*", text):
-            raise ValueError(f"arrays of type {text!r:.20} are not read")
-        self.value = np.dtype(text)
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        _, order, *structure = state[:5]
-        if any(part is not None for part in structure):
-            raise ValueError("arrays with named fields are not read")
-        if order in ("<", ">"):
-            self.value = self.value.newbyteorder(order)
-
-
-class _Array(np.ndarray):
-    """Stands for ``numpy.ndarray`` in a pickle, so that NumPy never sees a state that was not checked."""
-
-    source: ClassVar[BinaryIO | None] = None
-
-    def __new__(cls, *_: object) -> _Array:
-        return super().__new__(cls, (0,), np.uint8)
-
-    def __setstate__(self, state: Any) -> None:
-        _, shape, dtype, fortran, raw = self._beside(state) if isinstance(state, dict) else state
-        if not isinstance(dtype, _Dtype) or not all(isinstance(n, int) and n >= 0 for n in shape):
-            raise ValueError("an array in it has no proper type and shape")
-        raw = raw.encode("latin-1") if isinstance(raw, str) else raw  # bytes of Python 2
-        is_list = dtype.value.kind == "O"
-        wanted = math.prod(shape) * (1 if is_list else dtype.value.itemsize)
-        if not isinstance(raw, list if is_list else (bytes, bytearray)) or len(raw) != wanted:
-            raise ValueError("an array in it is shorter or longer than its shape")
-        raw = raw if is_list else bytes(raw)
-        super().__setstate__((1, tuple(shape), dtype.value, bool(fortran), raw))  # type: ignore[arg-type]
-
-    def _beside(self, state: dict[str, Any]) -> tuple[Any, ...]:
-        """The state of an array whose bytes joblib wrote into the file behind this entry."""
-        shape, dtype = state["shape"], state["dtype"]
-        if self.source is None or not isinstance(dtype, _Dtype) or dtype.value.kind == "O":
-            raise ValueError("an array in it does not hold numbers")
-        if state.get("numpy_array_alignment_bytes") is not None:
-            self.source.read(self.source.read(1)[0])
-        return 1, shape, dtype, state["order"] == "F", self.source.read(math.prod(shape) * dtype.value.itemsize)
-
-
-def _reconstruct(kind: object, *_: object) -> _Array:
-    if not (isinstance(kind, type) and issubclass(kind, _Array)):
-        raise ValueError("an array in it is of an unknown class")
-    return kind()
-
-
-def _from_bytes(raw: object, dtype: object, shape: tuple[int, ...], order: str) -> np.ndarray:
-    array = _Array()
-    array.__setstate__((1, shape, dtype, order == "F", raw))
-    return array
-
-
-def _scalar(dtype: object, raw: object) -> Any:
-    return _from_bytes(raw, dtype, (), "C")[()]
-
-
-def _encode(text: str, encoding: str) -> bytes:
-    if encoding not in ("latin1", "latin-1"):
-        raise ValueError(f"text in it is encoded as {encoding!r:.20}")
-    return text.encode("latin-1")
-
-
-_KNOWN: dict[str, Callable[..., Any]] = {
-    "numpy.ndarray": _Array,
-    "numpy.dtype": _Dtype,
-    "numpy.core.multiarray._reconstruct": _reconstruct,
-    "numpy.core.multiarray.scalar": _scalar,
-    "numpy.core.numeric._frombuffer": _from_bytes,
-    "joblib.numpy_pickle.NumpyArrayWrapper": _Array,
-    "_codecs.encode": _encode,
-    "collections.OrderedDict": OrderedDict,
-    "builtins.set": set,
-    "builtins.frozenset": frozenset,
-}
-
-
-class _Unpickler(pickle._Unpickler):
-    """Knows containers and arrays, and no way to anything else.
-
-    The one in C would let a file claim any amount of memory by one number, and reads ahead, where joblib's arrays are.
-    """
-
-    def __init__(self, file: BinaryIO) -> None:
-        super().__init__(file, encoding="latin1")
-        self._file = file
-        self._own: dict[str, Callable[..., Any]] = {}
-
-    def find_class(self, module: str, name: str) -> Any:
-        module = module.replace("numpy._core.", "numpy.core.").replace("__builtin__", "builtins")
-        key = f"{module}.{name}"
-        known = _KNOWN.get(key)
-        if known is None:
-            raise pickle.UnpicklingError(f"it holds {key!r:.80}, but only numbers, text and arrays are read")
-        if key not in self._own:  # a file can set attributes of what it is given: never of what others use
-            is_stand_in = known in (_Array, _Dtype)
-            self._own[key] = type(name, (known,), {"source": self._file}) if is_stand_in else partial(known)  # type: ignore[call-overload]
-        return self._own[key]
-
-
-def _unpickled(path: Path, is_array: bool) -> object:
-    if not path.is_file():
-        raise DyngsError(f"{path}: no such file; restore it")
-    try:
-        with path.open("rb") as file:
-            if is_array:
-                _skip_array_header(file)
-            return _Unpickler(file).load()
-    except Exception as error:  # a damaged pickle raises nearly anything
-        raise DyngsError(f"{path}: cannot be read as a pickle ({_reason(error)}); export it again as arrays") from None
-
-
-def _skip_array_header(file: BinaryIO) -> None:
-    version = np.lib.format.read_magic(file)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    if read(file)[2].kind != "O":
-        raise ValueError("an array of Python objects was expected")

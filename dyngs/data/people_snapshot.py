@@ -21,8 +21,8 @@ from dyngs.data.people import (
     of_one_clip,
     person_view,
     read_hdf5,
-    read_pickle,
 )
+from dyngs.data.pickles import read_pickle
 from dyngs.data.poses import inverse_rigid
 from dyngs.data.video import VIDEO_SUFFIXES
 from dyngs.errors import DyngsError

@@ -19,11 +19,10 @@ from dyngs.data.people import (
     numbers_of,
     of_one_clip,
     person_view,
-    read_pickle,
-    read_pickled_array,
     rows_of,
     some,
 )
+from dyngs.data.pickles import read_pickle, read_pickled_array
 from dyngs.data.poses import checked_pose, inverse_rigid
 from dyngs.data.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError

@@ -6,19 +6,17 @@ Local letters: J joints, M vertices, T triangles, U UV vertices, n any number.
 from __future__ import annotations
 
 import io
-import pickle
-import re
 import zipfile
 import zlib
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.data.pickles import read_pickle
 from dyngs.errors import DyngsError
 from dyngs.human.body import Body
 
@@ -37,7 +35,7 @@ def load_body(path: Path, uv: Path | None = None) -> Body:
 
     SMPL, SMPL-H and SMPL-X are told apart by their 24, 52 or 55 joints. SMPL-X keeps shape and expression in one array:
     300 and the rest, or 10 and 10. Only the keys that matter are read. No file can run code: arrays with Python
-    objects are refused, and a pickle is taken apart without making or calling anything that it names.
+    objects are refused, and of a pickle only numbers, text and arrays are read.
 
     Args:
         path: the file.
@@ -323,135 +321,12 @@ def _reason(error: Exception) -> str:
     return " ".join((said or str(error) or type(error).__name__).split())[:80]
 
 
-# --- pickles ----------------------------------------------------------------------------------------------------------
-
-_NUMBER = re.compile(r"[biuf][1248]")
-_KINDS = {
-    "numpy": {
-        "_reconstruct": "array",
-        "_frombuffer": "buffer",
-        "ndarray": "class",
-        "dtype": "dtype",
-        "scalar": "scalar",
-    },
-    "scipy": {"csc_matrix": "csc", "csc_array": "csc", "csr_matrix": "csr", "csr_array": "csr"},
-    "_codecs": {"encode": "bytes"},
-    "copy_reg": {"_reconstructor": "object"},
-    "copyreg": {"_reconstructor": "object"},
-    "__builtin__": {"object": "class", "bytes": "bytes"},
-    "builtins": {"object": "class", "bytes": "bytes"},
-}
-"""What the things are that a body file of Python 2 or 3 names, by package. Chumpy's are all alike."""
-
-
-class _Kept:
-    """Stands for an object of a pickle: keeps what it would have been made from. The class's name says its kind."""
-
-    args: tuple[Any, ...]
-    state: Any
-
-    def __new__(cls, *args: object) -> _Kept:
-        made = object.__new__(cls)
-        made.args, made.state = args, None
-        return made
-
-    def __setstate__(self, state: object) -> None:
-        self.state = state
-
-
-class _InertUnpickler(pickle._Unpickler):
-    """Loads a pickle without importing, making or calling anything that it names.
-
-    It is the one in Python, because that in C allocates what a damaged file asks for: gigabytes for a wrong byte.
-    """
-
-    def find_class(self, module_name: str, global_name: str) -> type[_Kept]:
-        """A stand-in of that kind.
-
-        Raises:
-            DyngsError: no body file needs it.
-        """
-        package = module_name.split(".")[0]
-        kind = "chumpy" if package == "chumpy" else _KINDS.get(package, {}).get(global_name)
-        if kind is None:
-            named = f"{module_name}.{global_name}"[:80]
-            raise DyngsError(f"asks for {named!r}, which could run code; refused: body files need no such thing")
-        return type(kind, (_Kept,), {})
-
-
 def _read_pickle(path: Path) -> dict[str, np.ndarray]:
-    try:
-        loaded = _InertUnpickler(io.BytesIO(path.read_bytes()), encoding="latin1").load()
-    except OSError as error:
-        raise DyngsError(f"{path}: cannot be read ({_reason(error)})") from None
-    except DyngsError as error:
-        raise DyngsError(f"{path}: {error}") from None
-    except Exception as error:  # a damaged pickle raises nearly anything
-        raise DyngsError(f"{path}: not a pickle, or a damaged one ({_reason(error)}); copy it again") from None
+    loaded = read_pickle(path)
     if not isinstance(loaded, dict):
         raise DyngsError(f"{path}: holds no dictionary; give a body file of SMPL, SMPL-H or SMPL-X")
-    return {key: _decoded(path, key, loaded[key]) for key in _wanted(path, loaded)}
-
-
-def _decoded(path: Path, key: str, value: object) -> np.ndarray:
-    try:
-        return _array(value)
-    except (ValueError, TypeError, LookupError, AttributeError, OverflowError, MemoryError, RecursionError) as error:
-        raise DyngsError(f"{path}: '{key}' is not an array of numbers ({_reason(error)}); export it again") from None
-
-
-def _array(value: object) -> np.ndarray:
-    """The array that ``value`` stands for; wrong contents raise whatever they raise."""
-    kind, args, state = _parts(value)
-    if kind == "object":  # protocols 0 and 1 name the class of an object first
-        kind = getattr(args[0], "__name__", "")
-    if kind == "chumpy":
-        return _array(state["x"])
-    if kind in ("csc", "csr"):
-        return _dense(kind, state)
-    axes = None
-    if kind == "array":
-        shape, dtype, is_fortran, data = state[-4:]
-        order = "F" if is_fortran else "C"
-    elif kind == "buffer":
-        data, dtype, shape, order, axes = (*args, None)[:5]
-    else:
-        raise ValueError("it is something else")
-    array = np.frombuffer(_bytes(data), _dtype(dtype)).reshape(shape, order="F" if order == "F" else "C")
-    return array if axes is None else array.transpose(axes)
-
-
-def _parts(value: Any) -> tuple[str, tuple[Any, ...], Any]:
-    """Kind, arguments and state of what stands for an object; the kind of anything else is empty."""
-    return (type(value).__name__, value.args, value.state) if isinstance(value, _Kept) else ("", (), None)
-
-
-def _bytes(value: object) -> bytes:
-    kind, args, _ = _parts(value)
-    if kind == "bytes":
-        value = args[0]
-    if isinstance(value, str):
-        return value.encode("latin1")
-    if isinstance(value, (bytes, bytearray)):
-        return bytes(value)
-    raise ValueError("it holds Python objects")
-
-
-def _dtype(value: object) -> np.dtype:
-    kind, args, state = _parts(value)
-    if kind != "dtype" or not _NUMBER.fullmatch(args[0]) or state[1] not in ("<", ">", "=", "|"):
-        raise ValueError("it holds Python objects or text")
-    return np.dtype(state[1] + args[0])
-
-
-def _dense(kind: str, state: Any) -> np.ndarray:
-    """The matrix that compressed columns (csc) or rows (csr) stand for."""
-    rows, columns = (int(size) for size in state["_shape"])
-    data, minor, pointers = _array(state["data"]), _array(state["indices"]), _array(state["indptr"]).astype(np.int64)
-    counts = np.diff(pointers)
-    if counts.sum() != len(data) or minor.min() < 0:
-        raise ValueError("it is a damaged sparse matrix")
-    major = np.repeat(np.arange(len(counts)), counts)
-    dense = np.zeros((rows, columns))
-    np.add.at(dense, (minor, major) if kind == "csc" else (major, minor), data)
-    return dense
+    found = {key: loaded[key] for key in _wanted(path, loaded)}
+    for key, value in found.items():
+        if not isinstance(value, np.ndarray) or value.dtype.kind == "O":
+            raise DyngsError(f"{path}: '{key}' is not an array of numbers; export it again")
+    return found

