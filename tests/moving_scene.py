@@ -13,7 +13,7 @@ from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, StaticModel, TrajectoryField
 from dyngs.config_io import RESOLVED_NAME, save_config
 from dyngs.data.synthetic import StillOptions, write_still_capture
-from dyngs.deform.field import FieldSetup, Offsets
+from dyngs.deform.field import FieldSetup, Offsets, chosen
 from dyngs.deform.fields import field_state, new_field
 from dyngs.deform.learned import LearnedTensors
 from dyngs.deform.trained import TrainedScene
@@ -34,9 +34,9 @@ class Sliding:
     learned: LearnedTensors = field(default_factory=lambda: LearnedTensors({}, {}))
     buffers: dict[str, Tensor] = field(default_factory=dict)
 
-    def offsets(self, means: Tensor, time: float) -> Offsets:
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         self.calls += 1
-        return Offsets(torch.tensor([self.speed * time, 0.0, 0.0]).expand(len(means), 3))
+        return Offsets(torch.tensor([self.speed * time, 0.0, 0.0]).expand(len(chosen(means, rows)), 3))
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         return {}
@@ -54,8 +54,9 @@ class Blinking(Sliding):
 
     num_times: int = 5
 
-    def offsets(self, means: Tensor, time: float) -> Offsets:
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         odd = round(time * (self.num_times - 1)) % 2
+        means = chosen(means, rows)
         return Offsets(torch.zeros(len(means), 3), colors=torch.full((len(means), 3), self.speed * odd))
 
 

@@ -72,8 +72,14 @@ class DeformationField(Protocol):
     buffers: dict[str, Tensor]
     """What a checkpoint must hold besides."""
 
-    def offsets(self, means: Tensor, time: float) -> Offsets:
-        """What moves at ``time`` in [0, 1], for the canonical ``means`` (M, 3) of all moving Gaussians in order."""
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
+        """What moves at ``time`` in [0, 1].
+
+        Args:
+            means: (M, 3) canonical, of all moving Gaussians in order.
+            time: in [0, 1].
+            rows: (A,) only these of them are asked for, in this order, and cost anything; None: all.
+        """
         ...
 
     def penalties(self, time: float) -> dict[str, Tensor]:
@@ -109,6 +115,11 @@ def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None)
         base = _added(gaussians.sh[:, 0], offsets.colors, rows)
         changes["sh"] = torch.cat([base[:, None], gaussians.sh[:, 1:]], dim=1)
     return gaussians.replace(**changes)
+
+
+def chosen(x: Tensor, rows: Tensor | None) -> Tensor:
+    """The ``rows`` of ``x``; None: all."""
+    return x if rows is None else x.index_select(0, rows)
 
 
 def turned_quats(quats: Tensor, offsets: Tensor) -> Tensor:

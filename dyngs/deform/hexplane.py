@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dyngs.config import HexplaneField
 from dyngs.deform.decoder import Decoder, head_sizes, split_heads
-from dyngs.deform.field import FieldSetup, Offsets, key_times
+from dyngs.deform.field import FieldSetup, Offsets, chosen, key_times
 from dyngs.deform.learned import LearnedTensors
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 
@@ -48,9 +48,9 @@ class Hexplane:
         indices = range(len(self.options.levels))
         return [PlaneLevel(self.learned[f"space{i}"], self.learned[f"time{i}"]) for i in indices]
 
-    def offsets(self, means: Tensor, time: float) -> Offsets:
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """See ``DeformationField.offsets``; no gradient flows to ``means``."""
-        coords = self.setup.normalized(means.detach())
+        coords = self.setup.normalized(chosen(means.detach(), rows))
         features = hexplane_features(coords, time, self.levels)
         return split_heads(self.decoder(features, self.learned), self.options)
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from dyngs.config import MlpField
 from dyngs.deform.decoder import Decoder, split_heads
-from dyngs.deform.field import FieldSetup, Offsets
+from dyngs.deform.field import FieldSetup, Offsets, chosen
 from dyngs.deform.learned import LearnedTensors
 
 SKIP_LAYER = 5
@@ -30,9 +30,9 @@ class Mlp:
         weights = self.decoder.start_values(generator)
         self.learned = LearnedTensors(weights, dict.fromkeys(weights, options.lr), options.lr_decay)
 
-    def offsets(self, means: Tensor, time: float) -> Offsets:
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """See ``DeformationField.offsets``; no gradient flows to ``means``, as in the paper."""
-        space = encoded(self.setup.normalized(means.detach()), self.options.space_frequencies)
+        space = encoded(self.setup.normalized(chosen(means.detach(), rows)), self.options.space_frequencies)
         moment = encoded(space.new_full((1, 1), time), self.options.time_frequencies)
         features = torch.cat([space, moment.expand(len(space), -1)], dim=1)
         return split_heads(self.decoder(features, self.learned), self.options)

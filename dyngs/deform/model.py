@@ -18,8 +18,10 @@ from dyngs.config import DynamicModel
 from dyngs.data.loader import Picture
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import field_state, new_field, part_of, restored_field
+from dyngs.deform.masks import KeyMasks, matched
 from dyngs.deform.motion import bake_, measure_motion
-from dyngs.deform.residual import two_group_threshold
+from dyngs.deform.residual import Residuals, two_group_threshold
+from dyngs.deform.seeds import box_of, seeded
 from dyngs.deform.window import TimeWindow
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.static.densify import EditResult
@@ -27,17 +29,12 @@ from dyngs.static.filters import FILTER_VARIANCE, filter_std
 from dyngs.static.model import Drawn, StaticScene
 
 NOBODY = torch.zeros(0, dtype=torch.long)
-BOX_MARGIN = 1.1
-SEED_SIZE = 0.3
-"""Standard deviation of a seed, in distances between them."""
 SURELY_MOVING = 1.5
 """Errors so many times ``moving_error`` are never taken for those of still things."""
+SURELY_STILL = 0.25
+"""Where cameras stay in place, errors of so many times ``moving_error`` are those of still things."""
 MIN_MOVING_SHARE = 0.02
 """If no larger share of the Gaussians surely moves, nothing does."""
-SEED_LOGIT = -2.2
-"""Opacity 0.1, as all Gaussians begin."""
-SOLID = 0.05
-"""Opacity from which a Gaussian counts for the box in which things move."""
 
 
 @dataclass(frozen=True)
@@ -68,13 +65,15 @@ class Surroundings4D:
         times: of the training views, in [0, 1], ascending; at least two differ.
         cameras: the training cameras.
         extent: of the scene, world units.
-        residuals: the mean colour error where each of N still Gaussians shows.
+        residuals: how far its pictures disagree with what is still, where N Gaussians are seen.
+        cameras_stay: in place, so that pictures show what is still exactly alike.
     """
 
     times: tuple[float, ...]
     cameras: Sequence[Cameras]
     extent: float
-    residuals: Callable[[Gaussians], Tensor]
+    residuals: Callable[[Callable[[float], Gaussians]], Residuals]
+    cameras_stay: bool = False
 
 
 class DynamicScene:
@@ -85,6 +84,7 @@ class DynamicScene:
         rows: (M,) indices of the Gaussians that it moves, ascending.
         times: distinct training times, ascending.
         window: which of them are trained on.
+        masks: which Gaussians are seen around a time; None: all may be, at all times.
     """
 
     def __init__(
@@ -100,6 +100,7 @@ class DynamicScene:
         phases = schedule.fine, schedule.opens, schedule.full
         self.window = TimeWindow.around_middle(capture.times, options.first_views, *phases)
         self.field: DeformationField | None = None
+        self.masks: KeyMasks | None = None
         self.rows = NOBODY
         self._still, self._generator = still, generator
         self._setup: FieldSetup | None = None
@@ -116,10 +117,19 @@ class DynamicScene:
             parameters = parameters.detach()
         means = parameters.means.index_select(0, self.rows)
         time = self._jittered(batch.time or 0.0, step)
-        offsets = self.field.offsets(means, time)
-        moved = deformed(parameters, offsets, self.rows)
-        drawn = self._still.gaussians_at(moved, batch, step)
-        return Drawn(drawn.gaussians, drawn.penalties | self.field.penalties(time) | self._sparsity(offsets))
+        asked, rows, active = None, self.rows, None
+        if self.masks is not None:
+            active = self.masks.active(self.masks.interval(time))
+            asked, rows = matched(self.rows, active, len(parameters))
+            parameters = picked(parameters, active)
+        offsets = self.field.offsets(means, time, asked)
+        moved = deformed(parameters, offsets, rows)
+        drawn = (
+            self._still.gaussians_at(moved, batch, step).gaussians
+            if active is None
+            else self._still.filtered(moved, active)
+        )
+        return Drawn(drawn, self.field.penalties(time) | self._sparsity(offsets))
 
     def after_step(self, parameters: Gaussians, step: int, result: EditResult | None) -> int:
         """Rows left out for bad gradients; optimizes the field, follows ``result``, begins the next phase."""
@@ -141,12 +151,12 @@ class DynamicScene:
         """Random Gaussians to begin motion with, after the coarse phase; None where a still model explains all."""
         if step != self.schedule.fine:
             return None
-        scores = self.capture.residuals(parameters.detach())
+        found = self.capture.residuals(lambda _: parameters)
         floor = self.options.moving_error
-        if not bool((scores > SURELY_MOVING * floor).float().mean() > MIN_MOVING_SHARE):
+        if not bool((found.most > SURELY_MOVING * floor).float().mean() > MIN_MOVING_SHARE):
             return None
-        threshold = min(max(two_group_threshold(scores), floor), SURELY_MOVING * floor)
-        rows = torch.nonzero(scores > threshold)[:, 0]
+        threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
+        rows = torch.nonzero(found.usual > threshold)[:, 0]
         result = seeded(parameters.detach(), self.options.seeds, self.capture.extent, self._generator)
         added = torch.arange(len(parameters), len(parameters) + self.options.seeds)
         self._begin_motion(parameters, torch.cat([rows, added]))
@@ -162,11 +172,14 @@ class DynamicScene:
         if self.field is not None and self._setup is not None:
             state |= {f"field.{name}": x for name, x in field_state(self.field, self._setup).items()}
             state["rows"] = self.rows
+        if self.masks is not None:
+            state |= {f"masks.{name}": x for name, x in self.masks.state().items()}
         return state
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         self._still.load_state(state)
         self.rows = state.get("rows", NOBODY)
+        self.masks = KeyMasks.restored(part_of(state, "masks."))
         part = part_of(state, "field.")
         self.field = self._setup = None
         if part:
@@ -184,6 +197,10 @@ class DynamicScene:
         px_size = filter_std(now.means, self.capture.cameras)[self.rows] / math.sqrt(FILTER_VARIANCE)
         motion = measure_motion(field, now.select(self.rows), self.times, px_size)
         moves = motion.pixels >= self.options.still_below
+        if self.capture.cameras_stay:
+            means = now.means[self.rows]
+            seen = self.capture.residuals(lambda time: deformed(now, field.offsets(means, time), self.rows))
+            moves &= seen.usual[self.rows] > SURELY_STILL * self.options.moving_error
         still = torch.nonzero(~moves)[:, 0]
         bake_(parameters, self.rows[still], motion.mean.select(still))
         kept = torch.nonzero(moves)[:, 0]
@@ -200,6 +217,8 @@ class DynamicScene:
         descent = position[edit.source]
         self.rows = torch.nonzero(descent >= 0)[:, 0]
         field.select(descent[self.rows], edit.is_new[self.rows])
+        if self.masks is not None:
+            self.masks = self.masks.select(edit.source)
 
     def _jittered(self, time: float, step: int) -> float:
         """``time`` with the annealed noise of Deformable-3DGS, against frames that overfit."""
@@ -218,34 +237,6 @@ class DynamicScene:
         return {"motion sparsity": length * (self.options.motion_sparsity / self.capture.extent)}
 
 
-def seeded(gaussians: Gaussians, count: int, extent: float, generator: torch.Generator) -> EditResult:
-    """The edit that adds ``count`` faint grey Gaussians, spread evenly in the box of ``gaussians``."""
-    center, half_size = box_of(gaussians, extent)
-    places = center + half_size * (2 * torch.rand((count, 3), generator=generator) - 1)
-    spacing = float((2 * half_size).prod() / max(count, 1)) ** (1 / 3)
-    source = torch.cat([torch.arange(len(gaussians)), torch.zeros(count, dtype=torch.long)])
-    is_new = torch.arange(len(source)) >= len(gaussians)
-    changes = {
-        "means": torch.cat([gaussians.means, places]),
-        "quats": torch.cat([gaussians.quats, torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(count, 4)]),
-        "log_scales": torch.cat([gaussians.log_scales, torch.full((count, 3), math.log(SEED_SIZE * spacing))]),
-        "logit_opacities": torch.cat([gaussians.logit_opacities, torch.full((count,), SEED_LOGIT)]),
-        "sh": torch.cat([gaussians.sh, torch.zeros(count, *gaussians.sh.shape[1:])]),
-    }
-    return EditResult(TopologyEdit(source, is_new), changes)
-
-
-def box_of(gaussians: Gaussians, extent: float) -> tuple[Tensor, Tensor]:
-    """Centre and half sides (3,) of the box around what is solid, a little larger; no side is zero.
-
-    The outer percent of the Gaussians on either side is left out: there the field is that of the box's border.
-    """
-    now = gaussians.detach()
-    solid = (now.opacities >= SOLID) & now.means.isfinite().all(1)
-    means = now.means[solid] if bool(solid.any()) else now.means.nan_to_num()
-    if not len(means):
-        return torch.zeros(3), torch.full((3,), extent)
-    ordered = means.sort(dim=0).values
-    low, high = ordered[int(0.01 * (len(ordered) - 1))], ordered[math.ceil(0.99 * (len(ordered) - 1))]
-    half_size = (0.5 * BOX_MARGIN * (high - low)).clamp_min(max(1e-3 * extent, 1e-6))
-    return 0.5 * (low + high), half_size
+def picked(gaussians: Gaussians, rows: Tensor) -> Gaussians:
+    """The Gaussians at ``rows``; differentiable, and its gradient costs less than that of indexing."""
+    return Gaussians(**{name: x.index_select(0, rows) for name, x in gaussians.tensors().items()})

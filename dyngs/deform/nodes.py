@@ -5,7 +5,7 @@ Local letters: S nodes, B nodes that one Gaussian follows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -34,6 +34,10 @@ class Nodes:
     positions: Tensor
     radii: Tensor
     followed: Tensor
+
+    def followed_by(self, rows: Tensor) -> Nodes:
+        """The nodes as only the points ``rows`` follow them."""
+        return replace(self, followed=self.followed.index_select(0, rows))
 
     def weights(self, means: Tensor) -> Tensor:
         """(M, B) shares of the followed nodes: Gaussians of the distance, normalised; constant in ``means``."""

@@ -2,44 +2,131 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from dyngs.data.capture import View
 from dyngs.data.loader import Picture
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, render
 
+Thing = TypeVar("Thing")
+MIN_SAME = 3
+"""Pictures of one camera, from which what they have in common is known."""
+USUAL = 0.7
+"""What moves differs from the median in three of ten pictures or more; what is hidden at times, in fewer."""
+MOMENTS = 8
+"""Pictures of one camera that are looked at."""
+SHOWS = 1e-3
+"""Sum of weights, in pixels, from which a Gaussian shows in a picture."""
 
-def residual_scores(
-    gaussians: Gaussians, pictures: Iterable[Picture], options: RenderOptions, background: Tensor
-) -> Tensor:
-    """(N,) how far the pictures disagree with the colour of each Gaussian, from view to view.
 
-    sum_v |sum_p w_vip (rendered - truth)| / sum_v sum_p w_vip with w = alpha T, a mean over channels. Errors of one
-    view are summed with their sign over what a Gaussian covers: detail that is not yet resolved cancels, a thing that
-    has come or gone does not. Both sums come from passes back through the blending of a constant colour. Masked pixels
-    do not count; a Gaussian that shows nowhere has 0.
+@dataclass(frozen=True)
+class Residuals:
+    """How far pictures disagree with what is still.
+
+    Attributes:
+        most: (N,) large where anything moves, be it this Gaussian or what hides it at times.
+        usual: (N,) large where this moves.
+    """
+
+    most: Tensor
+    usual: Tensor
+
+
+def residuals_of(
+    gaussians_at: Callable[[float], Gaussians],
+    pictures: Sequence[Picture],
+    options: RenderOptions,
+    background: Tensor,
+) -> Residuals:
+    """How far the pictures disagree with what is still, where each Gaussian is seen.
+
+    e_vi = |sum_p w_vip (expected - truth)| / sum_p w_vip with w = alpha T for each picture v, a mean over channels.
+    Errors of one view are summed with their sign over what a Gaussian covers: detail that is not yet resolved cancels,
+    a thing that has come or gone does not. Both sums come from passes back through the blending of a constant colour.
+    Masked pixels do not count; a Gaussian that shows nowhere has 0.
+
+    Where cameras stay in place, what is expected of one with ``MIN_SAME`` pictures or more is their median, which holds
+    whatever is still exactly as it is; ``most`` is the largest, ``usual`` the ``USUAL`` quantile of e_vi over pictures
+    in which a Gaussian shows. Else the rendering is expected, and both are the mean, weighted by sum_p w_vip: a still
+    model that is not yet right errs too.
 
     Args:
-        pictures: as many as are to be looked at, one at a time.
+        gaussians_at: N Gaussians at a time.
+        pictures: one or more, as many as are to be looked at.
         background: (3,) colour.
     """
-    errors, weights = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
-    still = gaussians.detach()
-    for picture in pictures:
+    expected = _median_pictures(pictures, background)
+    looked_at = [p for p in pictures if _camera_key(p) in expected] if expected else pictures
+    found: list[tuple[Tensor, Tensor]] = []
+    for picture in looked_at:
+        gaussians = gaussians_at(picture.time or 0.0).detach()
+        found.append(_errors_in(gaussians, picture, options, background, expected.get(_camera_key(picture))))
+    errors, weights = torch.stack([x for x, _ in found]), torch.stack([x for _, x in found])
+    if not expected:
+        mean = errors.sum(0) / weights.sum(0).clamp_min(1e-6)
+        return Residuals(mean, mean)
+    shows = weights > SHOWS
+    ordered = torch.where(shows, errors / weights.clamp_min(SHOWS), 0.0).sort(dim=0, descending=True).values
+    usual = ((1 - USUAL) * shows.sum(0)).long()
+    return Residuals(ordered[0], ordered.gather(0, usual[None])[0])
+
+
+def _errors_in(
+    gaussians: Gaussians, picture: Picture, options: RenderOptions, background: Tensor, expected: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """(N,) sums of errors and of weights over one picture; None expects the rendering."""
+    if expected is None:
         with torch.no_grad():
-            rendered = render(still, picture.cameras, options, background=background).rgb[0]
-            counts = torch.ones(rendered.shape[:2]) if picture.mask is None else picture.mask
-            error = (rendered - picture.composite(background)) * counts[..., None]
-        flat = torch.zeros(len(still), 1, 3, requires_grad=True)
-        blended = render(still.replace(sh=flat), picture.cameras, options).rgb[0]
-        (signed,) = torch.autograd.grad(blended, flat, error, retain_graph=True)
-        (weight,) = torch.autograd.grad(blended, flat, counts[..., None].expand_as(error).contiguous())
-        errors += signed[:, 0].abs().mean(1)
-        weights += weight[:, 0, 0]
-    return errors / weights.clamp_min(1e-6)
+            expected = render(gaussians, picture.cameras, options, background=background).rgb[0]
+    counts = torch.ones(expected.shape[:2]) if picture.mask is None else picture.mask
+    error = (expected - picture.composite(background)) * counts[..., None]
+    flat = torch.zeros(len(gaussians), 1, 3, requires_grad=True)
+    blended = render(gaussians.replace(sh=flat), picture.cameras, options).rgb[0]
+    (signed,) = torch.autograd.grad(blended, flat, error, retain_graph=True)
+    (weight,) = torch.autograd.grad(blended, flat, counts[..., None].expand_as(error).contiguous())
+    return signed[:, 0].abs().mean(1), weight[:, 0, 0]
+
+
+def cameras_in_place(views: Sequence[View]) -> list[list[int]]:
+    """Per camera that does not move and took ``MIN_SAME`` views or more, the indices of these."""
+    cameras: dict[bytes, list[int]] = {}
+    for index, view in enumerate(views):
+        cameras.setdefault(view.cam_from_world.tobytes() + view.intrinsics.tobytes(), []).append(index)
+    return [seen for seen in cameras.values() if len(seen) >= MIN_SAME]
+
+
+def views_to_compare(views: Sequence[View], limit: int = 50) -> list[int]:
+    """Indices of at most ``limit`` views, evenly chosen; where cameras stay in place, ``MOMENTS`` of each or more."""
+    cameras = cameras_in_place(views)
+    if not cameras:
+        return _evenly(range(len(views)), limit)
+    chosen = _evenly(cameras, max(limit // MOMENTS, 1))
+    return [index for seen in chosen for index in _evenly(seen, limit // len(chosen))]
+
+
+def _evenly(things: Sequence[Thing], limit: int) -> list[Thing]:
+    """At most ``limit`` of them."""
+    count = min(len(things), limit)
+    return [things[i * len(things) // count] for i in range(count)]
+
+
+def _median_pictures(pictures: Sequence[Picture], background: Tensor) -> dict[bytes, Tensor]:
+    """Per camera with enough pictures, (H, W, 3) what most of them show."""
+    same: dict[bytes, list[Tensor]] = {}
+    for picture in pictures:
+        same.setdefault(_camera_key(picture), []).append(picture.composite(background))
+    return {key: torch.stack(seen).median(0).values for key, seen in same.items() if len(seen) >= MIN_SAME}
+
+
+def _camera_key(picture: Picture) -> bytes:
+    """Equal for pictures from the same place in the same direction."""
+    return picture.cameras.cam_from_world.numpy().tobytes() + picture.cameras.intrinsics.numpy().tobytes()
 
 
 def two_group_threshold(scores: Tensor) -> float:

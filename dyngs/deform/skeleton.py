@@ -55,11 +55,14 @@ class Skeleton:
         """Control points of each spline."""
         return self.num_pieces + SPAN - 1
 
-    def offsets(self, means: Tensor, time: float) -> Offsets:
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """See ``DeformationField.offsets``; differentiable in ``means``, which nodes turn about themselves."""
         if not len(means):  # whatever nodes there are
             return self._at(time).select(slice(0))
-        return follow(self._nodes(means), means, self._at(time))
+        nodes = self._nodes(means)
+        if rows is not None:
+            nodes, means = nodes.followed_by(rows), means.index_select(0, rows)
+        return follow(nodes, means, self._at(time))
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         """Acceleration of the nodes, and how far neighbours stray from moving rigidly, in squared spacings."""

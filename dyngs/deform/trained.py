@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -10,11 +11,14 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from dyngs.colour.network import ColourNetwork
 from dyngs.config import DynamicModel
 from dyngs.deform.field import DeformationField, deformed
 from dyngs.deform.fields import part_of, restored_field
+from dyngs.deform.masks import KeyMasks, matched
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.rendering import Shader
 from dyngs.static.filters import fuse_filter
 
 
@@ -28,6 +32,8 @@ class TrainedScene:
         field: what moves them; None where nothing moves.
         filter_std: (N,) of Mip-Splatting's 3D filter, or None.
         times: distinct training times in [0, 1], ascending; empty for a capture without times.
+        colour: what colours them; None: their harmonics.
+        masks: which of the Gaussians are seen around a time; None: all may be, at all times.
     """
 
     gaussians: Gaussians
@@ -35,6 +41,9 @@ class TrainedScene:
     field: DeformationField | None = None
     filter_std: Tensor | None = None
     times: tuple[float, ...] = ()
+    colour: ColourNetwork | None = None
+    masks: KeyMasks | None = None
+    _kept: dict[int, _Around] = dataclasses.field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -58,20 +67,45 @@ class TrainedScene:
 
     @torch.no_grad()
     def at(self, time: float | None) -> Gaussians:
-        """The N Gaussians at ``time``, clamped to [0, 1]; None is 0. What is still is not computed anew.
+        """The Gaussians at ``time``, clamped to [0, 1]; None is 0. What is still is not computed anew.
+
+        All N of them; with masks only those that are seen around then, in their order.
 
         Raises:
             DyngsError: the time is NaN.
         """
         if time is not None and math.isnan(time):
             raise DyngsError("the time to draw is not a number; give one from 0 to 1")
-        drawn = self.gaussians
+        moment = min(max(0.0 if time is None else time, 0.0), 1.0)
+        drawn, std = self.gaussians, self.filter_std
         if self.field is not None and not self.is_still:
-            moment = min(max(0.0 if time is None else time, 0.0), 1.0)
-            everything = len(self.rows) == len(drawn)
-            means = drawn.means if everything else drawn.means[self.rows]
-            drawn = deformed(drawn, self.field.offsets(means, moment), None if everything else self.rows)
-        return drawn if self.filter_std is None else fuse_filter(drawn, self.filter_std)
+            around = self._around(moment)
+            drawn, std = around.gaussians, around.filter_std
+            offsets = self.field.offsets(around.moving_means, moment, around.asked)
+            drawn = deformed(drawn, offsets, around.rows)
+        return drawn if std is None else fuse_filter(drawn, std)
+
+    def _around(self, time: float) -> _Around:
+        """What is drawn around ``time``; that of the last interval is kept."""
+        interval = 0 if self.masks is None else self.masks.interval(time)
+        if interval not in self._kept:
+            self._kept.clear()
+            self._kept[interval] = self._selected(interval)
+        return self._kept[interval]
+
+    def _selected(self, interval: int) -> _Around:
+        means = self.gaussians.means[self.rows]
+        if self.masks is None:
+            rows = None if len(self.rows) == len(self) else self.rows
+            return _Around(self.gaussians, self.filter_std, means, None, rows)
+        active = self.masks.active(interval)
+        std = None if self.filter_std is None else self.filter_std[active]
+        asked, rows = matched(self.rows, active, len(self))
+        return _Around(self.gaussians.select(active), std, means, asked, rows)
+
+    def shader_at(self, time: float | None) -> Shader | None:
+        """What colours the Gaussians of ``at(time)``; None: their harmonics."""
+        return None if self.colour is None else self.colour.shader(time)
 
     def part(self, which: Literal["moving", "still"]) -> TrainedScene:
         """Only the Gaussians that move, with their field, or only those that do not."""
@@ -80,7 +114,25 @@ class TrainedScene:
         index = torch.nonzero(moves if which == "moving" else ~moves)[:, 0]
         std = None if self.filter_std is None else self.filter_std[index]
         rows, field = (torch.arange(len(index)), self.field) if which == "moving" else (torch.zeros(0).long(), None)
-        return replace(self, gaussians=self.gaussians.select(index), rows=rows, field=field, filter_std=std)
+        return replace(self, gaussians=self.gaussians.select(index), rows=rows, field=field, filter_std=std, masks=None)
+
+    def unmasked(self) -> TrainedScene:
+        """The same with all Gaussians at all times."""
+        return replace(self, masks=None)
+
+
+@dataclass(frozen=True)
+class _Around:
+    """What is drawn around a time: Gaussians with the filter, canonical means of all that move, and who of them.
+
+    ``asked`` are those of the moving that are drawn, ``rows`` where they are drawn; None: all.
+    """
+
+    gaussians: Gaussians
+    filter_std: Tensor | None
+    moving_means: Tensor
+    asked: Tensor | None
+    rows: Tensor | None
 
 
 def trained_scene(gaussians: Gaussians, model_state: Mapping[str, Tensor], options: object) -> TrainedScene:
@@ -95,6 +147,7 @@ def trained_scene(gaussians: Gaussians, model_state: Mapping[str, Tensor], optio
     nothing = torch.zeros(0, dtype=torch.long)
     if not part or not isinstance(options, DynamicModel):
         return TrainedScene(gaussians, nothing, None, std, times)
+    masks = KeyMasks.restored(part_of(model_state, "masks."))
     rows = model_state.get("rows", torch.arange(len(gaussians)))
-    field, _ = restored_field(options.deform, part, len(rows))
-    return TrainedScene(gaussians, rows, field, std, times)
+    motion, _ = restored_field(options.deform, part, len(rows))
+    return TrainedScene(gaussians, rows, motion, std, times, masks=masks)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dyngs.config import TrajectoryField
 from dyngs.deform.decoder import head_sizes, split_heads
-from dyngs.deform.field import FieldSetup, Offsets
+from dyngs.deform.field import FieldSetup, Offsets, chosen
 from dyngs.deform.learned import LearnedTensors
 
 
@@ -29,10 +29,11 @@ class Trajectory:
         rates["means"] = options.lr_means * setup.extent
         self.learned = LearnedTensors(tensors, rates, options.lr_decay)
 
-    def offsets(self, means: Tensor, time: float) -> Offsets:
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """See ``DeformationField.offsets``; ``means`` do not matter."""
         terms = basis(time, self.options.polynomial, self.options.fourier).to(means)
-        parts = [torch.einsum("b,mbd->md", terms, self.learned[name]) for name in head_sizes(self.options)]
+        curves = (chosen(self.learned[name], rows) for name in head_sizes(self.options))
+        parts = [torch.einsum("b,mbd->md", terms, x) for x in curves]
         return split_heads(torch.cat(parts, dim=1), self.options)
 
     def penalties(self, time: float) -> dict[str, Tensor]:

@@ -58,6 +58,20 @@ def test_the_generator_decides_everything() -> None:
         assert kind in ("skeleton", "trajectory") or any(not torch.equal(x, other[name]) for name, x in first.items())
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_some_rows_are_moved_as_among_all(kind: str) -> None:
+    """1e-6 for sums of other lengths; gradients reach only their canonical means."""
+    field, means, rows = stirred_field(kind), cloud().means.requires_grad_(), torch.tensor([7, 2, 3])
+    everything, some = field.offsets(means, 0.37), field.offsets(means, 0.37, rows)
+    for name, x in vars(everything).items():
+        assert x is not None
+        torch.testing.assert_close(getattr(some, name), x[rows], rtol=0, atol=1e-6)
+    if kind == "skeleton":
+        (slope,) = torch.autograd.grad(some.means.sum(), means)
+        assert set(torch.nonzero(slope.any(1))[:, 0].tolist()) == {2, 3, 7}
+    assert len(field.offsets(means, 0.37, rows[:0]).means) == 0
+
+
 def test_part_of_takes_the_prefix_away() -> None:
     x, y = torch.zeros(1), torch.ones(1)
     assert part_of({"a.x": x, "ab.x": y, "x": y}, "a.") == {"x": x}

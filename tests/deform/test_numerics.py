@@ -18,8 +18,9 @@ from dyngs.config import DynamicModel, HexplaneField, SkeletonField, StaticModel
 from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
 from dyngs.deform.hexplane import Hexplane, time_rows
-from dyngs.deform.model import DynamicScene, box_of
+from dyngs.deform.model import DynamicScene
 from dyngs.deform.motion import MAX_SAMPLES, measure_motion
+from dyngs.deform.seeds import box_of
 from dyngs.deform.skeleton import Skeleton
 from dyngs.deform.trained import TrainedScene
 from dyngs.deform.window import FRONTIER_VIEWS, TimeWindow

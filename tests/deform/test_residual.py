@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -11,8 +13,9 @@ from tiny_fields import cloud
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.data.capture import View
 from dyngs.data.loader import Picture
-from dyngs.deform.residual import residual_scores, two_group_threshold
+from dyngs.deform.residual import MIN_SAME, cameras_in_place, residuals_of, two_group_threshold, views_to_compare
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, render
 
@@ -58,10 +61,17 @@ def left_half() -> Tensor:
     return half
 
 
+def scores_of(gaussians: Gaussians, pictures: list[Picture], background: Tensor) -> Tensor:
+    """(N,) of cameras that do not stay in place."""
+    found = residuals_of(lambda _: gaussians, pictures, OPTIONS, background)
+    assert torch.equal(found.most, found.usual)
+    return found.most
+
+
 def test_what_the_pictures_show_has_no_error() -> None:
     gaussians = cloud(12)
     pictures = [picture(rendered(gaussians, view=view), view=view) for view in range(3)]
-    assert residual_scores(gaussians, pictures, OPTIONS, BLACK).max() < 1e-6
+    assert scores_of(gaussians, pictures, BLACK).max() < 1e-6
 
 
 @settings(max_examples=25, deadline=None)
@@ -71,14 +81,14 @@ def test_a_known_colour_is_the_error(colour: list[float]) -> None:
     ball = balls(sideways(0.0), sideways(0.5)).replace(logit_opacities=torch.tensor([4.0, -4.0]))
     pictures = [picture(rendered(ball, view=view) + torch.tensor(colour), view=view) for view in range(3)]
     expected = sum(abs(x) for x in colour) / 3
-    assert residual_scores(ball, pictures, OPTIONS, BLACK).tolist() == pytest.approx([expected] * 2, rel=1e-3, abs=1e-6)
+    assert scores_of(ball, pictures, BLACK).tolist() == pytest.approx([expected] * 2, rel=1e-3, abs=1e-6)
 
 
 def test_errors_count_where_a_gaussian_shows() -> None:
     """The left half is wrong by 0.3: one ball is in it, one in the other half, one on the border."""
     scene = balls(sideways(-0.9), sideways(0.9), sideways(0.0))
     wrong = picture(rendered(scene) + 0.3 * left_half()[..., None])
-    left, right, border = residual_scores(scene, [wrong], OPTIONS, BLACK).tolist()
+    left, right, border = scores_of(scene, [wrong], BLACK).tolist()
     assert (left, right) == pytest.approx((0.3, 0.0), abs=0.01)
     assert 0.05 < border < 0.25
 
@@ -87,7 +97,7 @@ def test_masked_pixels_do_not_count() -> None:
     scene = balls(sideways(-0.9), sideways(0.9), sideways(0.0))
     truth = rendered(scene) + 0.3 * left_half()[..., None]
     for mask, expected in ((left_half(), [0.3, 0.0, 0.3]), (1 - left_half(), [0.0, 0.0, 0.0])):
-        scores = residual_scores(scene, [picture(truth, mask)], OPTIONS, BLACK)
+        scores = scores_of(scene, [picture(truth, mask)], BLACK)
         assert scores.tolist() == pytest.approx(expected, abs=0.01)
 
 
@@ -101,21 +111,20 @@ def test_what_shows_nowhere_has_no_error() -> None:
     logits, scales = scene.logit_opacities.clone(), scene.log_scales.clone()
     logits[4], logits[5:], scales[5:] = -20.0, 20.0, 3.0
     scene = scene.replace(logit_opacities=logits, log_scales=scales)
-    scores = residual_scores(scene, [picture(torch.ones(SIZE, SIZE, 3))], OPTIONS, BLACK)
+    scores = scores_of(scene, [picture(torch.ones(SIZE, SIZE, 3))], BLACK)
     assert scores[:5].tolist() == [0.0] * 5
     assert scores[5] > 0.3
-    assert residual_scores(scene, [], OPTIONS, BLACK).tolist() == [0.0] * 8
 
 
 def test_the_background_lies_behind_both() -> None:
     """Where a picture is transparent, the truth is the background."""
     scene, clear = balls(sideways(0.0)), torch.zeros(SIZE, SIZE)
     empty = picture(torch.zeros(SIZE, SIZE, 3), alpha=clear)
-    errors = [float(residual_scores(scene, [empty], OPTIONS, colour)) for colour in (BLACK, WHITE)]
+    errors = [float(scores_of(scene, [empty], colour)) for colour in (BLACK, WHITE)]
     assert errors[0] == pytest.approx(errors[1], rel=1e-3)  # grey is as far from black as from white
     assert 0.2 < errors[0] < 0.5
     grey = torch.full((3,), 0.5)
-    assert float(residual_scores(scene, [empty], OPTIONS, grey)) == pytest.approx(0.0, abs=1e-6)
+    assert float(scores_of(scene, [empty], grey)) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_detail_cancels_in_a_view_but_not_between_views() -> None:
@@ -124,9 +133,9 @@ def test_detail_cancels_in_a_view_but_not_between_views() -> None:
     signs = torch.ones(SIZE)
     signs[1::2] = -1.0
     stripes = picture(rendered(ball) + 0.3 * signs[None, :, None])
-    assert float(residual_scores(ball, [stripes], OPTIONS, BLACK)) < 0.02
+    assert float(scores_of(ball, [stripes], BLACK)) < 0.02
     changes = [picture(rendered(ball, view=view) + 0.3 * (-1) ** view, view=view) for view in range(2)]
-    assert float(residual_scores(ball, changes, OPTIONS, BLACK)) == pytest.approx(0.3, rel=1e-3)
+    assert float(scores_of(ball, changes, BLACK)) == pytest.approx(0.3, rel=1e-3)
 
 
 def test_it_is_the_weighted_mean() -> None:
@@ -145,7 +154,7 @@ def test_it_is_the_weighted_mean() -> None:
             share = rendered(gaussians.replace(sh=sh), view=view)[..., 0] * counts
             error[i] += (share[..., None] * wrong).sum((0, 1)).abs().mean()
             weight[i] += share.sum()
-    scores = residual_scores(gaussians, iter(pictures), OPTIONS, WHITE)
+    scores = scores_of(gaussians, pictures, WHITE)
     assert (weight > 0.1).sum() > 5
     torch.testing.assert_close(scores, error / weight.clamp_min(1e-6), rtol=1e-3, atol=1e-5)
 
@@ -153,7 +162,7 @@ def test_it_is_the_weighted_mean() -> None:
 def test_nothing_is_left_behind() -> None:
     """Neither gradients nor changes; leaf tensors are taken too."""
     gaussians = Gaussians(**{name: x.clone().requires_grad_() for name, x in cloud(5).tensors().items()})
-    scores = residual_scores(gaussians, [picture(torch.rand(SIZE, SIZE, 3))], OPTIONS, BLACK)
+    scores = scores_of(gaussians, [picture(torch.rand(SIZE, SIZE, 3))], BLACK)
     assert not scores.requires_grad
     for name, x in gaussians.tensors().items():
         assert x.grad is None
@@ -162,9 +171,73 @@ def test_nothing_is_left_behind() -> None:
 
 def test_no_gaussians() -> None:
     nobody = cloud(3).select(torch.zeros(0, dtype=torch.long))
-    scores = residual_scores(nobody, [picture(torch.ones(SIZE, SIZE, 3))], OPTIONS, BLACK)
+    scores = scores_of(nobody, [picture(torch.ones(SIZE, SIZE, 3))], BLACK)
     assert scores.shape == (0,)
     assert two_group_threshold(scores) == float("inf")
+
+
+# --- cameras that stay in place ---------------------------------------------------------------------------------------
+
+
+def in_place(*errors: float, view: int = 0) -> list[Picture]:
+    """What one camera shows while all of the picture is brighter by ``errors``, one after the other."""
+    ball = balls(sideways(0.0))
+    return [picture(rendered(ball, view=view) + error, view=view) for error in errors]
+
+
+def test_what_a_still_model_has_not_learned_is_no_motion() -> None:
+    """Wrong by far, but in all pictures alike; with too few pictures to know, it may be motion."""
+    ball = balls(sideways(0.0))
+    found = residuals_of(lambda _: ball, in_place(*[0.4] * MIN_SAME), OPTIONS, BLACK)
+    assert (float(found.most), float(found.usual)) == pytest.approx((0.0, 0.0), abs=1e-6)
+    few = residuals_of(lambda _: ball, in_place(*[0.4] * (MIN_SAME - 1)), OPTIONS, BLACK)
+    assert float(few.most) == pytest.approx(0.4, rel=1e-3)
+
+
+def test_what_is_hidden_at_times_does_not_move() -> None:
+    """Something passes in front in two of ten pictures: seen by ``most``, not by ``usual``."""
+    found = residuals_of(lambda _: balls(sideways(0.0)), in_place(*[0.0] * 8, 0.3, 0.3), OPTIONS, BLACK)
+    assert (float(found.most), float(found.usual)) == pytest.approx((0.3, 0.0), rel=1e-3, abs=1e-6)
+
+
+def test_what_changes_again_and_again_moves() -> None:
+    found = residuals_of(lambda _: balls(sideways(0.0)), in_place(*[0.0] * 6, 0.1, 0.2, 0.3, 0.4), OPTIONS, BLACK)
+    assert float(found.most) == pytest.approx(0.4, rel=1e-3)
+    assert float(found.usual) == pytest.approx(0.1, rel=1e-3)
+
+
+def test_pictures_in_which_a_gaussian_does_not_show_do_not_count() -> None:
+    """Seen by one of two cameras, which sees it change in every second picture."""
+    ball = balls(sideways(0.0))
+    beside = [picture(torch.zeros(SIZE, SIZE, 3), torch.zeros(SIZE, SIZE), view=1)] * 10
+    found = residuals_of(lambda _: ball, in_place(*[0.0, 0.3] * 3) + beside, OPTIONS, BLACK)
+    assert float(found.usual) == pytest.approx(0.3, rel=1e-3)
+
+
+def test_a_camera_that_stays_is_preferred_to_one_that_does_not() -> None:
+    pictures = in_place(0.0, 0.0, 0.0) + in_place(0.5, view=1)
+    found = residuals_of(lambda _: balls(sideways(0.0)), pictures, OPTIONS, BLACK)
+    assert float(found.most) == pytest.approx(0.0, abs=1e-6)
+
+
+def views(*cameras: int) -> list[View]:
+    """From one of three places each."""
+    poses, intrinsics = look_around(3, torch.float64).numpy(), camera().intrinsics[0].double().numpy()
+    return [View(str(i), Path("x.png"), poses[place], intrinsics, SIZE, SIZE) for i, place in enumerate(cameras)]
+
+
+def test_views_are_evenly_chosen_of_a_moving_camera() -> None:
+    assert views_to_compare(views(0, 1, 2), 50) == [0, 1, 2]
+    assert views_to_compare(views(0, 1, 2, 0, 1, 2), 3) == [0, 2, 4]
+    assert views_to_compare([], 3) == []
+
+
+def test_of_cameras_in_place_few_are_chosen_with_many_moments() -> None:
+    chosen = views_to_compare(views(*[0, 1, 2] * 40), 20)
+    assert chosen == [*range(0, 120, 12), *range(1, 120, 12)]
+    assert views_to_compare(views(0, 0, 0, 1), 50) == [0, 1, 2]
+    assert cameras_in_place(views(0, 1, 1, 0, 1, 2)) == [[1, 2, 4]]
+    assert cameras_in_place(views(0, 1, 2, 0, 1, 2)) == []
 
 
 # --- two groups -------------------------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tiny_fields import KINDS, cloud, stirred_field, tiny_field, tiny_options, tiny_setup
@@ -10,6 +12,7 @@ from torch import Tensor
 from dyngs.config import DynamicModel, StaticModel
 from dyngs.deform.field import deformed
 from dyngs.deform.fields import field_state
+from dyngs.deform.masks import KeyMasks
 from dyngs.deform.trained import TrainedScene, trained_scene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -120,6 +123,22 @@ def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
     means = gaussians.means if rows is None else gaussians.means[rows]
     moved = deformed(gaussians, field.offsets(means, 0.3), rows) if num_moving else gaussians
     assert same(scene.at(0.3), fuse_filter(moved, torch.ones(9)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("filtered", [False, True])
+def test_masks_show_the_same_of_fewer(kind: str, filtered: bool) -> None:
+    """Before, between and after key times, in any order of times; parts and sizes are those of all Gaussians."""
+    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if filtered else None)
+    seen = torch.rand(3, 9, generator=torch.Generator().manual_seed(1)) < 0.4
+    masked = replace(scene, masks=KeyMasks.pack((0.0, 0.5, 1.0), seen))
+    for time, active in ((0.1, seen[:2]), (0.9, seen[1:]), (0.3, seen[:2]), (1.0, seen[1:]), (None, seen[:2])):
+        found, whole = masked.at(time), scene.at(time).select(active.any(0))
+        for name, x in found.tensors().items():
+            torch.testing.assert_close(x, whole.tensors()[name], rtol=0, atol=1e-6)
+    assert len(masked) == 9
+    assert same(masked.part("moving").at(0.4), scene.part("moving").at(0.4))
+    assert same(masked.unmasked().at(0.4), scene.at(0.4))
 
 
 def test_a_state_without_field_is_a_still_scene() -> None:

@@ -1,0 +1,85 @@
+"""Which Gaussians can be seen around a moment: bits at key times (the temporal filter of 4DGS-1K, Yuan et al. 2025).
+
+Local letters: K key times, A Gaussians active at a time.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+BITS = 8
+
+
+@dataclass(frozen=True)
+class KeyMasks:
+    """For each of N Gaussians, at which of K >= 2 key times it is seen.
+
+    Attributes:
+        times: distinct, ascending, in [0, 1].
+        bits: (K, ceil(N / 8)) uint8; Gaussian i is bit i % 8 of byte i // 8.
+        count: N.
+    """
+
+    times: tuple[float, ...]
+    bits: Tensor
+    count: int
+
+    @staticmethod
+    def pack(times: tuple[float, ...], seen: Tensor) -> KeyMasks:
+        """The masks of ``seen`` (K, N) bool."""
+        padded = torch.nn.functional.pad(seen, (0, -seen.shape[1] % BITS)).unflatten(1, (-1, BITS))
+        return KeyMasks(times, (padded * _places()).sum(2).to(torch.uint8), seen.shape[1])
+
+    @property
+    def seen(self) -> Tensor:
+        """(K, N) bool."""
+        return _unpacked(self.bits, self.count)
+
+    def interval(self, time: float) -> int:
+        """k such that ``time`` lies between key times k and k + 1, the nearest two where it lies outside all."""
+        return min(max(bisect_right(self.times, time) - 1, 0), len(self.times) - 2)
+
+    def active(self, interval: int) -> Tensor:
+        """(A,) ascending indices of the Gaussians seen at one end of an interval at least."""
+        either = self.bits[interval] | self.bits[interval + 1]
+        return torch.nonzero(_unpacked(either[None], self.count)[0])[:, 0]
+
+    def select(self, index: Tensor) -> KeyMasks:
+        """The masks of the Gaussians at ``index`` (long)."""
+        return KeyMasks.pack(self.times, self.seen[:, index])
+
+    def state(self) -> dict[str, Tensor]:
+        """By name, for a checkpoint."""
+        times = torch.tensor(self.times, dtype=torch.float64)
+        return {"times": times, "bits": self.bits, "count": torch.tensor([self.count])}
+
+    @staticmethod
+    def restored(state: Mapping[str, Tensor]) -> KeyMasks | None:
+        """What ``state()`` returned as masks; None of an empty one. Raises KeyError where something is missing."""
+        if not state:
+            return None
+        return KeyMasks(tuple(state["times"].tolist()), state["bits"], int(state["count"]))
+
+
+def matched(rows: Tensor, active: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Places in ``rows`` of what is in both, and their places in ``active``; both ascending indices below ``count``."""
+    place = torch.full((count,), -1)
+    place[rows] = torch.arange(len(rows))
+    found = place[active]
+    places = torch.nonzero(found >= 0)[:, 0]
+    return found[places], places
+
+
+def _places() -> Tensor:
+    return 2 ** torch.arange(BITS, dtype=torch.int64)
+
+
+def _unpacked(bits: Tensor, count: int) -> Tensor:
+    """(K, N) bool of packed bits (K, ceil(N / 8))."""
+    places = torch.arange(BITS, dtype=torch.uint8)
+    return ((bits[..., None] >> places) & 1).bool().flatten(1)[:, :count]

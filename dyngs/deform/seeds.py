@@ -1,0 +1,52 @@
+"""Faint Gaussians all over a scene, to catch what a still model has lost."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.static.densify import EditResult
+
+BOX_MARGIN = 1.1
+SEED_SIZE = 0.3
+"""Standard deviation of a seed, in distances between them."""
+SEED_LOGIT = -2.2
+"""Opacity 0.1, as all Gaussians begin."""
+SOLID = 0.05
+"""Opacity from which a Gaussian counts for the box in which things move."""
+
+
+def seeded(gaussians: Gaussians, count: int, extent: float, generator: torch.Generator) -> EditResult:
+    """The edit that adds ``count`` faint grey Gaussians, spread evenly in the box of ``gaussians``."""
+    center, half_size = box_of(gaussians, extent)
+    places = center + half_size * (2 * torch.rand((count, 3), generator=generator) - 1)
+    spacing = float((2 * half_size).prod() / max(count, 1)) ** (1 / 3)
+    source = torch.cat([torch.arange(len(gaussians)), torch.zeros(count, dtype=torch.long)])
+    is_new = torch.arange(len(source)) >= len(gaussians)
+    changes = {
+        "means": torch.cat([gaussians.means, places]),
+        "quats": torch.cat([gaussians.quats, torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(count, 4)]),
+        "log_scales": torch.cat([gaussians.log_scales, torch.full((count, 3), math.log(SEED_SIZE * spacing))]),
+        "logit_opacities": torch.cat([gaussians.logit_opacities, torch.full((count,), SEED_LOGIT)]),
+        "sh": torch.cat([gaussians.sh, torch.zeros(count, *gaussians.sh.shape[1:])]),
+    }
+    return EditResult(TopologyEdit(source, is_new), changes)
+
+
+def box_of(gaussians: Gaussians, extent: float) -> tuple[Tensor, Tensor]:
+    """Centre and half sides (3,) of the box around what is solid, a little larger; no side is zero.
+
+    The outer percent of the Gaussians on either side is left out: there the field is that of the box's border.
+    """
+    now = gaussians.detach()
+    solid = (now.opacities >= SOLID) & now.means.isfinite().all(1)
+    means = now.means[solid] if bool(solid.any()) else now.means.nan_to_num()
+    if not len(means):
+        return torch.zeros(3), torch.full((3,), extent)
+    ordered = means.sort(dim=0).values
+    low, high = ordered[int(0.01 * (len(ordered) - 1))], ordered[math.ceil(0.99 * (len(ordered) - 1))]
+    half_size = (0.5 * BOX_MARGIN * (high - low)).clamp_min(max(1e-3 * extent, 1e-6))
+    return 0.5 * (low + high), half_size
