@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,6 +16,10 @@ from dyngs.ops.finite import check_finite, finite_rows
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
+
+Shader = Callable[[Gaussians, Cameras, Tensor], Tensor]
+"""(V, N, 3) colours of N Gaussians for V cameras. Those with radii (V, N, 2) of zero are not drawn: theirs are of no
+matter, but finite. What is other than harmonics, or depends on more than the direction, comes into ``render`` so."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +84,7 @@ def render(
     *,
     background: Tensor | None = None,
     probe: Tensor | None = None,
+    shader: Shader | None = None,
 ) -> Rendering:
     """Pictures of the Gaussians from every camera (Kerbl et al. 2023), differentiable in all of them.
 
@@ -88,6 +94,7 @@ def render(
         options: how to draw.
         background: (3,) or (V, 3) colour; None = black.
         probe: (V, N, 4) zeros whose gradient is the densification signal, see ``rasterize``.
+        shader: gives the colours; None: the Gaussians' harmonics do.
 
     Raises:
         DyngsError: NaN or infinite input (names the argument and the count), or a render too large to bin.
@@ -97,8 +104,7 @@ def render(
         _check_finite_views(cameras, background)
         gaussians = _deal_with_nonfinite(gaussians, options.nonfinite)
     projection, opacities = _project(gaussians, cameras, options)
-    degree = gaussians.sh_degree if options.sh_degree is None else min(options.sh_degree, gaussians.sh_degree)
-    colors = evaluate_harmonics(gaussians.means, cameras.centers, gaussians.sh, projection.radii, degree)
+    colors = _colors(gaussians, cameras, projection.radii, options, shader)
     if background is not None:
         background = background.to(colors.dtype).expand(len(cameras), 3)
     if options.depth != "none":
@@ -123,6 +129,34 @@ def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions
     gaussians, cameras = _one_dtype(gaussians.detach(), cameras)
     projection, opacities = _project(gaussians, cameras, options)
     return tally(projection, opacities, (cameras.width, cameras.height), Tally.WEIGHTS, options.blending)
+
+
+def sensitivities(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    options: RenderOptions = RenderOptions(),
+    *,
+    background: Tensor | None = None,
+    shader: Shader | None = None,
+) -> Tensor:
+    """(V, N) sum over pixels of (dI/dG)^2, I a pixel's channels added up, G the Gaussian there (Tu et al. 2026)."""
+    gaussians, cameras = _one_dtype(gaussians.detach(), cameras)
+    projection, opacities = _project(gaussians, cameras, options)
+    colors = _colors(gaussians, cameras, projection.radii, options, shader)
+    if background is not None:
+        background = background.to(colors.dtype).expand(len(cameras), 3)
+    size, kind = (cameras.width, cameras.height), Tally.SQUARED_SLOPES
+    return tally(projection, opacities, size, kind, options.blending, colors=colors, background=background)
+
+
+def _colors(
+    gaussians: Gaussians, cameras: Cameras, radii: Tensor, options: RenderOptions, shader: Shader | None
+) -> Tensor:
+    """(V, N, 3)."""
+    if shader is not None:
+        return shader(gaussians, cameras, radii)
+    degree = gaussians.sh_degree if options.sh_degree is None else min(options.sh_degree, gaussians.sh_degree)
+    return evaluate_harmonics(gaussians.means, cameras.centers, gaussians.sh, radii, degree)
 
 
 def _project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Projection, Tensor]:

@@ -10,11 +10,12 @@ import torch
 from scenes import REFERENCE, Limits, Scene, draw, look_around, random_scene, weights
 from torch import Tensor
 
-from dyngs.conventions import RasterizeMode
+from dyngs.camera import Cameras
+from dyngs.conventions import SH_C0, RasterizeMode
 from dyngs.gaussians import Gaussians
 from dyngs.ops.projection import ProjectionOptions
 from dyngs.ops.rasterization import BlendOptions
-from dyngs.rendering import Rendering, RenderOptions, contributions, render
+from dyngs.rendering import Rendering, RenderOptions, contributions, render, sensitivities
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -49,6 +50,25 @@ def test_is_the_three_ops_in_a_row(mode: RasterizeMode) -> None:
     torch.testing.assert_close(ours.alpha, 1 - truth.blended.transmittance, rtol=1e-9, atol=1e-12)
     assert ours.depth is None
     assert torch.equal(ours.radii, truth.projection.radii)
+
+
+def test_a_shader_gives_the_colours() -> None:
+    """Instead of the harmonics; it sees what is drawn and where from, and its gradients go on."""
+    scene = random_scene(degree=1)
+    gaussians, asked = leaves(scene.gaussians), []
+
+    def shader(drawn: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
+        asked.append((len(drawn), len(cameras), radii.shape))
+        return drawn.base_rgb.clamp_min(0).expand(len(cameras), -1, -1)
+
+    ours = render(gaussians, scene.cameras, shader=shader).rgb
+    plain = render(leaves(scene.gaussians), scene.cameras, RenderOptions(sh_degree=0)).rgb
+    torch.testing.assert_close(ours, plain, rtol=1e-12, atol=1e-12)
+    assert asked == [(20, 2, (2, 20, 2))]
+    ours.sum().backward()
+    assert gaussians.sh.grad is not None
+    assert gaussians.sh.grad[:, 0].any()
+    assert not gaussians.sh.grad[:, 1:].any()
 
 
 @pytest.mark.parametrize("depth", ["accumulated", "expected"])
@@ -168,6 +188,23 @@ def test_probe_collects_the_densification_signal() -> None:
         assert probe.grad[..., 2:].any() == absgrad
         if absgrad:
             assert (probe.grad[..., 2:] >= probe.grad[..., :2].abs() - 1e-12).all()
+
+
+@pytest.mark.parametrize("shaded", [False, True])
+def test_sensitivity_of_a_half_transparent_wall(shaded: bool) -> None:
+    """dI/dG = o (c - B) with opacity 0.5, channels of 0.7 before a background of 0.3: (0.5 * 3 * 0.4)^2 per pixel."""
+    gaussians, scene = half_transparent_wall()
+    color = torch.full((1, 1, 3), 0.7, dtype=torch.float64)
+    if not shaded:
+        gaussians = gaussians.replace(sh=(color - 0.5) / SH_C0)
+    found = sensitivities(
+        gaussians,
+        scene.cameras,
+        background=torch.full((3,), 0.3, dtype=torch.float64),
+        shader=(lambda drawn, cameras, radii: color) if shaded else None,
+    )
+    pixels = scene.cameras.width * scene.cameras.height
+    torch.testing.assert_close(found, torch.full((1, 1), 0.36 * pixels, dtype=torch.float64), rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("mode", RasterizeMode)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.colour.network import Frame
 from dyngs.gaussians import Gaussians
 from dyngs.static.densify import EditResult
 from dyngs.static.filters import filter_std, fuse_filter
@@ -20,10 +21,12 @@ class Drawn:
     Attributes:
         gaussians: differentiable in the parameters.
         penalties: differentiable regularizers, weighted, by name.
+        frame: where they are at rest, if colours should follow a body.
     """
 
     gaussians: Gaussians
     penalties: dict[str, Tensor] = field(default_factory=dict)
+    frame: Frame | None = None
 
 
 class StaticScene:
@@ -44,11 +47,15 @@ class StaticScene:
 
     def gaussians_at(self, parameters: Gaussians, batch: object, step: int) -> Drawn:
         """What is drawn; ``batch`` and ``step`` are of no matter here."""
-        if not self._cameras:
-            return Drawn(parameters)
-        if self._filter_std is None or len(self._filter_std) != len(parameters):
+        if self._cameras and (self._filter_std is None or len(self._filter_std) != len(parameters)):
             self._filter_std = filter_std(parameters.means, self._cameras)
-        return Drawn(fuse_filter(parameters, self._filter_std))
+        return Drawn(self.filtered(parameters))
+
+    def filtered(self, gaussians: Gaussians, rows: Tensor | None = None) -> Gaussians:
+        """What is drawn of the Gaussians, or, where ``rows`` (A,) are given, of those A; the filter as it was last."""
+        if self._filter_std is None:
+            return gaussians
+        return fuse_filter(gaussians, self._filter_std if rows is None else self._filter_std[rows])
 
     def after_step(self, parameters: Gaussians, step: int, result: EditResult | None) -> int:
         """Bring what depends on the parameters up to date; nothing of its own is optimized, so 0 is returned."""

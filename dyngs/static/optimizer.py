@@ -23,16 +23,14 @@ class GaussianOptimizer:
         self.parameters = _as_leaves(gaussians.tensors())
         self._exp_avg = {name: torch.zeros_like(x.detach()) for name, x in gaussians.tensors().items()}
         self._exp_avg_sq = {name: torch.zeros_like(x.detach()) for name, x in gaussians.tensors().items()}
-        self._lr_sh = torch.full((gaussians.sh.shape[1], 3), options.lr_sh_rest)
-        self._lr_sh[0] = options.lr_sh_dc
-        self._lr_sh = self._lr_sh.reshape(-1)
 
-    def step(self, step: int, lr_means: float, *, dense: bool) -> int:
+    def step(self, step: int, lr_means: float, *, dense: bool, frozen_rest: Tensor | None = None) -> int:
         """How many rows were left out for a gradient that is not finite; updates parameters and drops the gradients.
 
         Args:
             step: number of this step, from 1, for Adam's bias correction.
             lr_means: learning rate of the means, world units.
+            frozen_rest: (N,) bool, Gaussians of whose harmonics only the base colour is updated; None: none.
             dense: update all Gaussians; otherwise, if ``optim.sparse``, only those that received a gradient: the others
                 keep parameters and moments.
         """
@@ -42,8 +40,10 @@ class GaussianOptimizer:
             "quats": self.options.lr_quats,
             "log_scales": self.options.lr_scales,
             "logit_opacities": self.options.lr_opacities,
-            "sh": self._lr_sh,
+            "sh": self._harmonics_rates(),
         }
+        if frozen_rest is not None and self.parameters.sh.grad is not None:
+            self.parameters.sh.grad[frozen_rest, 1:] = 0
         left_out = 0
         for name, x in self.parameters.tensors().items():
             if x.grad is not None:
@@ -79,6 +79,22 @@ class GaussianOptimizer:
                 moved[name] = x if result.edit is None else result.edit.apply(x.detach())
         self.parameters = _as_leaves(moved)
 
+    def drop_rest(self, base: Tensor, frozen_rest: Tensor) -> None:
+        """Replace harmonics by a base colour, for good: rest and moments become zero; if they do for all, they go.
+
+        Args:
+            base: (N, 3) new constant coefficients.
+            frozen_rest: (N,) bool, the Gaussians that have only that; the others stay as they are.
+        """
+        chosen = frozen_rest[:, None, None]
+        sh = self.parameters.sh.detach()
+        plain = torch.cat([base[:, None], torch.zeros_like(sh[:, 1:])], dim=1)
+        count = 1 if bool(frozen_rest.all()) else sh.shape[1]
+        self.parameters = _as_leaves({**self.parameters.tensors(), "sh": torch.where(chosen, plain, sh)[:, :count]})
+        for moments in (self._exp_avg, self._exp_avg_sq):
+            rest = torch.where(chosen, 0.0, moments["sh"][:, 1:])
+            moments["sh"] = torch.cat([moments["sh"][:, :1], rest], dim=1)[:, :count].contiguous()
+
     def state(self) -> dict[str, Tensor]:
         """Parameters and moments by name, for a checkpoint: ``gaussians.*``, ``exp_avg.*``, ``exp_avg_sq.*``."""
         state = {f"gaussians.{name}": x.detach() for name, x in self.parameters.tensors().items()}
@@ -91,6 +107,12 @@ class GaussianOptimizer:
         self.parameters = _as_leaves({name: state[f"gaussians.{name}"].clone() for name in names})
         self._exp_avg = {name: state[f"exp_avg.{name}"].clone() for name in names}
         self._exp_avg_sq = {name: state[f"exp_avg_sq.{name}"].clone() for name in names}
+
+    def _harmonics_rates(self) -> Tensor:
+        """(K * 3,) one rate per coefficient."""
+        rates = torch.full((self.parameters.sh.shape[1], 3), self.options.lr_sh_rest)
+        rates[0] = self.options.lr_sh_dc
+        return rates.reshape(-1)
 
     def _rows_with_gradient(self) -> Tensor:
         """(N,) bool; opacity or position: a Gaussian at full opacity gets no gradient on its opacity alone."""

@@ -77,6 +77,46 @@ def test_a_row_with_nan_gradients_is_counted_and_left_alone() -> None:
     assert moved.tolist() == [True, True, False, True]
 
 
+def test_of_frozen_gaussians_only_the_base_colour_learns() -> None:
+    optimizer = GaussianOptimizer(_gaussians(4), OptimConfig())
+    frozen = torch.tensor([False, True, True, False])
+    before = optimizer.parameters.sh.detach().clone()
+    _set_gradients(optimizer, 1)
+    optimizer.step(1, 0.1, dense=True, frozen_rest=frozen)
+    changed = optimizer.parameters.sh.detach() != before
+    assert changed[:, 0].all()
+    assert changed[:, 1:].flatten(1).any(1).tolist() == [True, False, False, True]
+
+
+@pytest.mark.parametrize("frozen", [(False, True, False), (True, True, True)])
+def test_dropped_harmonics_stay_zero(frozen: tuple[bool, ...]) -> None:
+    """Others keep theirs, with their moments; if nobody keeps them, there are none, in checkpoints neither."""
+    optimizer = GaussianOptimizer(_gaussians(3), OptimConfig())
+    _set_gradients(optimizer, 1)
+    optimizer.step(1, 0.1, dense=True)
+    before = {name: x.clone() for name, x in optimizer.state().items()}
+    rows, base = torch.tensor(frozen), torch.full((3, 3), 0.7)
+    optimizer.drop_rest(base, rows)
+    after = optimizer.state()
+    assert torch.equal(after["gaussians.sh"][rows, 0], base[rows])
+    assert not after["gaussians.sh"][rows, 1:].any()
+    for name, x in before.items():
+        if not name.endswith(".sh"):
+            assert torch.equal(after[name], x), name
+        elif not all(frozen):
+            assert torch.equal(after[name][~rows], x[~rows]), name
+    terms = 1 if all(frozen) else before["gaussians.sh"].shape[1]
+    assert optimizer.parameters.sh.shape == (3, terms, 3)
+    other = GaussianOptimizer(_gaussians(3), OptimConfig())
+    other.load_state({name: x.clone() for name, x in after.items()})
+    for each in (optimizer, other):
+        for x in each.parameters.tensors().values():
+            x.grad = torch.ones_like(x)
+        each.step(2, 0.1, dense=True, frozen_rest=rows)
+        assert not each.parameters.sh[rows, 1:].any()
+    assert torch.equal(optimizer.parameters.sh, other.parameters.sh)
+
+
 def test_an_edit_moves_parameters_and_moments() -> None:
     optimizer = GaussianOptimizer(_gaussians(4), OptimConfig())
     _set_gradients(optimizer, 1)

@@ -1,0 +1,169 @@
+"""Colours from three base values per Gaussian and one small network for all of them (MEGA, Zhang et al. 2024).
+
+MEGA draws sigmoid(c_dc + F(mu, d, t, c_dc)) with F a perceptron, d the unit direction from the camera to the centre
+mu. Here F is added to the base colour of the harmonics before their clamp, max(0, rgb + F(...)): so files that hold the
+base colours alone stay right, and a network whose last layer is zero changes nothing. Gradients of F by mu and d are
+stopped, so that colours do not move Gaussians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.gaussians import Gaussians
+from dyngs.ops.perceptron import Layer, perceptron
+from dyngs.rendering import Shader
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where a moving body was at rest: colours of what is painted on it follow it.
+
+    Attributes:
+        places: (N, 3) centres of the drawn Gaussians at rest.
+        turn: (3, 3) rotation of the body from rest to the world.
+    """
+
+    places: Tensor
+    turn: Tensor
+
+
+@dataclass(frozen=True)
+class ColourNetwork:
+    """F: what is added to the base colour of a Gaussian, by place, direction, normal and time.
+
+    Attributes:
+        layers: first to last; 3 outputs.
+        box: (2, 3) centre and half sides of the scene, world units.
+        sees_time: time is an input.
+        sees_normals: the cosine between the shortest axis of the Gaussian and the direction, and the direction mirrored
+            at that axis, are inputs.
+    """
+
+    layers: tuple[Layer, ...]
+    box: Tensor
+    sees_time: bool
+    sees_normals: bool
+
+    @property
+    def num_values(self) -> int:
+        """How many numbers it holds."""
+        return self.box.numel() + sum(layer.weight.numel() + layer.bias.numel() for layer in self.layers)
+
+    def shader(self, time: float | None, frame: Frame | None = None) -> Shader:
+        """Colours at ``time`` (clamped to [0, 1], None is 0), for ``render``; ``frame`` for Gaussians on a body."""
+
+        def colors(gaussians: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
+            views = [
+                self._seen_from(gaussians, center, shown[:, 0] > 0, time, frame)
+                for center, shown in zip(cameras.centers, radii, strict=True)
+            ]
+            return torch.stack(views) if views else gaussians.means.new_empty(0, len(gaussians), 3)
+
+        return colors
+
+    def shades(
+        self, geometry: Gaussians, base: Tensor, directions: Tensor, time: float | None, frame: Frame | None = None
+    ) -> Tensor:
+        """(M, 3) colours before their clamp of M Gaussians, seen along unit ``directions`` (M, 3) in the world.
+
+        Args:
+            geometry: where they are and how they lie; no gradient reaches it.
+            base: (M, 3) their base colours.
+            directions: from the camera.
+            time: as in ``shader``.
+            frame: of these M.
+        """
+        features = [*self._features(geometry, directions, frame), base - 0.5]
+        if self.sees_time:
+            moment = min(max(0.0 if time is None else time, 0.0), 1.0)
+            features.append(torch.full_like(base[:, :1], 2 * moment - 1))
+        return base + perceptron(torch.cat(features, dim=1), self.layers)
+
+    def _seen_from(
+        self, gaussians: Gaussians, center: Tensor, drawn: Tensor, time: float | None, frame: Frame | None
+    ) -> Tensor:
+        """(N, 3) colours seen from ``center``; zero, and not computed, for those that are not ``drawn`` (N,)."""
+        rows = torch.nonzero(drawn)[:, 0]
+        geometry = gaussians.detach()
+        if len(rows) < len(gaussians):
+            geometry = geometry.select(rows)
+        if frame is not None:
+            frame = Frame(frame.places[rows], frame.turn)
+        directions = torch.nn.functional.normalize(geometry.means - center.detach(), dim=1)
+        base = gaussians.base_rgb.index_select(0, rows)
+        shown = self.shades(geometry, base, directions, time, frame).clamp_min(0)
+        return shown.new_zeros(len(gaussians), 3).index_copy(0, rows, shown)
+
+    @torch.no_grad()
+    def _features(self, geometry: Gaussians, directions: Tensor, frame: Frame | None) -> list[Tensor]:
+        """Inputs that no gradient passes: (M, 3) place and direction, and what the normal says."""
+        normals = shortest_axes(geometry.quats, geometry.log_scales) if self.sees_normals else None
+        places = geometry.means
+        if frame is not None:
+            places, directions = frame.places, directions @ frame.turn
+            normals = None if normals is None else normals @ frame.turn
+        center, half_size = self.box.to(places.dtype)
+        features = [contracted((places - center) / half_size), directions]
+        if normals is not None:
+            cosine = (normals * directions).sum(1, keepdim=True)
+            features += [cosine.abs(), directions - 2 * cosine * normals]
+        return features
+
+
+def num_inputs(*, sees_time: bool, sees_normals: bool) -> int:
+    """Width of a network's input: place, direction and base colour, and what it sees beside them."""
+    return 9 + sees_time + 4 * sees_normals
+
+
+def contracted(points: Tensor) -> Tensor:
+    """(M, 3) ``points`` as they are in the unit ball, and what lies outside drawn into one of radius 2.
+
+    (2 - 1 / |x|) x / |x|, the contraction of Barron et al. 2022 (mip-NeRF 360): far things stay bounded inputs.
+    """
+    length = points.norm(dim=1, keepdim=True).clamp_min(1)
+    return points * (2 - 1 / length) / length
+
+
+def shortest_axes(quats: Tensor, log_scales: Tensor) -> Tensor:
+    """(M, 3) unit vectors along the shortest axis of each Gaussian: the normal of what is flat, up to its sign."""
+    # Components first: long rows are what elementwise operations are fast on.
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).T.contiguous()
+    shortest = log_scales.argmin(dim=1)
+    a, b, c = ((shortest == axis).to(quats.dtype) for axis in range(3))
+    rows = (
+        a * (1 - 2 * (y * y + z * z)) + 2 * (b * (x * y - w * z) + c * (x * z + w * y)),
+        b * (1 - 2 * (x * x + z * z)) + 2 * (a * (x * y + w * z) + c * (y * z - w * x)),
+        c * (1 - 2 * (x * x + y * y)) + 2 * (a * (x * z - w * y) + b * (y * z + w * x)),
+    )
+    return torch.stack(rows, dim=1)
+
+
+def box_around(means: Tensor) -> Tensor:
+    """(2, 3) centre and half sides of the box that holds ``means`` (N, 3) but their outer percent; no side is zero."""
+    if not len(means):
+        return torch.stack([torch.zeros(3), torch.ones(3)])
+    ordered = means.detach().sort(dim=0).values
+    last = len(ordered) - 1
+    low, high = ordered[round(0.01 * last)], ordered[round(0.99 * last)]
+    half_size = 0.5 * (high - low)
+    return torch.stack([0.5 * (low + high), half_size.clamp_min(max(1e-3 * float(half_size.max()), 1e-6))])
+
+
+def network_of(state: Mapping[str, Tensor]) -> ColourNetwork | None:
+    """The network of a checkpoint, from the state of its colours; None where there is none.
+
+    Raises:
+        KeyError: the state lacks a tensor.
+    """
+    count = sum(name.startswith("weight") for name in state)
+    if not count:
+        return None
+    layers = tuple(Layer(state[f"weight{i}"], state[f"bias{i}"]) for i in range(count))
+    sees_time, sees_normals = (bool(x) for x in state["sees"])
+    return ColourNetwork(layers, state["box"], sees_time, sees_normals)
