@@ -1,0 +1,113 @@
+"""What each Gaussian is worth: its share of pictures over views and times, weighed in one of several ways.
+
+Local letters: K moments, C (K, N) sums over pixels and views of what a Gaussian contributes at each moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.gaussians import Gaussians
+from dyngs.rendering import RenderOptions, Shader, contributions, sensitivities
+
+STEEPNESS = 4.0
+"""Of the hyperbolic tangent: second differences of a profile are small numbers."""
+VOLUME_POWER = 0.1
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is looked at: every camera at every moment.
+
+    Attributes:
+        at: the N Gaussians at a time.
+        shader_at: what colours them then; None: their harmonics.
+        cameras: V groups of one camera.
+        times: K moments in [0, 1], ascending; one None for a still scene.
+        options: how the scene is drawn.
+        background: (3,) colour.
+    """
+
+    at: Callable[[float | None], Gaussians]
+    shader_at: Callable[[float | None], Shader | None]
+    cameras: Sequence[Cameras]
+    times: Sequence[float | None]
+    options: RenderOptions
+    background: Tensor
+
+
+@dataclass(frozen=True)
+class Worth:
+    """What N Gaussians do at K moments.
+
+    Attributes:
+        shares: (K, N) C, sums over pixels and views of alpha T.
+        slopes: (N,) sums over pixels, views and moments of (dI/dG)^2, or None where that was not asked for.
+        opacities: (K, N).
+        log_volumes: (K, N) sums of the logarithms of the scales.
+    """
+
+    shares: Tensor
+    slopes: Tensor | None
+    opacities: Tensor
+    log_volumes: Tensor
+
+    @property
+    def contribution(self) -> Tensor:
+        """(N,) sum of C over moments."""
+        return self.shares.sum(0)
+
+    @property
+    def temporal(self) -> Tensor:
+        """(N,) sum over moments of gamma g, see ``variation``."""
+        return (self._volumes() * self._variation()).sum(0)
+
+    @property
+    def variation(self) -> Tensor:
+        """(N,) sum_k gamma(k) g(k) C(k), the spatio-temporal variation score of 4DGS-1K (Yuan et al. 2025) for a
+        canonical form that moves.
+
+        gamma(k) = V(k)^0.1 with the volume V, over that of the mean Gaussian; g(k) = 1 / (tanh(4 |d(k)|) / 2 + 1/2) in
+        (1, 2] with the second difference d of the profile p over moments. p is the opacity over its maximum where it
+        changes, and otherwise what is seen, C, smoothed by [1 2 1] / 4, over its maximum.
+        """
+        return (self._volumes() * self._variation() * self.shares).sum(0)
+
+    def _volumes(self) -> Tensor:
+        return (VOLUME_POWER * (self.log_volumes - self.log_volumes.mean())).exp()
+
+    def _variation(self) -> Tensor:
+        fades = bool((self.opacities != self.opacities[:1]).any())
+        profile = self.opacities if fades else _smoothed(self.shares)
+        profile = profile / profile.amax(0).clamp_min(torch.finfo(profile.dtype).tiny)
+        padded = torch.cat([profile[:1], profile, profile[-1:]])
+        bend = padded[2:] - 2 * profile + padded[:-2]
+        return 1 / (0.5 * torch.tanh(STEEPNESS * bend.abs()) + 0.5)
+
+
+@torch.no_grad()
+def worth(survey: Survey, *, slopes: bool) -> Worth:
+    """What every Gaussian contributes to the pictures of a survey; ``slopes`` are the dearer half."""
+    shares, opacities, volumes, squares = [], [], [], torch.zeros(())
+    for time in survey.times:
+        now = survey.at(time)
+        sums = [contributions(now, camera, survey.options)[0] for camera in survey.cameras]
+        shares.append(torch.stack(sums).sum(0))
+        opacities.append(now.opacities)
+        volumes.append(now.log_scales.sum(1))
+        if slopes:
+            shader, behind = survey.shader_at(time), survey.background
+            for camera in survey.cameras:
+                squares = squares + sensitivities(now, camera, survey.options, background=behind, shader=shader)[0]
+    return Worth(torch.stack(shares), squares if slopes else None, torch.stack(opacities), torch.stack(volumes))
+
+
+def _smoothed(x: Tensor) -> Tensor:
+    """(K, N) by [1 2 1] / 4 over K, ends repeated."""
+    padded = torch.cat([x[:1], x, x[-1:]])
+    return (padded[:-2] + 2 * x + padded[2:]) / 4
