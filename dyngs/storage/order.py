@@ -1,0 +1,31 @@
+"""The order in which Gaussians are stored: neighbours in space are neighbours in the file and predict each other."""
+
+from __future__ import annotations
+
+import numpy as np
+
+MORTON_BITS = 20
+"""Of each coordinate; 60 bits in all."""
+
+
+def morton_order(points: np.ndarray) -> np.ndarray:
+    """(N,) indices of ``points`` (N, 3) along a Z-shaped curve through their box (Morton 1966); ties by index."""
+    if not len(points):
+        return np.zeros(0, dtype=np.int64)
+    places = points.astype(np.float64)
+    low = places.min(0)
+    side = max(float((places.max(0) - low).max()), np.finfo(np.float64).tiny)
+    cells = ((places - low) / side * (2**MORTON_BITS - 1)).astype(np.uint64)
+    code = np.zeros(len(points), dtype=np.uint64)
+    for bit in range(MORTON_BITS):
+        for axis in range(3):
+            code |= (cells[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def storage_order(means: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """(N,) indices of ``means`` (N, 3): those that move (``rows``, (M,)), then the others, both in Morton order."""
+    still = np.ones(len(means), dtype=bool)
+    still[rows] = False
+    rest = np.flatnonzero(still)
+    return np.concatenate([rows[morton_order(means[rows])], rest[morton_order(means[rest])]]).astype(np.int64)

@@ -1,0 +1,202 @@
+"""Tensors as whole numbers and back: which kind of number each is, and how exactly it is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.storage.quantize import (
+    LARGEST_STEP,
+    NEAREST,
+    OPACITY_STEPS,
+    ROTATION_STEP,
+    SMALLEST_STEP,
+    SPARSE,
+    Steps,
+    from_grid,
+    is_step,
+    opacities_from_grid,
+    opacities_to_grid,
+    rotations_from_grid,
+    rotations_to_grid,
+    step_below,
+    to_grid,
+)
+
+
+class Kind(str, Enum):
+    """How values become whole numbers."""
+
+    EXACT = "exact"
+    HALF = "half"
+    GRID = "grid"
+    SPARSE = "sparse"
+    OPACITY = "opacity"
+    ROTATION = "rotation"
+
+
+MAX_COARSENESS = 6
+"""Octaves by which the colour steps of a Gaussian that hardly shows exceed those of the others."""
+COARSENESS = "gaussians.coarseness"
+_BY_COARSENESS = ("gaussians.sh_base", "gaussians.sh_rest")
+_KINDS = {
+    "gaussians.quats": Kind.ROTATION,
+    "gaussians.logit_opacities": Kind.OPACITY,
+    "gaussians.sh_rest": Kind.SPARSE,
+}
+_LIMITS = {Kind.ROTATION: (SMALLEST_STEP, ROTATION_STEP), Kind.OPACITY: OPACITY_STEPS}
+FEW = 64
+"""Tensors with no more values are stored as they are."""
+LARGEST_HALF = 65504.0
+RELATIVE = "model.filter_std"
+"""Stored in half precision: it spans orders of magnitude."""
+FIXED_STEPS = {
+    "model.anchors.points": 2.0**-9,
+    "model.anchors.size": 2.0**-13,
+    "model.anchors.height": 2.0**-10,
+    "model.anchors.uv": 2.0**-9,
+    "model.anchors.barycentric": 2.0**-6,
+}
+"""Of what ties a person's Gaussians to the template, m or shares: pictures hardly depend on it, or not at all."""
+
+
+@dataclass(frozen=True)
+class Coding:
+    """How one tensor is stored.
+
+    Attributes:
+        kind: of its numbers.
+        step: 0 for the kinds that have none.
+        by_coarseness: the step of row i is ``2 ** coarseness[i]`` times as large.
+    """
+
+    kind: Kind
+    step: float = 0.0
+    by_coarseness: bool = False
+
+    def __post_init__(self) -> None:
+        has_step = self.kind not in (Kind.EXACT, Kind.HALF)
+        low, high = _LIMITS.get(self.kind, (SMALLEST_STEP, LARGEST_STEP))
+        fits = is_step(self.step) and low <= self.step <= high if has_step else self.step == 0
+        if not fits or (self.by_coarseness and self.kind not in (Kind.GRID, Kind.SPARSE)):
+            raise ValueError(f"no such coding: {self}")
+
+    def steps(self, coarseness: np.ndarray | None, num_axes: int) -> Steps:
+        """The step, or those of all rows of an array with so many axes."""
+        if not self.by_coarseness:
+            return self.step
+        if coarseness is None:
+            raise ValueError("the coarseness of its rows lacks")
+        return (self.step * 2.0 ** coarseness.astype(np.float64)).reshape(-1, *[1] * (num_axes - 1))
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A tensor as whole numbers.
+
+    Attributes:
+        numbers: int64, the shape of the tensor; (N, 3) for rotations.
+        far: (K, 2) int64, index into the flat numbers and float32 bits of the values that no whole number reaches.
+    """
+
+    numbers: np.ndarray
+    far: np.ndarray
+
+
+def group_of(name: str, x: Tensor) -> str | None:
+    """Name of the tensors that share a step with this one: less the number at its end; None where it has no step."""
+    if x.dtype != torch.float32 or name == RELATIVE or name in FIXED_STEPS:
+        return None
+    if x.numel() <= FEW and not name.startswith("gaussians."):
+        return None
+    return name.rstrip("0123456789")
+
+
+def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness: bool = False) -> Coding:
+    """How a tensor is stored.
+
+    Args:
+        name: as in ``dyngs.storage.drawable``.
+        x: its values.
+        steps: group to the largest step; a group that lacks is stored in half precision.
+        by_coarseness: Gaussians have a coarseness each.
+    """
+    if name in FIXED_STEPS:
+        return Coding(Kind.GRID, FIXED_STEPS[name])
+    group = group_of(name, x)
+    if group is None or group not in steps:
+        fits = x.dtype == torch.float32 and x.numel() > FEW and float(x.abs().max()) <= LARGEST_HALF
+        return Coding(Kind.HALF if fits else Kind.EXACT)
+    kind = _KINDS.get(name, Kind.GRID)
+    low, high = _LIMITS.get(kind, (SMALLEST_STEP, LARGEST_STEP))
+    return Coding(kind, step_below(min(max(steps[group], low), high)), by_coarseness and name in _BY_COARSENESS)
+
+
+def to_whole(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> Whole:
+    """The whole numbers of ``x``; ``coarseness`` (N,) of its rows, where they have any."""
+    values, far = x.detach().contiguous().numpy(), np.zeros((0, 2), dtype=np.int64)
+    if coding.kind is Kind.ROTATION:
+        numbers = rotations_to_grid(values, coding.step)
+    elif coding.kind is Kind.OPACITY:
+        numbers = opacities_to_grid(values, coding.step)
+    elif coding.kind in (Kind.GRID, Kind.SPARSE):
+        steps = coding.steps(coarseness, values.ndim)
+        numbers, out = to_grid(values, steps, SPARSE if coding.kind is Kind.SPARSE else NEAREST)
+        index = np.flatnonzero(out)
+        bits = values.astype(np.float32).ravel()[index].view(np.int32)
+        far = np.stack([index, bits.astype(np.int64)], axis=1)
+    else:
+        numbers = _bits(values.astype(np.float16) if coding.kind is Kind.HALF else values)
+    return Whole(numbers.astype(np.int64), far)
+
+
+def from_whole(whole: Whole, coding: Coding, dtype: torch.dtype, coarseness: np.ndarray | None = None) -> Tensor:
+    """The tensor again.
+
+    Raises:
+        ValueError, OverflowError: numbers that ``to_whole`` does not make.
+    """
+    if coding.kind is Kind.ROTATION:
+        return torch.from_numpy(rotations_from_grid(whole.numbers, coding.step)).to(dtype)
+    if coding.kind is Kind.OPACITY:
+        return torch.from_numpy(opacities_from_grid(whole.numbers, coding.step)).to(dtype)
+    if coding.kind in (Kind.GRID, Kind.SPARSE):
+        values = from_grid(whole.numbers, coding.steps(coarseness, whole.numbers.ndim)).astype(np.float32)
+        if len(whole.far) and not 0 <= int(whole.far[:, 0].min()) <= int(whole.far[:, 0].max()) < values.size:
+            raise ValueError("a value lies outside its tensor")
+        values.reshape(-1)[whole.far[:, 0]] = whole.far[:, 1].astype(np.int32).view(np.float32)
+        return torch.from_numpy(values).to(dtype)
+    stored = torch.float16 if coding.kind is Kind.HALF else dtype
+    return _from_bits(whole.numbers, stored).to(dtype)
+
+
+def restored(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> Tensor:
+    """``x`` as it will be read again."""
+    return from_whole(to_whole(x, coding, coarseness), coding, x.dtype, coarseness)
+
+
+def checked_coarseness(values: Tensor, count: int) -> np.ndarray:
+    """(N,) whole numbers from 0 to ``MAX_COARSENESS``. Raises ValueError for anything else."""
+    whole = values.to(torch.int64).numpy()
+    if whole.shape != (count,) or (count and not 0 <= whole.min() <= whole.max() <= MAX_COARSENESS):
+        raise ValueError("its coarseness is not one small number per Gaussian")
+    return whole
+
+
+def _bits(values: np.ndarray) -> np.ndarray:
+    """int64 of the same shape: whole numbers as they are, the bits of others."""
+    if values.dtype.kind != "f":
+        return values.astype(np.int64)
+    return values.view(f"i{values.itemsize}").astype(np.int64)
+
+
+def _from_bits(numbers: np.ndarray, dtype: torch.dtype) -> Tensor:
+    if not dtype.is_floating_point:
+        return torch.from_numpy(np.ascontiguousarray(numbers)).to(dtype)
+    bits = {2: torch.int16, 4: torch.int32, 8: torch.int64}[dtype.itemsize]
+    return torch.from_numpy(np.ascontiguousarray(numbers)).to(bits).view(dtype)

@@ -1,0 +1,147 @@
+"""The file: what was stored comes back, again and again, and anything else is one line."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dyngs.config import StaticModel
+from dyngs.errors import DyngsError
+from dyngs.storage.coding import compressed, decompressed
+from dyngs.storage.file import MAGIC, MAX_HEADER, SceneInfo, decoded, encoded, read_scene, write_scene
+from dyngs.storage.tensors import COARSENESS
+
+INFO = SceneInfo(step=7, extent=2.5, world_offset=(1e6 + 0.25, 0, -3), background="white", rasterize_mode="classic")
+STEPS = {"means": 0.01, "quats": 0.01, "log_scales": 0.02, "logit_opacities": 0.004, "sh_base": 0.02, "sh_rest": 0.05}
+STEPS = {f"gaussians.{name}": step for name, step in STEPS.items()}
+EXTREMES = st.sampled_from((0.0, 1.0, -1e4, 1e30, -1e30, 88.0)) | st.floats(-3, 3, width=32)
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> dict[str, torch.Tensor]:
+    """Tensors of 0 to 5 Gaussians of any degree, some values extreme."""
+    n, degree = draw(st.integers(0, 5)), draw(st.integers(0, 4))
+    shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
+    shapes["sh"] = (n, (degree + 1) ** 2, 3)
+    tensors = {}
+    for name, shape in shapes.items():
+        pool = draw(st.lists(EXTREMES, min_size=1, max_size=12))
+        count = int(torch.tensor(shape).prod())
+        tensors[f"gaussians.{name}"] = torch.tensor((pool * count)[:count]).reshape(shape)
+    if draw(st.booleans()):
+        tensors[COARSENESS] = torch.arange(n, dtype=torch.uint8)
+    return tensors
+
+
+def small_scene(count: int = 3) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (4, 3)}
+    return {f"gaussians.{name}": torch.randn(count, *shape, generator=generator) for name, shape in shapes.items()}
+
+
+def with_header(data: bytes, old: bytes, new: bytes) -> bytes:
+    """The file with ``old`` replaced in its header, and a checksum that fits."""
+    start = len(MAGIC) + 4
+    end = start + int.from_bytes(data[len(MAGIC) : start], "little")
+    header = decompressed(data[start:end], MAX_HEADER, exact=False)
+    assert old in header
+    changed = compressed(header.replace(old, new, 1), room=MAX_HEADER)
+    body = MAGIC + len(changed).to_bytes(4, "little") + changed + data[end:-32]
+    return body + hashlib.sha256(body).digest()
+
+
+@given(scenes())
+@settings(deadline=None, max_examples=25)
+def test_stored_again_it_is_the_same_file(tensors: dict[str, torch.Tensor]) -> None:
+    data = encoded(INFO, tensors, StaticModel(), STEPS)
+    found = decoded(data)
+    assert found.info == INFO
+    assert found.num_bytes == len(data)
+    for name, x in tensors.items():
+        assert found.tensors[name].shape == x.shape
+        assert found.tensors[name].dtype == x.dtype
+        assert torch.isfinite(found.tensors[name].double()).all()
+    assert encoded(found.info, found.tensors, StaticModel(), found.steps) == data
+
+
+def test_values_come_back_within_their_steps() -> None:
+    tensors = small_scene(200)
+    found = decoded(encoded(INFO, tensors, StaticModel(), STEPS)).tensors
+    order = [int((tensors["gaussians.means"] - mean).abs().sum(1).argmin()) for mean in found["gaussians.means"]]
+    assert sorted(order) == list(range(200))
+    for name, tolerance in (("means", 0.005), ("sh", 0.033)):  # half a step; 0.65 of one where zero is preferred
+        error = (found[f"gaussians.{name}"] - tensors[f"gaussians.{name}"][order]).abs().max()
+        assert error <= tolerance + 1e-6
+
+
+def test_a_crowd_of_equals_can_be_read_again() -> None:
+    tensors = {name: x[:1].expand(80_000, *x.shape[1:]) for name, x in small_scene().items()}
+    tensors["gaussians.sh"] = torch.zeros(80_000, 25, 3)
+    data = encoded(INFO, tensors, StaticModel(), STEPS)
+    assert len(decoded(data).tensors["gaussians.sh"]) == 80_000
+
+
+def test_every_cut_and_every_flip_is_an_error(tmp_path: Path) -> None:
+    data = encoded(INFO, small_scene(), StaticModel(), STEPS)
+    for end in range(len(data)):
+        with pytest.raises(DyngsError) as caught:
+            decoded(data[:end])
+        assert "\n" not in str(caught.value)
+    for place in range(len(data)):
+        with pytest.raises(DyngsError):
+            decoded(data[:place] + bytes([data[place] ^ (1 << place % 8)]) + data[place + 1 :])
+    path = tmp_path / "scene.dyngs"
+    write_scene(path, data[:-1])
+    with pytest.raises(DyngsError, match=r"scene.dyngs: damaged or cut off"):
+        read_scene(path)
+    with pytest.raises(DyngsError, match="cannot be read"):
+        read_scene(tmp_path / "none.dyngs")
+
+
+@given(st.data())
+@settings(deadline=None, max_examples=30)
+def test_a_forged_file_is_an_error_or_a_scene(source: st.DataObject) -> None:
+    """Flips with a checksum that fits: whatever the reader finds, it says it in one line."""
+    data = bytearray(encoded(INFO, small_scene(), StaticModel(), STEPS)[:-32])
+    for _ in range(source.draw(st.integers(1, 4))):
+        data[source.draw(st.integers(len(MAGIC), len(data) - 1))] ^= source.draw(st.integers(1, 255))
+    told = None
+    try:
+        found = decoded(bytes(data) + hashlib.sha256(data).digest())
+    except DyngsError as error:
+        told = str(error)
+    assert "\n" not in told if told is not None else len(found.tensors["gaussians.sh"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (b'"shape":[3,3]', b'"shape":[900000000000,3]', "claims"),
+        (b'"shape":[3,3]', b'"shape":[2,3]', "not as long as it says"),
+        (b'"shape":[3,3]', b'"shape":[-3,3]', "header is wrong at tensors"),
+        (b'"kind":"rotation"', b'"kind":"python"', "header is wrong at tensors"),
+        (b'"dtype":"float32"', b'"dtype":"object"', "lacks"),
+        (b'"planes":1', b'"planes":9', "no such packing"),
+        (b'"far":0', b'"far":99999', "tensors are wrong|something else"),
+        (b'"name":"gaussians.means"', b'"name":"gaussians.meals"', "lacks|wrong"),
+        (b'"step":7', b'"step":7,"more":1', "header is wrong at info.more"),
+        (b'"extent":2.5', b'"extent":NaN', "header is wrong"),
+    ],
+)
+def test_a_forged_header_is_refused(old: bytes, new: bytes, said: str) -> None:
+    data = encoded(INFO, small_scene(), StaticModel(), STEPS)
+    with pytest.raises(DyngsError, match=said):
+        decoded(with_header(data, old, new))
+
+
+def test_other_versions_and_other_files_are_told_apart() -> None:
+    data = encoded(INFO, small_scene(), StaticModel(), STEPS)
+    with pytest.raises(DyngsError, match="another version"):
+        decoded(data[:6] + b"\x02" + data[7:])
+    with pytest.raises(DyngsError, match="not a stored scene"):
+        decoded(b"ply\nformat binary_little_endian 1.0\n")

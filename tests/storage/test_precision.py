@@ -1,0 +1,60 @@
+"""Steps are as coarse as the pictures allow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pytest
+import torch
+from moving_scene import camera
+from scenes import random_scene
+from torch import Tensor
+
+from dyngs.gaussians import Gaussians
+from dyngs.rendering import render
+from dyngs.storage.drawable import completed, drawable
+from dyngs.storage.precision import assumed_precision, coarseness_of, measured_precision
+from dyngs.storage.tensors import MAX_COARSENESS, coding_of, restored
+
+
+def tensors() -> dict[str, Tensor]:
+    """Of a still scene."""
+    gaussians = random_scene(n=60, seed=1).to(torch.float32).gaussians
+    return {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
+
+
+def draw(state: Mapping[str, Tensor]) -> list[Tensor]:
+    """One picture."""
+    fields = ("means", "quats", "log_scales", "logit_opacities", "sh")
+    return [render(Gaussians(**{name: state[f"gaussians.{name}"] for name in fields}), camera()).rgb[0]]
+
+
+@pytest.mark.parametrize("max_change", [0.1, 2.0])
+def test_the_change_is_what_is_allowed_or_less(max_change: float) -> None:
+    precision = measured_precision(tensors(), draw, max_change)
+    exact = drawable(tensors())
+    rounded = {name: restored(x, coding_of(name, x, precision.steps)) for name, x in exact.items()}
+    before, after = draw(tensors())[0].clamp(0, 1), draw(completed(rounded))[0].clamp(0, 1)
+    change = 255 * float((before - after).double().square().mean().sqrt())
+    assert precision.change == pytest.approx(change)
+    assert max_change / 4 < change <= max_change
+
+
+def test_more_change_makes_larger_steps() -> None:
+    fine, coarse = (measured_precision(tensors(), draw, x).steps for x in (0.1, 3.0))
+    assert fine["gaussians.means"] < coarse["gaussians.means"]
+    assert fine["gaussians.sh_rest"] < coarse["gaussians.sh_rest"]
+
+
+def test_without_pictures_steps_follow_the_size_of_gaussians() -> None:
+    small = assumed_precision(tensors()).steps
+    larger = tensors()
+    larger["gaussians.log_scales"] = larger["gaussians.log_scales"] + 3
+    assert assumed_precision(larger).steps["gaussians.means"] > 10 * small["gaussians.means"]
+
+
+def test_coarseness_is_half_an_octave_per_octave() -> None:
+    visibility = torch.tensor([1.0] * 8 + [2.0**-4, 0.0])
+    assert coarseness_of(visibility).tolist() == [0] * 8 + [2, MAX_COARSENESS]
+    assert coarseness_of(torch.zeros(0)).shape == (0,)
+    assert coarseness_of(torch.zeros(3)).tolist() == [MAX_COARSENESS] * 3
