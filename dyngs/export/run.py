@@ -9,10 +9,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
+from dyngs.colour.bake import with_harmonics
 from dyngs.errors import DyngsError
 from dyngs.export.ply import write_ply
 from dyngs.train.checkpoint import LoadedRun, load_run
-from dyngs.train.scene import Scene
+from dyngs.train.scene import Scene, moment_of
 
 Part = Literal["all", "moving", "still"]
 
@@ -95,10 +96,15 @@ def scene_part(scene: Scene, part: Part) -> Scene:
 
 
 def _write(run: LoadedRun, scene: Scene, path: Path, time: float) -> Path:
-    model = run.config.model
+    model, moment = run.config.model, moment_of(scene, time)
+    gaussians = moment.gaussians
     comments = [f"step: {run.step}"] if scene.is_still else [f"step: {run.step}", f"dyngs time {time!r}"]
+    if moment.shader is not None:
+        baked = with_harmonics(gaussians, moment.shader)
+        gaussians = baked.gaussians
+        comments.append(f"colours: harmonics fitted to a network, rms error {baked.error:.4f}")
     return write_ply(
-        path, scene.at(time), model.rasterize_mode, comments, eps2d=model.eps2d, world_offset=run.info.world_offset
+        path, gaussians, model.rasterize_mode, comments, eps2d=model.eps2d, world_offset=run.info.world_offset
     )
 
 

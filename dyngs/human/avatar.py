@@ -1,6 +1,7 @@
 """Gaussians on the texels of a body template's atlas, and how a pose moves them.
 
-Local letters: N Gaussians, J joints, K joints that one Gaussian follows, P texels.
+Local letters: N Gaussians, J joints, K joints that one Gaussian follows, P texels, M vertices and T triangles of the
+template.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from dyngs.conventions import num_sh_terms
 from dyngs.gaussians import Gaussians
+from dyngs.human.body import Body
 from dyngs.human.clips import Clip
 from dyngs.human.covariance import moved_axes
 from dyngs.human.polar import nearest_rotations, quats_of
@@ -38,12 +40,20 @@ class Anchors:
         size: (N,) side of its texel, m.
         joints: (N, K) int64 that it follows, heaviest first.
         weights: (N, K) shares, rows sum to 1.
+        face: (N,) int64 triangle of the template in which its texel lies.
+        barycentric: (N, 3) of the texel's centre in that triangle.
+        uv: (N, 2) of the texel's centre in the atlas.
+        height: (N,) of its scaffold above the skin, m.
     """
 
     points: Tensor
     size: Tensor
     joints: Tensor
     weights: Tensor
+    face: Tensor
+    barycentric: Tensor
+    uv: Tensor
+    height: Tensor
 
     def __len__(self) -> int:
         return len(self.points)
@@ -63,6 +73,39 @@ class Skeleton:
 
     joints: Tensor
     parents: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class PoseShapes:
+    """What a template's vertices do at rest when joints turn: SMPL's pose blend shapes (Loper et al. 2015).
+
+    Attributes:
+        directions: (9 (J - 1), 3 M) m per unit of the rotations' difference from the identity, root left out.
+        faces: (T, 3) int64 vertices of the triangles.
+    """
+
+    directions: Tensor
+    faces: Tensor
+
+    def offsets(self, anchors: Anchors, rotations: Tensor) -> Tensor:
+        """(N, 3) m at rest: of the three vertices around each anchor, by their shares.
+
+        Args:
+            anchors: N, on this template.
+            rotations: (J, 3, 3) relative to the parent joints.
+        """
+        at_vertices = (_bends(rotations)[1:].flatten() @ self.directions).unflatten(0, (-1, 3))
+        around = self.faces.index_select(0, anchors.face)
+        parts = at_vertices.index_select(0, around.flatten()).unflatten(0, (-1, 3))
+        return (anchors.barycentric[..., None] * parts).sum(1)
+
+
+def pose_shapes(body: Body) -> PoseShapes | None:
+    """The pose blend shapes of ``body``, None where it has none; rounded to half precision, as runs store them.
+
+    Each direction errs by 2^-11 of itself at most; where random ones shift points by 1 cm, points err by 8 micrometres.
+    """
+    return None if body.pose_dirs is None else PoseShapes(body.pose_dirs.half().float(), body.faces)
 
 
 @dataclass(frozen=True)
@@ -89,7 +132,18 @@ def first_gaussians(texels: Texels, heights: Sequence[float], sh_degree: int) ->
     of = places.texel
     size = texels.size[of]
     joints, weights = heaviest(texels.weights)
-    anchors = Anchors(places.points(texels), size, joints[of], weights[of])
+    rows, columns = (texels.index // texels.resolution, texels.index % texels.resolution)
+    uv = torch.stack([columns + 0.5, texels.resolution - 0.5 - rows], dim=1).to(size) / texels.resolution
+    anchors = Anchors(
+        points=places.points(texels),
+        size=size,
+        joints=joints[of],
+        weights=weights[of],
+        face=texels.faces[of],
+        barycentric=texels.barycentric[of],
+        uv=uv[of],
+        height=places.height,
+    )
     ratios = size.new_tensor([_WIDTH, _WIDTH, _THICKNESS]).log()
     opacity = torch.where(places.height == min(heights), _SKIN, _SHELL)
     gaussians = Gaussians(
@@ -124,7 +178,7 @@ def skinning_weights(anchors: Anchors, num_joints: int, corrections: Tensor | No
 
 
 def posed(
-    gaussians: Gaussians, weights: Tensor, skeleton: Skeleton, posing: Posing, pose_dirs: Tensor | None = None
+    gaussians: Gaussians, weights: Tensor, skeleton: Skeleton, posing: Posing, offsets: Tensor | None = None
 ) -> Gaussians:
     """The N Gaussians of the rest pose in another one, in the world; differentiable in everything.
 
@@ -137,11 +191,11 @@ def posed(
         weights: (N, J).
         skeleton: J joints.
         posing: the pose.
-        pose_dirs: (N, 27) offsets at rest that depend on the pose, see ``pose_offsets``; None is none.
+        offsets: (N, 3) m, added to the means at rest; None is none.
     """
     transforms = blended(weights, joint_transforms(skeleton.joints, skeleton.parents, posing.rotations))
     linear = transforms[..., :3]
-    means = gaussians.means if pose_dirs is None else gaussians.means + pose_offsets(weights, posing, pose_dirs)
+    means = gaussians.means if offsets is None else gaussians.means + offsets
     quats, log_scales = moved_axes(linear, gaussians.quats, gaussians.log_scales)
     return Gaussians(
         means=posing.scale * apply(transforms, means) + posing.trans,
@@ -152,14 +206,29 @@ def posed(
     )
 
 
+def offsets_at_rest(
+    anchors: Anchors, weights: Tensor, posing: Posing, shapes: PoseShapes | None, pose_dirs: Tensor | None
+) -> Tensor | None:
+    """(N, 3) what a pose adds to the places at rest, m: of the template and as learned, either of which may lack."""
+    given = None if shapes is None else shapes.offsets(anchors, posing.rotations)
+    if pose_dirs is None:
+        return given
+    learned = pose_offsets(weights, posing, pose_dirs)
+    return learned if given is None else given + learned
+
+
 def pose_offsets(weights: Tensor, posing: Posing, pose_dirs: Tensor) -> Tensor:
     """(N, 3) offsets P vec(sum_j w_j (R_j - 1)), m, with P the ``pose_dirs`` (N, 27) as 3 x 9; the root does not count.
 
-    SMPL's pose blend shapes (Loper et al. 2015), but only of the joints that a Gaussian follows.
+    As SMPL's pose blend shapes (Loper et al. 2015), but learned, and only of the joints that a Gaussian follows.
     """
-    bends = (posing.rotations - torch.eye(3, dtype=weights.dtype)).flatten(1)
-    features = weights[:, 1:] @ bends[1:]
+    features = weights[:, 1:] @ _bends(posing.rotations)[1:].flatten(1)
     return (pose_dirs.unflatten(1, (3, 9)) * features[:, None]).sum(-1)
+
+
+def _bends(rotations: Tensor) -> Tensor:
+    """(J, 3, 3) difference of rotations from the identity."""
+    return rotations - torch.eye(3, dtype=rotations.dtype)
 
 
 def turned_colours(sh: Tensor, turns: Tensor) -> Tensor:

@@ -14,6 +14,9 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 from dyngs.human.skinning import apply, blended, check_tree, joint_transforms, rotations
 
+DEFAULT_FILE = Path(__file__).parent / "templates" / "anny_smplx55.npz"
+"""The free template that comes with the package."""
+
 
 @dataclass(frozen=True)
 class Body:
@@ -89,7 +92,7 @@ def default_body() -> Body:
     """The free template that comes with the package: an adult of 1.76 m in T-pose, 55 joints in the order of SMPL-X."""
     from dyngs.human.body_files import load_body
 
-    return load_body(Path(__file__).parent / "templates" / "anny_smplx55.npz")
+    return load_body(DEFAULT_FILE)
 
 
 def shaped(body: Body, betas: Tensor | None, expression: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,7 @@ Local letters: N places, J joints.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -28,11 +28,18 @@ class Places:
         points: (N, 3).
         normals: (N, 3) unit vectors outwards.
         weights: (N, J) skinning weights.
+        offsets: (N, 3) m, or None, that a pose adds to the points; none at all where it is None.
     """
 
     points: Tensor
     normals: Tensor
     weights: Tensor
+    offsets: Callable[[Posing], Tensor | None] | None = None
+
+    def at_rest(self, posing: Posing) -> Tensor:
+        """(N, 3) the points as they are before skinning to a pose, m."""
+        offsets = None if self.offsets is None else self.offsets(posing)
+        return self.points if offsets is None else self.points + offsets
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,7 @@ def sightings(places: Places, skeleton: Skeleton, shown: Iterable[tuple[Picture,
     colour = torch.zeros(count, 3)
     for picture, posing in shown:
         transforms = blended(places.weights, joint_transforms(skeleton.joints, skeleton.parents, posing.rotations))
-        world = posing.scale * apply(transforms, places.points) + posing.trans
+        world = posing.scale * apply(transforms, places.at_rest(posing)) + posing.trans
         normals = (transforms[..., :3] * places.normals[:, None]).sum(-1)
         column, row, in_frame = _pixels(world, picture.cameras)
         covered = in_frame.float() if picture.alpha is None else picture.alpha[row, column] * in_frame

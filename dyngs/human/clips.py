@@ -138,7 +138,7 @@ def placed(clip: Clip, like: Clip, joints: Tensor, parents: tuple[int, ...]) -> 
         joints: (J, 3) at rest, which both are given for.
         parents: of the joints.
     """
-    up = _up(like)
+    up = up_of(like)
     unit = like.scale.mean()
     turn = _least_rotation(joints.new_tensor([0.0, 1.0, 0.0]), up)
     roots = turn @ rotations(clip.poses[:, 0])
@@ -151,18 +151,18 @@ def placed(clip: Clip, like: Clip, joints: Tensor, parents: tuple[int, ...]) -> 
     return replace(moved, trans=moved.trans + shift + (rise - shift @ up) * up)
 
 
-def rest_clip(clip: Clip) -> Clip:
-    """The rest pose, as large and at the mean place of ``clip``."""
-    return Clip(
-        times=torch.zeros(1, dtype=torch.float64),
-        poses=torch.zeros_like(clip.poses[:1]),
-        trans=clip.trans.mean(0, keepdim=True),
-        scale=clip.scale.mean(0, keepdim=True),
-    )
+def upright(like: Clip, joints: Tensor, parents: tuple[int, ...]) -> Clip:
+    """The rest pose on the floor of ``like``, as large and as high as the person there; one frame.
+
+    What is ``placed`` like it, is placed as it would be like ``like``.
+    """
+    nothing = torch.zeros_like(like.poses[:1])
+    rest = Clip(torch.zeros(1, dtype=torch.float64), nothing, nothing[:, 0], torch.ones_like(like.scale[:1]))
+    return placed(rest, like, joints, parents)
 
 
-def _up(clip: Clip) -> Tensor:
-    """(3,) unit vector."""
+def up_of(clip: Clip) -> Tensor:
+    """(3,) unit vector in which the pelvis points on average, or the world axis within 30 degrees of it."""
     mean = torch.nn.functional.normalize(rotations(clip.poses[:, 0])[:, :, 1].mean(0), dim=0)
     largest = int(mean.abs().argmax())
     if float(mean[largest].abs()) < _ALONG_AXIS:

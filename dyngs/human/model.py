@@ -8,12 +8,22 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dyngs.colour.network import Frame
 from dyngs.config import HumanModel
 from dyngs.conventions import SH_C0
 from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar import Anchors, Skeleton, posed, posing_of, skinning_weights
+from dyngs.human.avatar import (
+    Anchors,
+    PoseShapes,
+    Posing,
+    Skeleton,
+    offsets_at_rest,
+    posed,
+    posing_of,
+    skinning_weights,
+)
 from dyngs.human.carve import Places, sightings
 from dyngs.human.clips import Footage
 from dyngs.human.refine import Corrections, corrected_posing, corrected_skeleton, corrected_weights
@@ -27,11 +37,15 @@ CENTIMETRE = 0.01
 
 @dataclass(frozen=True)
 class Subject:
-    """Who is filmed: the template's skeleton, what ties the first N Gaussians to it, and the poses of the pictures."""
+    """Who is filmed: the template's skeleton, what ties the first N Gaussians to it, and the poses of the pictures.
+
+    ``shapes`` are the template's pose blend shapes, None where it has none.
+    """
 
     skeleton: Skeleton
     anchors: Anchors
     footage: Footage
+    shapes: PoseShapes | None = None
 
 
 def first_look(
@@ -51,8 +65,12 @@ def first_look(
     rows = {frame: row for row, frame in enumerate(subject.footage.frames)}
     shown = ((picture, posing_of(clip, rows[picture.frame or 0])) for picture in pictures)
     normals = texels.normals.repeat(len(anchors) // max(len(texels), 1), 1)
-    places = Places(anchors.points, normals, skinning_weights(anchors, len(skeleton.joints)))
-    found = sightings(places, skeleton, shown)
+    weights = skinning_weights(anchors, len(skeleton.joints))
+
+    def offsets(posing: Posing) -> Tensor | None:
+        return offsets_at_rest(anchors, weights, posing, subject.shapes, None)
+
+    found = sightings(Places(anchors.points, normals, weights, offsets), skeleton, shown)
     sh = gaussians.sh.clone()
     sh[:, 0] = (found.rgb - 0.5) / SH_C0
     kept = found.inside >= carve
@@ -103,9 +121,10 @@ class HumanScene:
         else:
             posing = posing_of(clip, row)
             weights = self._constant_weights()
-        moved = posed(parameters, weights, skeleton, posing, pose_dirs)
+        offsets = offsets_at_rest(self.anchors, weights, posing, self.subject.shapes, pose_dirs)
+        moved = posed(parameters, weights, skeleton, posing, offsets)
         penalties |= self._between_neighbours(parameters, moved, float(clip.scale[row]), step)
-        return Drawn(moved, penalties)
+        return Drawn(moved, penalties, Frame(parameters.means, posing.rotations[0]))
 
     def after_step(self, parameters: Gaussians, step: int, result: EditResult | None) -> int:
         """Rows left out for bad gradients; optimizes the corrections, follows ``result``."""
@@ -134,6 +153,9 @@ class HumanScene:
         state |= {f"anchors.{name}": x for name, x in self.anchors.tensors().items()}
         state |= {f"clip.{name}": getattr(clip, name) for name in ("times", "poses", "trans", "scale")}
         state |= {"joints": self.subject.skeleton.joints, "parents": torch.tensor(self.subject.skeleton.parents)}
+        if self.subject.shapes is not None:
+            shapes = self.subject.shapes
+            state |= {"shapes.directions": shapes.directions.half(), "shapes.faces": shapes.faces.int()}
         return state if self._near is None else state | {"near": self._near}
 
     def load_state(self, state: dict[str, Tensor]) -> None:

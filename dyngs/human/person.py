@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from torch import Tensor
 
 from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
-from dyngs.human.body import Body, default_body, shaped
+from dyngs.human.body import DEFAULT_FILE, Body, default_body, shaped
 from dyngs.human.body_files import load_body
+
+
+def template_file(model: HumanModel) -> Path:
+    """The body file that ``model`` names, or that of the free template."""
+    return DEFAULT_FILE if model.body is None else model.body
 
 
 def template(model: HumanModel) -> Body:

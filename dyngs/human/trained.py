@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from dyngs.colour.network import ColourNetwork, Frame
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar import Anchors, Skeleton, posed, posing_of
+from dyngs.human.avatar import Anchors, PoseShapes, Skeleton, offsets_at_rest, posed, posing_of
 from dyngs.human.clips import Clip
 from dyngs.human.refine import Fit, corrected_clip, corrected_skeleton, corrected_weights
+from dyngs.rendering import Shader
 
 
 @dataclass(frozen=True)
@@ -21,25 +23,31 @@ class AvatarScene:
 
     Attributes:
         gaussians: N Gaussians at rest, m.
+        anchors: of the Gaussians, with the template's weights.
         weights: (N, J) learned skinning weights.
         skeleton: learned.
         given_joints: (J, 3) of the template, which clips are given for.
         fit: what was learned about poses.
-        pose_dirs: (N, 27) offsets that depend on the pose, or None.
+        shapes: the template's pose blend shapes, or None.
+        pose_dirs: (N, 27) learned offsets that depend on the pose, or None.
         clip: what is played, corrections included.
         given_clip: that of training, without corrections.
         num_field_values: how many numbers there are beside the Gaussians.
+        colour: what colours them, by place and direction at rest; None: their harmonics.
     """
 
     gaussians: Gaussians
+    anchors: Anchors
     weights: Tensor
     skeleton: Skeleton
     given_joints: Tensor
     fit: Fit
+    shapes: PoseShapes | None
     pose_dirs: Tensor | None
     clip: Clip
     given_clip: Clip
     num_field_values: int
+    colour: ColourNetwork | None = None
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -71,15 +79,27 @@ class AvatarScene:
         Raises:
             DyngsError: the time is NaN.
         """
-        now = self.clip.at(time)
-        return posed(self.gaussians, self.weights, self.skeleton, posing_of(now, 0), self.pose_dirs)
+        posing = posing_of(self.clip.at(time), 0)
+        offsets = offsets_at_rest(self.anchors, self.weights, posing, self.shapes, self.pose_dirs)
+        return posed(self.gaussians, self.weights, self.skeleton, posing, offsets)
+
+    def shader_at(self, time: float | None) -> Shader | None:
+        """What colours the Gaussians of ``at(time)``; None: their harmonics."""
+        if self.colour is None:
+            return None
+        return self.colour.shader(time, Frame(self.gaussians.means, posing_of(self.clip.at(time), 0).rotations[0]))
 
     def part(self, which: Literal["moving", "still"]) -> AvatarScene:
         """All of it, or nothing: a person moves as a whole."""
         count = len(self) if (which == "still") == self.is_still else 0
         index = torch.arange(count)
-        pose_dirs = None if self.pose_dirs is None else self.pose_dirs[index]
-        return replace(self, gaussians=self.gaussians.select(index), weights=self.weights[index], pose_dirs=pose_dirs)
+        return replace(
+            self,
+            gaussians=self.gaussians.select(index),
+            anchors=self.anchors.select(index),
+            weights=self.weights[index],
+            pose_dirs=None if self.pose_dirs is None else self.pose_dirs[index],
+        )
 
     def playing(self, clip: Clip) -> AvatarScene:
         """The same person in another clip, whose poses are given as those of training were.
@@ -96,22 +116,31 @@ def trained_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> AvatarS
         KeyError: the state lacks a tensor.
     """
     learned = {name: state[f"learned.{name}"] for name in ("poses", "trans", "turns", "joints", "log_scale", "weights")}
-    anchors = Anchors(*(state[f"anchors.{name}"] for name in ("points", "size", "joints", "weights")))
+    anchors = Anchors(**{field.name: state[f"anchors.{field.name}"] for field in fields(Anchors)})
     clip = Clip(*(state[f"clip.{name}"] for name in ("times", "poses", "trans", "scale")))
     skeleton = Skeleton(state["joints"], tuple(state["parents"].tolist()))
     fit = Fit(learned["turns"], float(learned["log_scale"]))
     with torch.no_grad():
         return AvatarScene(
             gaussians=gaussians,
+            anchors=anchors,
             weights=corrected_weights(learned, anchors, len(skeleton.joints)),
             skeleton=corrected_skeleton(learned, skeleton),
             given_joints=skeleton.joints,
             fit=fit,
+            shapes=stored_shapes(state),
             pose_dirs=state.get("learned.pose_dirs"),
             clip=corrected_clip(fit, clip, learned["poses"], learned["trans"]),
             given_clip=clip,
             num_field_values=sum(x.numel() for x in (*learned.values(), *_optional(state, "learned.pose_dirs"))),
         )
+
+
+def stored_shapes(state: Mapping[str, Tensor]) -> PoseShapes | None:
+    """The pose blend shapes of a state, if there are any."""
+    if "shapes.directions" not in state:
+        return None
+    return PoseShapes(state["shapes.directions"].float(), state["shapes.faces"].long())
 
 
 def _optional(state: Mapping[str, Tensor], name: str) -> tuple[Tensor, ...]:

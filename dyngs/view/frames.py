@@ -17,12 +17,11 @@ from dyngs.data.read import read_capture
 from dyngs.data.write import to_uint8, write_image
 from dyngs.errors import DyngsError
 from dyngs.export.ply import SplatFile
-from dyngs.gaussians import Gaussians
-from dyngs.rendering import RenderOptions, render
+from dyngs.rendering import RenderOptions
 from dyngs.train.checkpoint import load_run
 from dyngs.train.evaluate import evaluation_background, render_options, scene_of_split, split_views
 from dyngs.train.metrics import psnr
-from dyngs.train.scene import Scene
+from dyngs.train.scene import Moment, Scene, moment_of
 from dyngs.view.paths import CameraPath
 from dyngs.view.sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
 from dyngs.view.video import VideoWriter
@@ -84,18 +83,18 @@ class Shot:
 
 
 def render_frame(
-    gaussians: Gaussians, camera: Cameras, options: RenderOptions = DEFAULT_OPTIONS, background: Tensor | None = None
+    moment: Moment, camera: Cameras, options: RenderOptions = DEFAULT_OPTIONS, background: Tensor | None = None
 ) -> Frame:
     """The picture that one camera sees, without gradients.
 
     Args:
-        gaussians: N Gaussians.
+        moment: what it looks at.
         camera: one camera.
         options: how to draw; ``depth`` other than "none" fills ``Frame.depth``.
         background: (3,) colour; None is black.
     """
     with torch.no_grad():
-        rendering = render(gaussians, camera, options, background=background)
+        rendering = moment.seen_by(camera, options, background)
     depth = None if rendering.depth is None else rendering.depth[0].cpu().numpy()
     return Frame(rendering.rgb[0].clamp(0, 1).cpu().numpy(), rendering.alpha[0].cpu().numpy(), depth)
 
@@ -106,12 +105,12 @@ def shot_frames(shot: Shot) -> Iterator[Frame]:
     The scene is deformed anew only where the time differs from that of the picture before.
     """
     times = shot.path.times
-    gaussians, moment = None, None
+    moment, moment_time = None, None
     for i in range(len(shot.path)):
         time = None if times is None or shot.scene.is_still else times[i]
-        if gaussians is None or time != moment:
-            gaussians, moment = shot.scene.at(time), time
-        yield render_frame(gaussians, shot.path.cameras.select(i), shot.options, shot.background)
+        if moment is None or time != moment_time:
+            moment, moment_time = moment_of(shot.scene, time), time
+        yield render_frame(moment, shot.path.cameras.select(i), shot.options, shot.background)
 
 
 def write_path_frames(shot: Shot, out_dir: Path | None, output: OutputOptions = OutputOptions()) -> list[Path]:
@@ -167,7 +166,7 @@ def write_split(run_dir: Path, split: str, out_dir: Path, output: OutputOptions 
     with _FrameWriter(out_dir, output) as writer:
         for i, stem in enumerate(file_stems([view.name for view in views])):
             picture = loader[i]
-            frame = render_frame(scene.at(picture.time), picture.cameras, options, background)
+            frame = render_frame(moment_of(scene, picture.time), picture.cameras, options, background)
             writer.write(stem, frame)
             if i in shown:
                 truth = picture.composite(background)

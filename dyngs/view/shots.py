@@ -32,7 +32,7 @@ from dyngs.view.paths import (
 
 DEFAULT_FRAMES = 120
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_DEFAULT_SIZE = (960, 720)
+DEFAULT_SIZE = (960, 720)
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,9 @@ def shot_of_ply(file: Path, options: ShotOptions) -> Shot:
     if options.motion is not None or options.at_rest:
         raise DyngsError(f"{file}: a .ply has no skeleton; give the run of a person for --motion and --pose")
     splat = read_ply(file, nonfinite="skip")
-    path_file = _path_file(options.path)
-    if path_file is not None:
-        path = read_path(path_file, np.asarray(splat.world_offset))
+    named = path_file(options.path)
+    if named is not None:
+        path = read_path(named, np.asarray(splat.world_offset))
     else:
         path = CameraPath(_around_points(splat.gaussians.means.numpy(), options))
     if options.size is not None:
@@ -166,7 +166,7 @@ def _standing_path(run: LoadedRun, capture: Capture, options: ShotOptions) -> Ca
 def _moving_path(run: LoadedRun, capture: Capture, options: ShotOptions) -> CameraPath:
     """The path that ``options`` name, with ``options.times`` if there are any."""
     path = options.path or "orbit"
-    file = _path_file(path)
+    file = path_file(path)
     if file is not None:
         found = read_path(file, capture.world_offset)
     else:
@@ -194,7 +194,7 @@ def _around_points(means: np.ndarray, options: ShotOptions) -> Cameras:
     axis = _AXES[options.up.lstrip("-")]
     sign = -1.0 if options.up.startswith("-") else 1.0
     up = (sign * axis[0], sign * axis[1], sign * axis[2])
-    size = options.size or _DEFAULT_SIZE
+    size = options.size or DEFAULT_SIZE
     if options.path == "orbit":
         return frame_orbit_for_points(means, options.num_frames or DEFAULT_FRAMES, size, up)
     ring = frame_orbit_for_points(means, 24, size, up)
@@ -203,7 +203,7 @@ def _around_points(means: np.ndarray, options: ShotOptions) -> Cameras:
     return spiral_path(arc, options.num_frames or DEFAULT_FRAMES)
 
 
-def _path_file(path: str) -> Path | None:
+def path_file(path: str) -> Path | None:
     """The JSON file that ``path`` names, None for a path with a name."""
     if path in ("orbit", "spiral"):
         return None

@@ -6,9 +6,12 @@ N Gaussians, J joints.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
+import numpy as np
 import pytest
+import synthetic_bodies
 import torch
 from torch import Tensor
 
@@ -19,12 +22,14 @@ from dyngs.human.avatar import (
     Skeleton,
     first_gaussians,
     heaviest,
+    offsets_at_rest,
     pose_offsets,
+    pose_shapes,
     posed,
     skinning_weights,
     turned_colours,
 )
-from dyngs.human.body import Body, default_body
+from dyngs.human.body import Body, default_body, posed_vertices
 from dyngs.human.covariance import rotations_of
 from dyngs.human.motion import JOINTS
 from dyngs.human.skinning import rotations
@@ -191,6 +196,86 @@ def test_offsets_follow_the_bends_of_the_joints_that_count() -> None:
     bend = (rotations(turns[1]) - torch.eye(3)).flatten()
     torch.testing.assert_close(found[0], 0.75 * directions[0].reshape(3, 9) @ bend)
     assert not found[1].any()
+
+
+@cache
+def rigid_body() -> Body:
+    """A body of random triangles with SMPL's joints and pose blend shapes; each triangle follows one joint alone."""
+    generator = np.random.default_rng(0)
+    arrays = synthetic_bodies.model("smpl")
+    groups = torch.arange(len(arrays["v_template"])) // 3
+    faces = torch.stack([3 * groups.unique() + k for k in range(3)], dim=1)
+    followed = torch.from_numpy(generator.integers(0, 24, len(faces)))[groups]
+    return Body(
+        name="smpl",
+        vertices=torch.from_numpy(arrays["v_template"]).float(),
+        faces=faces,
+        uv=torch.from_numpy(generator.uniform(0, 1, (len(groups), 2))).float(),
+        uv_faces=faces,
+        weights=torch.nn.functional.one_hot(followed, 24).float(),
+        parents=tuple(synthetic_bodies.parents_of("smpl")),
+        joints=torch.from_numpy(arrays["J"]).float(),
+        pose_dirs=20 * torch.from_numpy(arrays["posedirs"].reshape(-1, 207).T.copy()).float(),
+    )
+
+
+def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
+    """Where a triangle follows one joint alone, texels in any pose are the barycentric points of the posed mesh."""
+    body = rigid_body()
+    generator = torch.Generator().manual_seed(0)
+    poses = 0.5 * torch.randn(24, 3, generator=generator)
+    posing = Posing(rotations(poses), torch.tensor([1.0, 2.0, 3.0]), torch.tensor(1.5))
+    gaussians, anchors = first_gaussians(texels_of(body, 24), (0.0,), 0)
+    weights, shapes = skinning_weights(anchors, 24), pose_shapes(body)
+    assert shapes is not None
+    offsets = offsets_at_rest(anchors, weights, posing, shapes, None)
+    found = posed(gaussians, weights, Skeleton(body.joints, body.parents), posing, offsets).means
+    given = (poses[None], posing.trans[None], None, None, posing.scale[None])
+    mesh, stiff = (posed_vertices(b, *given)[0] for b in (body, replace(body, pose_dirs=None)))
+    wanted, without = ((anchors.barycentric[..., None] * x[body.faces[anchors.face]]).sum(1) for x in (mesh, stiff))
+    assert float((wanted - without).norm(dim=1).mean()) > 0.1
+    # 2^-11 of offsets of half a metre, shared by 207 numbers that round independently
+    torch.testing.assert_close(found, wanted, rtol=0, atol=2e-4)
+    exact = replace(shapes, directions=body.pose_dirs).offsets(anchors, posing.rotations)
+    found = posed(gaussians, weights, Skeleton(body.joints, body.parents), posing, exact).means
+    torch.testing.assert_close(found, wanted, rtol=0, atol=2e-6)
+
+
+def test_offsets_of_the_template_and_learned_ones_add_up_and_reach_the_pose() -> None:
+    body = rigid_body()
+    _, anchors = first_gaussians(texels_of(body, 16), (0.0, 0.02), 0)
+    weights, shapes = skinning_weights(anchors, 24), pose_shapes(body)
+    assert shapes is not None
+    generator = torch.Generator().manual_seed(0)
+    dirs = 0.1 * torch.randn(len(anchors), 27, generator=generator)
+    poses = (0.5 * torch.randn(24, 3, generator=generator)).requires_grad_()
+    posing = Posing(rotations(poses), torch.zeros(3), torch.tensor(1.0))
+    both = offsets_at_rest(anchors, weights, posing, shapes, dirs)
+    given, learned = shapes.offsets(anchors, posing.rotations), pose_offsets(weights, posing, dirs)
+    assert both is not None
+    torch.testing.assert_close(both, given + learned)
+    half = len(anchors) // 2
+    assert torch.equal(given[:half], given[half:]), "both scaffolds follow the skin beneath"
+    given.sum().backward()
+    assert poses.grad is not None
+    assert not poses.grad[0].any(), "the root does not count"
+    assert bool(poses.grad[1:].ne(0).any(1).all())
+    assert offsets_at_rest(anchors, weights, posing, None, None) is None
+    assert pose_shapes(replace(body, pose_dirs=None)) is None
+
+
+def test_anchors_know_their_place_on_the_template() -> None:
+    body = default_body()
+    _, anchors = first_gaussians(texels_of(body, RESOLUTION), (0.0, 0.02), 0)
+    corners = (anchors.barycentric[..., None] * body.vertices[body.faces[anchors.face]]).sum(1)
+    skin = anchors.height == 0
+    torch.testing.assert_close(corners[skin], anchors.points[skin])
+    distances = (anchors.points - corners)[~skin].norm(dim=1)
+    torch.testing.assert_close(distances, anchors.height[~skin], rtol=1e-4, atol=0)
+    assert body.uv is not None
+    assert body.uv_faces is not None
+    uv = (anchors.barycentric[..., None] * body.uv[body.uv_faces[anchors.face]]).sum(1)
+    torch.testing.assert_close(anchors.uv, uv, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1])

@@ -14,7 +14,7 @@ from torch import Tensor
 from dyngs.data.capture import View
 from dyngs.data.people import BodyFrames, body_frames
 from dyngs.errors import DyngsError
-from dyngs.human.clips import Clip, clip_of_motion, footage, placed, rest_clip, same_clip
+from dyngs.human.clips import Clip, clip_of_motion, footage, placed, same_clip, upright
 from dyngs.human.motion import JOINTS, Motion
 from dyngs.human.skinning import apply, joint_transforms, rotations
 
@@ -115,10 +115,25 @@ def test_a_motion_is_put_where_the_person_was(up: int) -> None:
     torch.testing.assert_close(ours - ours[:1, :1], wanted, rtol=0, atol=1e-4)
 
 
-def test_a_motion_of_one_frame_and_the_rest_pose_are_clips() -> None:
+@pytest.mark.parametrize("up", [0, 1, 2])
+def test_what_is_placed_like_the_upright_pose_is_placed_like_the_clip_it_comes_from(up: int) -> None:
+    body = tiny_body()
+    generator = torch.Generator().manual_seed(up)
+    axis = torch.nn.functional.one_hot(torch.tensor((up + 1) % 3), 3).float()
+    roots = 2.0 * axis + 0.05 * torch.randn(4, 3, generator=generator)
+    poses = torch.cat([roots[:, None], 0.3 * torch.randn(4, 54, 3, generator=generator)], dim=1)
+    trans, times = torch.randn(4, 3, generator=generator), torch.linspace(0, 1, 4, dtype=torch.float64)
+    like = Clip(times, poses, trans, torch.tensor([1.9, 2.0, 2.0, 2.1]))
+    clip = Clip(times, 0.2 * torch.randn(4, 55, 3, generator=generator), trans.flip(0), torch.ones(4))
+    rest = upright(like, body.joints, body.parents)
+    assert len(rest) == 1
+    assert not rest.poses[:, 1:].any()
+    one, other = (placed(clip, x, body.joints, body.parents) for x in (like, rest))
+    for name in ("poses", "trans", "scale"):
+        torch.testing.assert_close(getattr(other, name), getattr(one, name), rtol=0, atol=1e-4)
+
+
+def test_a_motion_of_one_frame_is_a_clip() -> None:
     poses = torch.zeros(1, len(JOINTS), 3)
     one = clip_of_motion(Motion(poses, torch.zeros(1, 3), torch.zeros(0), 30.0, torch.ones(1)))
     assert one.times.tolist() == [0.0]
-    rest = rest_clip(three_frames())
-    assert not rest.poses.any()
-    assert float(rest.trans[0, 0]) == pytest.approx(2.0)

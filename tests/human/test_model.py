@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from synthetic_bodies import model, write_npz
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig, DefaultStrategy, HumanModel, OptimConfig, RunConfig, TrainConfig
@@ -90,8 +91,13 @@ def test_training_learns_and_evaluates_on_both_splits(capture: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("pose_offsets", [False, True])
-def test_what_is_played_back_is_what_was_trained(capture: Path, pose_offsets: bool) -> None:
-    trainer = assemble(tiny(capture, pose_offsets=pose_offsets))
+@pytest.mark.parametrize("own_body", [False, True])
+def test_what_is_played_back_is_what_was_trained(
+    capture: Path, tmp_path: Path, pose_offsets: bool, own_body: bool
+) -> None:
+    body = write_npz(tmp_path / "model.npz", model("smplx")) if own_body else None
+    trainer = assemble(tiny(capture, pose_offsets=pose_offsets, body=body))
+    assert (human(trainer).subject.shapes is not None) == own_body
     tensors_after(trainer, 8)
     parameters, picture = trainer.optimizer.parameters, trainer.pictures[4]
     drawn = human(trainer).gaussians_at(parameters, picture, trainer.done + 1).gaussians

@@ -23,6 +23,7 @@ from dyngs.export.ply import SplatFile, read_ply, write_ply
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, render
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
+from dyngs.train.scene import Moment, moment_of
 from dyngs.view.frames import (
     DEFAULT_OPTIONS,
     OutputOptions,
@@ -170,7 +171,7 @@ def test_each_frame_shows_the_scene_at_its_time() -> None:
     scene, times = moving_scene(Sliding()), (0.0, 0.3, 1.0)
     frames = list(shot_frames(Shot(scene, frozen_path(camera(), times))))
     for frame, time in zip(frames, times, strict=True):
-        np.testing.assert_array_equal(frame.rgb, render_frame(scene.at(time), camera()).rgb)
+        np.testing.assert_array_equal(frame.rgb, render_frame(moment_of(scene, time), camera()).rgb)
     assert np.abs(frames[0].rgb - frames[2].rgb).max() > 0.1
 
 
@@ -226,8 +227,7 @@ def test_exported_file_is_drawn_like_the_run(tmp_path) -> None:
     splat = read_ply(write_ply(tmp_path / "a.ply", two_balls(), RasterizeMode.ANTIALIASED, eps2d=0.1))
     options = splat_options(splat)
     assert (options.mode, options.eps2d) == (RasterizeMode.ANTIALIASED, 0.1)
-    wanted = render_frame(two_balls(), cameras_around(1), options)
-    got = render_frame(splat.gaussians, cameras_around(1), options)
+    wanted, got = (render_frame(Moment(x), cameras_around(1), options) for x in (two_balls(), splat.gaussians))
     np.testing.assert_array_equal(got.rgb, wanted.rgb)
     assert splat_options(SplatFile(two_balls())) == RenderOptions()
 

@@ -1,0 +1,85 @@
+"""What a camera path shows of an avatar file: the person at rest or in a motion, and cameras around it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dyngs.camera import Cameras
+from dyngs.errors import DyngsError
+from dyngs.export.avatar import read_avatar
+from dyngs.human.clips import up_of
+from dyngs.human.skinning import rotations
+from dyngs.human.trained import AvatarScene
+from dyngs.train.evaluate import evaluation_background, render_options
+from dyngs.train.playing import playing_motion
+from dyngs.view.frames import Shot
+from dyngs.view.paths import CameraPath, frame_orbit_for_points, frozen_path, read_path, spiral_path, with_times
+from dyngs.view.shots import DEFAULT_FRAMES, DEFAULT_SIZE, ShotOptions, path_file, resize_cameras
+
+_MOMENTS = 8
+"""Of a motion, at which the camera must see the person."""
+_RING = 24
+
+
+def shot_of_avatar(file: Path, options: ShotOptions) -> Shot:
+    """The person of a file along a path around it, or before one camera that stands in front of it.
+
+    Raises:
+        DyngsError: no avatar file, a broken path or motion, a view, or times that do not fit the frames.
+    """
+    if options.view is not None:
+        raise DyngsError(f"{file}: an avatar file holds no views; leave out --view")
+    run, fps = read_avatar(file), None
+    if options.motion is not None:
+        played = playing_motion(run, options.motion)
+        run, fps = played.run, played.fps
+    if not isinstance(run.scene, AvatarScene):
+        raise DyngsError(f"{file}: holds no person; give a file of `dyngs export RUN --format avatar`")
+    path = _path(run.scene, run.info.world_offset, options)
+    if fps is not None:
+        path = replace(path, fps=fps)
+    if options.size is not None:
+        path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
+    _, background = evaluation_background(options.background or run.info.background, has_alpha=True)
+    return Shot(run.scene, path, render_options(run.config.model), background)
+
+
+def _path(scene: AvatarScene, world_offset: tuple[float, float, float], options: ShotOptions) -> CameraPath:
+    """The cameras that are asked for, and the moments of the clip that they see."""
+    times = scene.times if options.times is None else options.times
+    if options.path is None:
+        return frozen_path(_around(scene, options, 1), times)
+    named = path_file(options.path)
+    if named is not None:
+        path = read_path(named, np.asarray(world_offset))
+    else:
+        path = CameraPath(
+            _around(scene, options, options.num_frames or (DEFAULT_FRAMES if scene.is_still else len(times)))
+        )
+    if scene.is_still or (options.times is None and path.times is not None):
+        return path
+    if options.times is None:
+        return with_times(path, np.linspace(0, 1, len(path)).tolist())
+    return with_times(replace(path, warnings=()), times * len(path) if len(times) == 1 else times)
+
+
+def _around(scene: AvatarScene, options: ShotOptions, count: int) -> Cameras:
+    """An orbit around where the person is, a spiral before it, or without a path the one camera in front of it."""
+    moments = np.linspace(0, 1, 1 if scene.is_still else _MOMENTS)
+    means = torch.cat([scene.at(moment).means for moment in moments.tolist()]).numpy()
+    x, y, z = up_of(scene.given_clip).tolist()
+    size = options.size or DEFAULT_SIZE
+    if options.path == "orbit":
+        return frame_orbit_for_points(means, count, size, (x, y, z))
+    ring = frame_orbit_for_points(means, _RING, size, (x, y, z))
+    facing = rotations(scene.clip.poses[0, 0])[:, 2]
+    front = int((ring.centers @ facing).argmax())
+    if options.path is None:
+        return ring.select(front)
+    arc = [(front + i) % _RING for i in (-1, 0, 1)]
+    around = replace(ring, cam_from_world=ring.cam_from_world[arc], intrinsics=ring.intrinsics[arc])
+    return spiral_path(around, count)
