@@ -1,29 +1,29 @@
-"""A synthetic capture of a person: the textured template in motion, from many cameras, with its exact pose.
+"""A synthetic capture of a person: the dressed template in motion, from many cameras, with its exact pose.
 
 Pictures come from a z-buffer of triangles in numpy. It shares no formula with the rasterizer of Gaussians, so that they
 are an independent ground truth.
 
-Local letters: J joints, M vertices, T triangles, U vertices of the atlas, F frames, H hits, P and S texels, S per side.
+Local letters: J joints, M vertices, T triangles, U vertices of the atlas, F frames, H hits, S texels per side.
 """
 
 from __future__ import annotations
 
-import colorsys
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from dyngs.data.raytrace import CAMERA_ANGLE_X
 from dyngs.data.synthetic import require_new_folder
 from dyngs.data.write import write_image, write_text
 from dyngs.errors import DyngsError
+from dyngs.human.clothes import atlas_of, dressed, outfit_of, texture_of, texture_places
+from dyngs.human.mesh import Hits, interpolated, unit, vertex_normals, visible
 from dyngs.human.motion import JOINTS, Motion, save_motion
 
 if TYPE_CHECKING:
@@ -36,17 +36,6 @@ _TARGET = np.array([0.0, 0.95, 0.0])
 """What all cameras look at, m."""
 _TO_LIGHT = np.array([0.35, 0.75, 0.56])
 _AMBIENT, _DIFFUSE = 0.6, 0.45
-_PARTS = {
-    "eye": ("eye",),
-    "head": ("neck", "head", "jaw"),
-    "torso": ("pelvis", "spine", "collar"),
-    "arm": ("shoulder",),
-    "forearm": ("elbow",),
-    "hand": ("wrist", "index", "middle", "pinky", "ring", "thumb"),
-    "leg": ("hip", "knee"),
-    "shoe": ("ankle", "foot"),
-}
-"""The joints by which the parts of the body move, without side and number."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +48,7 @@ class HumanOptions:
         num_new: frames of the other clip, ``pose``; 0 = no such split.
         num_cameras: training cameras, on a ring around the person.
         num_test: test cameras, each midway between two training cameras; 0 = neither test nor ``pose``.
-        seed: of the texture; one seed gives the same bytes each time.
+        seed: of the outfit, see ``dyngs.human.clothes.outfit_of``; one seed gives the same bytes each time.
         samples: per pixel side.
     """
 
@@ -91,26 +80,12 @@ class PosedMesh:
     texture: np.ndarray
 
 
-@dataclass(frozen=True)
-class _Hits:
-    """Which triangle is seen where; H grid points that see one, none of them twice.
-
-    Attributes:
-        index: (H,) row * width + column.
-        faces: (H,) int64.
-        shares: (H, 3) of the triangle's corners on the surface: barycentric coordinates, sum 1.
-    """
-
-    index: np.ndarray
-    faces: np.ndarray
-    shares: np.ndarray
-
-
 def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Path:
     """Write pictures of a walking person in the layout that ``dyngs.data.body_json`` reads; returns ``out``.
 
     Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha, sRGB), ``transforms_SPLIT.json`` (OpenGL poses, m,
     y up, floor at y = 0), and the exact parameters of the default template, ``body_train.npz`` and ``body_pose.npz``.
+    Clothes stand away from the template; how tall the person is, is the ``scale`` of the parameters.
     Test shows the frames of train from other cameras; ``pose`` shows another clip from these other cameras.
 
     Raises:
@@ -124,14 +99,16 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
         raise DyngsError("a synthetic person needs num_new, num_test and seed of at least 0")
     require_new_folder(out)
     body = default_body()
-    texture = texture_of(body, options.seed)
+    outfit = outfit_of(options.seed)
+    clothed, texture = dressed(body, outfit), texture_of(body, outfit)
     train = dict(enumerate(_ring(options.num_cameras)))
     test = {len(train) + i: pose for i, pose in enumerate(_ring_between(options.num_test, options.num_cameras))}
     clips = {"train": walk(body, options.num_frames)}
     if options.num_new and test:
         clips["pose"] = squat(body, options.num_new)
-    for name, motion in clips.items():
-        meshes = list(_posed_meshes(body, motion, texture))
+    for name, clip in clips.items():
+        motion = replace(clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale)
+        meshes = list(_posed_meshes(clothed, motion, texture))
         splits = {"train": train, "test": test} if name == "train" else {"pose": test}
         for split, cameras in splits.items():
             _write_split(out, split, meshes, cameras, options)
@@ -173,38 +150,6 @@ def squat(body: Body, num_frames: int) -> Motion:
     return _on_floor(body, turns, num_frames)
 
 
-def texture_of(body: Body, seed: int, resolution: int = 512) -> np.ndarray:
-    """(S, S, 3) sRGB values in [0, 1] of the clothes of ``seed``, float64; left and right, front and back differ.
-
-    Texels that no triangle covers repeat the nearest that one does, so that interpolation at seams stays on the body.
-
-    Args:
-        body: a template in T-pose with texture coordinates and the 55 joints of SMPL-X.
-        seed: chooses the colours.
-        resolution: S, texels per side.
-
-    Raises:
-        DyngsError: the template has no texture coordinates.
-    """
-    uv, uv_faces = _atlas(body)
-    columns, rows = _texture_places(uv, resolution)
-    hits = _visible(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], resolution, resolution)
-    around = body.faces.numpy()[hits.faces]
-    points = _interpolated(hits.shares, body.vertices.double().numpy()[around])
-    bases = [name.removeprefix("left_").removeprefix("right_").rstrip("123") for name in JOINTS]
-    member = np.array([[base in names for names in _PARTS.values()] for base in bases], dtype=np.float64)
-    parts = _interpolated(hits.shares, (body.weights.double().numpy() @ member)[around]).argmax(axis=1)
-    part = np.array(list(_PARTS))[parts]
-    eye = body.joints[JOINTS.index("left_eye")].double().numpy()
-    texture = np.zeros((resolution * resolution, 3))
-    texture[hits.index] = _painted(points, part, eye, _palette(seed))
-    is_bare = np.ones(resolution * resolution, dtype=bool)
-    is_bare[hits.index] = False
-    near = distance_transform_edt(is_bare.reshape(resolution, -1), return_distances=False, return_indices=True)
-    row, column = np.asarray(near)
-    return texture[row * resolution + column]
-
-
 def render_mesh(mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int) -> np.ndarray:
     """(size, size, 4) sRGB values and straight alpha in [0, 1], of ``samples`` x ``samples`` places per pixel.
 
@@ -226,11 +171,11 @@ def render_mesh(mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples:
         raise ValueError("all vertices must be in front of the camera")
     focal = _focal(size)
     image = np.stack([0.5 * size - focal * x / back, 0.5 * size + focal * up / back, -1.0 / back], axis=-1)
-    normals = _vertex_normals(mesh.vertices, mesh.faces)
+    normals = vertex_normals(mesh.vertices, mesh.faces)
     sums = np.zeros((size * size, 4))
     for k in range(samples * samples):
         place = np.array([(k % samples + 0.5) / samples, (k // samples + 0.5) / samples, 0.0])
-        hits = _visible((image - place)[mesh.faces], size, size)
+        hits = visible((image - place)[mesh.faces], size, size)
         sums[hits.index, :3] += _lit(mesh, normals, hits)
         sums[hits.index, 3] += 1.0
     rgb = sums[:, :3] / np.maximum(sums[:, 3:], 1.0)
@@ -259,18 +204,11 @@ def _posed_meshes(body: Body, motion: Motion, texture: np.ndarray) -> Iterator[P
     """The mesh of each frame, posed in float64."""
     from dyngs.human.body import posed_vertices
 
-    uv, uv_faces = _atlas(body)
+    uv, uv_faces = atlas_of(body)
     exact, faces = body.to(torch.float64), body.faces.numpy()
-    for pose, trans in zip(motion.poses.double(), motion.trans.double(), strict=True):
-        vertices = posed_vertices(exact, pose[None], trans[None])[0].numpy()
+    for pose, trans, scale in zip(*(x.double() for x in (motion.poses, motion.trans, motion.scale)), strict=True):
+        vertices = posed_vertices(exact, pose[None], trans[None], scale=scale[None])[0].numpy()
         yield PosedMesh(vertices, faces, uv, uv_faces, texture)
-
-
-def _atlas(body: Body) -> tuple[np.ndarray, np.ndarray]:
-    """Texture coordinates (U, 2), float64, and the triangles (T, 3) into them."""
-    if body.uv is None or body.uv_faces is None:
-        raise DyngsError(f"the body template '{body.name}' has no texture coordinates; give one with a texture atlas")
-    return body.uv.double().numpy(), body.uv_faces.numpy()
 
 
 def _on_floor(body: Body, turns: dict[str, np.ndarray], num_frames: int) -> Motion:
@@ -308,8 +246,8 @@ def _ring_between(count: int, others: int) -> np.ndarray:
 def _looking(azimuths: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """(V, 4, 4) OpenGL camera-to-world poses, y up; azimuths (V,) from +z towards +x in radians, heights (V,) in m."""
     centers = np.stack([_RADIUS * np.sin(azimuths), heights, _RADIUS * np.cos(azimuths)], axis=-1)
-    backward = _unit(centers - _TARGET)
-    right = _unit(np.cross([0.0, 1.0, 0.0], backward))
+    backward = unit(centers - _TARGET)
+    right = unit(np.cross([0.0, 1.0, 0.0], backward))
     poses = np.tile(np.eye(4), (len(centers), 1, 1))
     poses[:, :3] = np.stack([right, np.cross(backward, right), backward, centers], axis=-1)
     return poses
@@ -320,140 +258,21 @@ def _focal(size: int) -> float:
     return float(0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X))
 
 
-def _visible(corners: np.ndarray, width: int, height: int) -> _Hits:
-    """The nearest triangle at every grid point, whole numbers of column and row, that sees one.
-
-    Args:
-        corners: (T, 3, 3) column, row and nearness of the corners; nearness is 1 / depth, linear in the picture, or 1
-            where there is no perspective. Triangles without area cover nothing; edges belong to both sides.
-        width: of the grid.
-        height: of the grid.
-    """
-    x, y, near = np.ascontiguousarray(corners.transpose(2, 1, 0))
-    (x0, x1, x2), (y0, y1, y2) = x, y
-    area = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
-    left, across = _span(x, width)
-    top, down = _span(y, height)
-    counts = np.where(area != 0, across * down, 0)
-    owner = np.repeat(np.arange(len(corners)), counts)
-    within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    column, row = left[owner] + within % across[owner], top[owner] + within // across[owner]
-    right, below = column - x0[owner], row - y0[owner]
-    second = (right * (y2 - y0)[owner] - below * (x2 - x0)[owner]) / area[owner]
-    third = ((x1 - x0)[owner] * below - (y1 - y0)[owner] * right) / area[owner]
-    shares = np.stack([1.0 - second - third, second, third])
-    inside = shares.min(axis=0) >= -1e-9  # a little more than the triangle: no gaps between neighbours
-    shares, owner, index = shares[:, inside], owner[inside], (row * width + column)[inside]
-    shares = shares * near[:, owner]
-    nearness = shares.sum(axis=0)
-    nearest = np.zeros(width * height)
-    np.maximum.at(nearest, index, nearness)
-    first = np.flatnonzero(nearness == nearest[index])
-    index, chosen = np.unique(index[first], return_index=True)
-    first = first[chosen]
-    return _Hits(index, owner[first], (shares[:, first] / nearness[first]).T)
-
-
-def _span(ends: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """First whole number in [0, size) between the ``ends`` (3, T) of each triangle, and how many there are (T,)."""
-    first = np.ceil(ends.min(axis=0) - 1e-6).clip(0, size).astype(np.int64)
-    last = np.floor(ends.max(axis=0) + 1e-6).clip(-1, size - 1).astype(np.int64)
-    return first, np.maximum(last - first + 1, 0)
-
-
-def _lit(mesh: PosedMesh, normals: np.ndarray, hits: _Hits) -> np.ndarray:
+def _lit(mesh: PosedMesh, normals: np.ndarray, hits: Hits) -> np.ndarray:
     """(H, 3) sRGB values of what is hit."""
-    uv = _interpolated(hits.shares, mesh.uv[mesh.uv_faces[hits.faces]])
-    normal = _unit(_interpolated(hits.shares, normals[mesh.faces[hits.faces]]))
-    light = _AMBIENT + _DIFFUSE * np.maximum(normal @ _unit(_TO_LIGHT), 0.0)
+    uv = interpolated(hits.shares, mesh.uv[mesh.uv_faces[hits.faces]])
+    normal = unit(interpolated(hits.shares, normals[mesh.faces[hits.faces]]))
+    light = _AMBIENT + _DIFFUSE * np.maximum(normal @ unit(_TO_LIGHT), 0.0)
     return np.minimum(_sampled(mesh.texture, uv) * light[:, None], 1.0)
 
 
 def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """(H, 3) of a texture (S, S, 3) at ``uv`` (H, 2), bilinear between the centres of texels."""
     last = len(texture) - 1
-    column, row = (np.clip(place, 0.0, last) for place in _texture_places(uv, len(texture)))
+    column, row = (np.clip(place, 0.0, last) for place in texture_places(uv, len(texture)))
     left, top = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
     right, below = np.minimum(left + 1, last), np.minimum(top + 1, last)
     x, y = (column - left)[:, None], (row - top)[:, None]
     upper = (1 - x) * texture[top, left] + x * texture[top, right]
     lower = (1 - x) * texture[below, left] + x * texture[below, right]
     return (1 - y) * upper + y * lower
-
-
-def _texture_places(uv: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row (U,) of a texture, whole numbers at the centres of texels, of ``uv`` (U, 2)."""
-    return uv[:, 0] * resolution - 0.5, (1.0 - uv[:, 1]) * resolution - 0.5
-
-
-def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(M, 3) unit normals: of the triangles around, weighted by their areas."""
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    flat = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    total = [np.bincount(faces.ravel(), weights=flat[:, k], minlength=len(vertices)) for k in range(3)]
-    return _unit(np.stack(total, axis=-1))
-
-
-def _interpolated(shares: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(H, D) values at hits between their corners' (H, 3, D)."""
-    return np.einsum("hk,hkd->hd", shares, values)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    """(..., 3) of length 1; zero stays zero."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
-
-
-def _palette(seed: int) -> dict[str, np.ndarray]:
-    """By name of cloth or part: (3,) sRGB values; hues far from each other, in an order that ``seed`` chooses."""
-    make = np.random.default_rng(seed)
-    names = ("shirt", "stripe", "back", "left_leg", "right_leg", "left_hand", "right_hand", "left_shoe", "right_shoe")
-    hues = (make.permutation(len(names)) + make.uniform()) / len(names)
-    values = {"shirt": 0.85, "stripe": 0.95, "back": 0.6, "left_leg": 0.6, "right_leg": 0.75}
-    colors = {
-        name: np.array(colorsys.hsv_to_rgb(hue, make.uniform(0.55, 0.85), values.get(name, 0.9)))
-        for name, hue in zip(names, hues, strict=True)
-    }
-    skin, hair = make.uniform(0.35, 0.9), make.uniform(0.1, 0.5)
-    return colors | {"skin": skin * np.array([1.0, 0.8, 0.68]), "hair": hair * np.array([1.0, 0.75, 0.5])}
-
-
-def _painted(points: np.ndarray, part: np.ndarray, eye: np.ndarray, palette: dict[str, np.ndarray]) -> np.ndarray:
-    """(P, 3) colours of places ``points`` (P, 3) of the T-pose, m; their ``part`` (P,); ``eye`` (3,) the left."""
-    x, y, z = points.T
-    is_left, is_front, side = x > 0, z > -0.02, np.abs(x)
-
-    def either(name: str) -> np.ndarray:
-        return np.where(is_left[:, None], palette[f"left_{name}"], palette[f"right_{name}"])
-
-    def striped(along: np.ndarray, pitch: float, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return np.where((np.floor(along / pitch) % 2 == 0)[:, None], first, second)
-
-    def disc(center_x: float, center_y: float, radius: float) -> np.ndarray:
-        return is_front & (np.hypot(x - center_x, y - center_y) < radius)
-
-    rgb = np.broadcast_to(palette["skin"], points.shape).copy()
-    is_head, is_torso, is_leg = (part == name for name in ("head", "torso", "leg"))
-    white, black, red = np.full(3, 0.95), np.full(3, 0.08), np.array([0.75, 0.1, 0.1])
-    shirt, stripe, back = palette["shirt"], palette["stripe"], palette["back"]
-    checks = 0.65 + 0.35 * ((np.floor(y / 0.06) + np.floor(z / 0.06)) % 2)
-    trousers = checks[:, None] * either("leg")
-    torso = np.where(is_front[:, None], striped(y, 0.05, shirt, stripe), striped(x, 0.06, back, stripe))
-    sleeves = np.where(is_left[:, None], striped(side, 0.05, shirt, stripe), striped(side, 0.08, back, white))
-    for where, colors in (
-        (is_torso, torso),
-        (is_torso & disc(0.09, 0.47, 0.05), white),
-        (is_torso & (y < 0.18), black),
-        (is_leg | (is_torso & (y < 0.14)), trousers),
-        (part == "arm", sleeves),
-        ((part == "forearm") & is_left & (np.abs(side - 0.62) < 0.03), black),
-        (part == "hand", either("hand")),
-        (part == "shoe", either("shoe")),
-        (is_head & ((y > eye[1] + 0.05) | (~is_front & (y > eye[1] - 0.06))), palette["hair"]),
-        (is_head & (disc(eye[0], eye[1], 0.02) | disc(-eye[0], eye[1], 0.02)), black),
-        (part == "eye", white),
-        (is_head & (np.hypot(x / 2.5, y - eye[1] + 0.075) < 0.011) & (z > 0.05), red),
-        (is_head & disc(eye[0] + 0.012, eye[1] - 0.042, 0.014), palette["left_hand"]),
-    ):
-        rgb[where] = colors[where] if colors.ndim == 2 else colors
-    return rgb

@@ -25,13 +25,13 @@ from dyngs.data.raytrace import CAMERA_ANGLE_X
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.human.body import Body, default_body, posed_vertices
+from dyngs.human.clothes import dressed, outfit_of, texture_of
 from dyngs.human.motion import JOINTS, Motion, read_motion
 from dyngs.human.synthetic import (
     HumanOptions,
     PosedMesh,
     render_mesh,
     squat,
-    texture_of,
     walk,
     write_human_capture,
 )
@@ -47,7 +47,7 @@ def body() -> Body:
 
 @cache
 def texture() -> np.ndarray:
-    return texture_of(body(), 0)
+    return texture_of(body(), outfit_of(0))
 
 
 @pytest.fixture(scope="module")
@@ -212,43 +212,6 @@ def test_what_is_behind_the_camera_is_refused() -> None:
         render_mesh(mesh_of(body().vertices.double().numpy(), texture()), front_camera(0.0, 0.0), 8, 1)
 
 
-# --- clothes ----------------------------------------------------------------------------------------------------------
-
-
-def test_the_texture_differs_by_seed_side_and_front() -> None:
-    """By the colours at the vertices of hands, shoes and chest."""
-    vertices = body().vertices.double().numpy()
-    mesh = mesh_of(vertices, texture())
-    places = np.zeros((len(vertices), 2))
-    places[mesh.faces.ravel()] = mesh.uv[mesh.uv_faces.ravel()]
-    colors = texture()[((1 - places[:, 1]) * 512).astype(int), (places[:, 0] * 512).astype(int)]
-    palm, sole = np.abs(vertices[:, 0]) > 0.83, vertices[:, 1] < -0.8
-    for part in (palm, sole):
-        left, right = (colors[part & (sign * vertices[:, 0] > 0)] for sign in (1, -1))
-        for side in (left, right):
-            assert (np.abs(side - np.median(side, axis=0)) < 1e-9).all(1).mean() > 0.95, "one colour"
-        assert np.abs(np.median(left, axis=0) - np.median(right, axis=0)).max() > 0.2
-    chest = (np.abs(vertices[:, 0]) < 0.1) & (np.abs(vertices[:, 1] - 0.35) < 0.1)
-    front, back = (colors[chest & (sign * (vertices[:, 2] + 0.02) > 0.02)].mean(0) for sign in (1, -1))
-    assert np.abs(front - back).max() > 0.1
-    other = texture_of(body(), 1, 64)
-    assert np.abs(other - texture_of(body(), 0, 64)).mean() > 0.05
-    assert (other >= 0).all()
-    assert (other <= 1).all()
-
-
-def test_texels_beside_the_atlas_repeat_the_nearest_one() -> None:
-    """No texel is left black, however coarse the texture; the darkest cloth is 0.08."""
-    for resolution in (1, 7, 64):
-        assert texture_of(body(), 0, resolution).shape == (resolution, resolution, 3)
-        assert texture_of(body(), 0, resolution).max(-1).min() >= 0.08
-
-
-def test_a_body_without_an_atlas_is_refused() -> None:
-    with pytest.raises(DyngsError, match="no texture coordinates"):
-        texture_of(replace(body(), uv=None, uv_faces=None), 0)
-
-
 # --- motion -----------------------------------------------------------------------------------------------------------
 
 
@@ -302,13 +265,27 @@ def seen_at(view: View, points: np.ndarray) -> np.ndarray:
     return np.stack([u / w, v / w], axis=-1)
 
 
-def test_one_seed_gives_the_same_bytes_and_another_one_other_clothes_only(root: Path, tmp_path: Path) -> None:
-    first, again = files(root), files(write_human_capture(tmp_path / "again", TINY))
-    other = files(write_human_capture(tmp_path / "other", replace(TINY, seed=1)))
-    assert again == first
-    assert {name for name in first if other[name] != first[name]} == {name for name in first if name.endswith(".png")}
-    for name in (name for name in first if name.endswith(".png")):
-        np.testing.assert_array_equal(pixels(tmp_path / "other" / name)[..., 3], pixels(root / name)[..., 3])
+def test_one_seed_gives_the_same_bytes(root: Path, tmp_path: Path) -> None:
+    assert files(write_human_capture(tmp_path / "again", TINY)) == files(root)
+
+
+def test_another_seed_is_another_person_of_another_size(root: Path, tmp_path: Path) -> None:
+    """The parameters say how tall; the silhouette is that of the dressed template."""
+    other = write_human_capture(tmp_path / "other", replace(TINY, seed=3))
+    assert files(other).keys() == files(root).keys()
+    outfit = outfit_of(3)
+    motion = read_motion(other / "body_train.npz", body())
+    torch.testing.assert_close(motion.scale, torch.full((2,), outfit.size))
+    torch.testing.assert_close(motion.trans, outfit.size * walk(body(), 2).trans)
+    exact = dressed(body(), outfit).to(torch.float64)
+    vertices = posed_vertices(exact, motion.poses.double(), motion.trans.double(), scale=motion.scale.double())
+    for view in captured(other).splits["train"][:3]:
+        is_person = pixels(view.image_path)[..., 3] == 255
+        places = seen_at(view, vertices[0].numpy())
+        for found, expected in zip(np.nonzero(is_person), places.T[::-1], strict=True):
+            assert expected.min() - 0.5 <= found.min() + 0.5 <= expected.min() + 2  # pixels: centres are sampled
+            assert expected.max() - 2 <= found.max() + 0.5 <= expected.max() + 0.5
+    assert (pixels(root / "images/train/f000_c00.png") != pixels(other / "images/train/f000_c00.png")).any()
 
 
 def test_the_layout_is_read_as_a_person(root: Path) -> None:

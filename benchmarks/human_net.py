@@ -1,0 +1,134 @@
+"""The network that predicts people, on synthetic ones that it has not seen, against mean textures.
+
+    python benchmarks/human_net.py FOLDER [--people 12] [--held-out 4] [--size 128] [--steps 2000] [--threads 1]
+
+FOLDER keeps the captures and the run, which are used again. Printed per held-out person, for other cameras (`test`) and
+for another clip (`pose`): PSNR in the person's box / of the whole picture, from three pictures of one moment, of
+
+- network: what `dyngs predict` makes;
+- seen, else mean: the bare template in the colours that the three pictures show, elsewhere in the mean of the people
+  that were trained on, texel by texel;
+- mean texture: the bare template in that mean alone;
+and the seconds from pictures in memory or on disk to Gaussians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean
+
+import torch
+
+from dyngs.config import Config, HumanNetModel
+from dyngs.config_io import load_config, packaged_preset
+from dyngs.human.person import template
+from dyngs.human.predict.fill import filled
+from dyngs.human.predict.sitter import spread_views
+from dyngs.human.synthetic import HumanOptions, write_human_capture
+from dyngs.train.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at
+from dyngs.train.evaluate import evaluate_run
+from dyngs.train.predictor import filmed, human_options, load_network, new_network
+from dyngs.train.predictor_run import network_config, predict_person, write_run
+from dyngs.train.trainer import train
+
+FIRST_HELD_OUT = 101
+"""Seed of the first person that is not trained on."""
+
+SPLITS = ("test", "pose")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way of making one person: name, PSNR by split (box, whole picture), seconds."""
+
+    name: str
+    psnr: dict[str, tuple[float, float]]
+    seconds: float
+
+
+def captures(folder: Path, seeds: range, options: HumanOptions) -> None:
+    """Synthetic people, those that are not there yet."""
+    for seed in seeds:
+        if not (folder / f"p{seed:03d}").exists():
+            write_human_capture(folder / f"p{seed:03d}", replace(options, seed=seed))
+
+
+def trained(folder: Path, run: Path, steps: int, threads: int) -> Path:
+    """The run of the network, made or gone on with where it is not finished."""
+    words = [f"data.root={folder}", f"run.dir={run}", f"run.threads={threads}", f"train.steps={steps}"]
+    config: Config = load_config(packaged_preset("human_net"), words)
+    return train(config, resume_from=run if checkpoint_paths(run) else None)
+
+
+def scored(name: str, run: Path, seconds: float) -> Row:
+    """PSNR of a run on both splits."""
+    reports = {split: evaluate_run(run, split, threads=1) for split in SPLITS}
+    return Row(name, {split: (r.psnr_person or 0.0, r.psnr) for split, r in reports.items()}, seconds)
+
+
+def baselines(network: Path, capture: Path, out: Path, count: int) -> list[Row]:
+    """The bare template, coloured without the network."""
+    config, model = network_config(network)
+    mean = load_network(new_network(model, torch.Generator()), latest_checkpoint(network))
+    bare: HumanNetModel = model.model_copy(update={"heights": (min(model.heights),)})
+    data = config.data.model_copy(update={"root": capture.absolute()})
+    person = filmed(data, bare, template(human_options(bare)))
+    rows = []
+    for name in ("seen, else mean", "mean texture"):
+        start = time.perf_counter()
+        maps = person.look(spread_views(person.sitter, count))
+        if name == "mean texture":
+            maps = replace(maps, seen=torch.zeros_like(maps.seen))
+        avatar = filled(person.sitter, maps, mean, None, bare.carve)
+        seconds = time.perf_counter() - start
+        run = out / name.replace(", ", "_").replace(" ", "_")
+        if not checkpoint_paths(run):
+            write_run(run, avatar, data, bare, seconds)
+        rows.append(scored(name, run, seconds))
+    return rows
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--people", type=int, default=12)
+    parser.add_argument("--held-out", type=int, default=4)
+    parser.add_argument("--size", type=int, default=128)
+    parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--views", type=int, default=3)
+    given = parser.parse_args()
+    options = HumanOptions(size=given.size, num_frames=6, num_new=0, num_test=0)
+    captures(given.folder / "train", range(1, given.people + 1), options)
+    held_out = range(FIRST_HELD_OUT, FIRST_HELD_OUT + given.held_out)
+    captures(given.folder / "held_out", held_out, replace(options, num_new=4, num_test=4))
+    network = trained(given.folder / "train", given.folder / "network", given.steps, given.threads)
+    torch.set_num_threads(given.threads)
+    table: dict[str, list[Row]] = {}
+    for seed in held_out:
+        capture, out = given.folder / "held_out" / f"p{seed:03d}", given.folder / "predicted" / f"p{seed:03d}"
+        start = time.perf_counter()
+        if not checkpoint_paths(out / "network"):
+            predict_person(network, capture, out / "network", given.views)
+        whole = time.perf_counter() - start
+        print(f"person {seed}: dyngs predict took {whole:.1f} s with reading and writing")
+        seconds = seconds_at(out / "network", 0)
+        for row in (scored("network", out / "network", seconds), *baselines(network, capture, out, given.views)):
+            table.setdefault(row.name, []).append(row)
+            print(line(f"{seed} {row.name}", [row]), flush=True)
+    for name, rows in table.items():
+        print(line(f"mean {name}", rows))
+
+
+def line(name: str, rows: list[Row]) -> str:
+    """A row of a table in Markdown: means."""
+    cells = [" / ".join(f"{fmean(row.psnr[split][which] for row in rows):.2f}" for which in (0, 1)) for split in SPLITS]
+    return f"| {name} | {' | '.join(cells)} | {fmean(row.seconds for row in rows):.2f} s |"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""``dyngs predict``: a person from a few pictures, by a network that was trained on others."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+_EPILOG = """\
+examples:
+  dyngs train configs/human_net.yaml data.root=PEOPLE run.dir=runs/net     PEOPLE holds a capture in each folder
+  dyngs predict runs/net captures/ann --out runs/ann
+  dyngs predict runs/net captures/ann --out runs/ann --views f000_c00.png,f000_c03.png,f000_c06.png
+  dyngs eval runs/ann
+  dyngs train --resume runs/ann                                            goes on from the prediction
+"""
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``predict`` to the commands."""
+    parser = commands.add_parser(
+        "predict",
+        help="a person from a few pictures, without training on them",
+        description="Predict an avatar from a few training views of a capture; writes a run folder of model.kind=human "
+        "that all other commands take.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("network", type=Path, metavar="NET_RUN", help="run folder of model.kind=human_net")
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="a capture of a person, with body parameters")
+    parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="a new run folder")
+    parser.add_argument(
+        "--views",
+        type=parse_views,
+        default=3,
+        metavar="N|NAME,..",
+        help="how many views to predict from, or which (default 3)",
+    )
+    parser.set_defaults(run=run)
+
+
+def parse_views(text: str) -> int | tuple[str, ...]:
+    """A number of views, or their names."""
+    if text.lstrip("-").isdigit():
+        return int(text)
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Predict, and say how long it took and what to do next."""
+    from dyngs.train.predictor_run import predict_person
+
+    out: Path = arguments.out
+    made = predict_person(arguments.network, arguments.capture, out, arguments.views)
+    seconds = made.seconds_maps + made.seconds_network
+    print(f"predicted: {made.num_gaussians:,} Gaussians from {', '.join(made.views)}")
+    print(f"time:      {seconds:.2f} s ({made.seconds_maps:.2f} s pictures, {made.seconds_network:.2f} s network)")
+    print(f"written:   {out}\nnext:      dyngs eval {out}\n           dyngs train --resume {out}   refines it")
+    return 0

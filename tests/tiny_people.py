@@ -1,0 +1,32 @@
+"""Small synthetic people for tests of predictions: captures, and the persons in them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+from dyngs.config import DataConfig, HumanNetModel
+from dyngs.human.body import Body, default_body
+from dyngs.human.synthetic import HumanOptions, write_human_capture
+from dyngs.train.predictor import Filmed, filmed
+
+TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)
+NET = HumanNetModel(sh_degree=0, resolution=32, heights=(0.0, 0.02), views=3, inputs=1, targets=1, widths=(8, 8))
+
+
+@cache
+def body() -> Body:
+    return default_body()
+
+
+def people(folder: Path, seeds: tuple[int, ...], options: HumanOptions = TINY) -> Path:
+    """``folder`` with a capture of a person per seed."""
+    for seed in seeds:
+        write_human_capture(folder / f"p{seed}", replace(options, seed=seed))
+    return folder
+
+
+def person(capture: Path, model: HumanNetModel = NET) -> Filmed:
+    """The person of one capture."""
+    return filmed(DataConfig.model_validate({"root": capture}), model, body())
