@@ -53,10 +53,13 @@ class DataConfig(Section):
 
 
 class PointsInit(Section):
-    """Start from the capture's sparse points (random ones where it has none)."""
+    """Start from the capture's sparse points, else from triangulated ones, else from random ones."""
 
     kind: Literal["auto", "points"] = "auto"
-    num_random: int = Field(default=100_000, ge=1, description="used where the capture has no points")
+    triangulate: int = Field(
+        default=24, ge=0, description="pictures of one moment to triangulate points from where the capture has none"
+    )
+    num_random: int = Field(default=100_000, ge=1, description="used where there are no points at all")
     half_extent: Positive = 1.3
 
 
@@ -207,6 +210,66 @@ class HumanModel(SceneModel):
     smoothness: float = Field(default=1e-3, ge=0, description="of what the offsets of five neighbours differ, cm")
 
 
+class HumanNetModel(SceneModel):
+    """A network that predicts people from a few pictures, trained on others (docs/people_network.md)."""
+
+    kind: Literal["human_net"] = "human_net"
+    body: Path | None = Field(default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template")
+    uv: Path | None = Field(default=None, description=".obj with the texture coordinates of the body")
+    resolution: int = Field(default=128, ge=8, le=1024, description="texels per side of the atlas")
+    heights: tuple[float, ...] = Field(
+        default=(0.0, 0.02, 0.04), min_length=1, description="of the scaffolds above the skin, m"
+    )
+    carve: Fraction = Field(
+        default=0.9, description="share of the silhouettes that a scaffold above the skin must lie inside of"
+    )
+    views: int = Field(default=3, ge=1, description="pictures of a person that are predicted from")
+    inputs: int = Field(default=6, ge=1, description="choices of such pictures per person, which are cached")
+    targets: int = Field(default=2, ge=1, description="pictures of one moment to compare with per step")
+    widths: tuple[Annotated[int, Field(ge=8)], ...] = Field(
+        default=(24, 32, 48, 64), min_length=1, description="channels at 1/2, 1/4, .. of the resolution"
+    )
+    lr: Positive = Field(default=2e-3, description="highest rate")
+    warm_up: Fraction = Field(default=0.05, description="share of the run in which it is reached; then it falls to 0")
+    weight_decay: float = Field(default=1e-5, ge=0)
+    clip: Positive = Field(default=1.0, description="longest gradient")
+
+
+class ColourSection(Section):
+    """What all kinds of colour have in common."""
+
+    opacity_entropy: float = Field(
+        default=0.0, ge=0, description="weight of mean -o ln o, which removes what is faint; MEGA: 5e-4"
+    )
+
+
+class ShColour(ColourSection):
+    """Spherical harmonics of degree ``model.sh_degree`` for every Gaussian."""
+
+    kind: Literal["sh"] = "sh"
+
+
+class DcacColour(ColourSection):
+    """Three base values per Gaussian and one small network for all (MEGA, Zhang et al. 2024); no harmonics."""
+
+    kind: Literal["dcac"] = "dcac"
+    width: int = Field(default=32, ge=1, description="of the network's hidden layers; MEGA: 64")
+    depth: int = Field(default=2, ge=1, le=8, description="hidden layers")
+    normals: bool = Field(default=True, description="the network also sees how Gaussians lie, and what they mirror")
+    lr: Positive = Field(default=0.01, description="of the network; divided by 3 after 1/6, 1/2 and 5/6 of the run")
+    warm_up: int = Field(default=100, ge=1, description="steps in which that rate is reached")
+
+
+class AutoColour(ColourSection):
+    """Harmonics only for the Gaussians whose dependence on the view pays on held-out training views."""
+
+    kind: Literal["auto"] = "auto"
+    measure_at: Annotated[float, Field(gt=0, lt=1)] = Field(
+        default=0.6, description="share of the run after which that is measured; until then every 8th view is held out"
+    )
+    tolerance: float = Field(default=0.05, ge=0, description="dB that may be given away")
+
+
 class DefaultStrategy(Section):
     """Clone, split and prune by the gradient of the 2D means (3DGS, AbsGS as an option).
 
@@ -279,6 +342,26 @@ class TrainConfig(Section):
     tensorboard: bool = False
 
 
+class CompactConfig(Section):
+    """A last stage with fewer Gaussians, after ``train.steps`` (docs/compact.md). Off where nothing is asked for."""
+
+    prune: float = Field(default=0.0, ge=0, lt=1, description="share of the Gaussians to remove; 0 = none")
+    score: Literal["variation", "sensitivity", "contribution", "temporal"] = Field(
+        default="sensitivity", description="what a Gaussian is worth; the lowest go"
+    )
+    max_loss: float = Field(
+        default=10.0, ge=0, description="dB on training pictures, before fine-tuning; above it fewer are removed"
+    )
+    masks: int = Field(default=0, ge=0, description="key times of the masks of what is seen; 0 or 1 = no masks")
+    mask_below: float = Field(default=0.0, ge=0, description="px of a Gaussian in all views that count as not seen")
+    steps: int = Field(default=2000, ge=1, description="of fine-tuning")
+
+    @property
+    def is_wanted(self) -> bool:
+        """Anything is to be done."""
+        return self.prune > 0 or self.masks > 1
+
+
 class RunConfig(Section):
     """Where the run goes and how it is executed."""
 
@@ -292,9 +375,19 @@ class Config(Section):
     """Everything that decides a run."""
 
     data: DataConfig
-    model: Annotated[StaticModel | DynamicModel | HumanModel, Field(discriminator="kind")] = StaticModel()
+    model: Annotated[StaticModel | DynamicModel | HumanModel | HumanNetModel, Field(discriminator="kind")] = (
+        StaticModel()
+    )
     init: Annotated[PointsInit | RandomInit, Field(discriminator="kind")] = PointsInit()
+    colour: Annotated[ShColour | DcacColour | AutoColour, Field(discriminator="kind")] = ShColour()
     strategy: Annotated[DefaultStrategy | McmcStrategy, Field(discriminator="kind")] = DefaultStrategy()
     optim: OptimConfig = OptimConfig()
     train: TrainConfig = TrainConfig()
+    compact: CompactConfig = CompactConfig()
     run: RunConfig = RunConfig()
+
+    @property
+    def total_steps(self) -> int:
+        """Of training and of the last stage, if there is one."""
+        compacts = self.compact.is_wanted and not isinstance(self.model, HumanNetModel)
+        return self.train.steps + (self.compact.steps if compacts else 0)

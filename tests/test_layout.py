@@ -34,8 +34,7 @@ MANY_PARAMETERS = {
 
 HEAVY = ("pycolmap", "trimesh", "kornia", "OpenImageIO", "skimage", "av", "rich", "tensorboard", "lpips")
 UNPICKLERS = {
-    "dyngs/data/people.py": "reads pickles of numbers and arrays with an unpickler that knows nothing else",
-    "dyngs/human/body_files.py": "body models come as pickles; nothing that they name is imported or called",
+    "dyngs/data/pickles.py": "reads pickles of numbers and arrays with an unpickler that knows nothing else",
 }
 """Files that may import pickle, each with its reason."""
 

@@ -64,7 +64,9 @@ def report_table(report: EvalReport) -> Table:
     table.add_row("Gaussians", f"{report.num_gaussians:,}")
     if report.num_moving:
         table.add_row("moving", f"{report.num_moving:,} ({report.moving_share:.1%})")
-    table.add_row("model", f"{report.model_mb:.1f} MB{field}")
+    stored = "" if report.stored_mb is None else f"{report.stored_mb:.2f} MB on disk, as float32 "
+    table.add_row("model", f"{stored}{report.model_mb:.1f} MB{field}")
+    table.add_row("colour", f"{report.colour_floats:.1f} numbers per Gaussian")
     table.add_row("rendering", f"{report.fps:.1f} frames/s{deforming}")
     table.add_row("training", f"{report.step:,} steps in {report.seconds_train:.0f} s")
     return table

@@ -1,4 +1,4 @@
-"""``dyngs render``: pictures and videos of a run, or of any 3DGS .ply."""
+"""``dyngs render``: pictures and videos of a run, of an avatar file, or of any 3DGS .ply."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ examples:
   dyngs render runs/dance --times 0:1:60 --view 3 --video standing.mp4     the scene moves, the camera does not
   dyngs render runs/ann --motion walk.npz --video walk.mp4                 a person (model.kind=human) walks
   dyngs render runs/ann --pose rest --path orbit --video rest.mp4          the same person in the template's pose
+  dyngs render ann.safetensors --motion walk.npz --video walk.mp4          a person in one file
   dyngs render splats.ply --path spiral --video spiral.mp4 --up=-y --size 1280x720
 """
 
@@ -35,7 +36,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("source", type=Path, metavar="RUN_OR_PLY", help="a run folder, or a 3DGS .ply of any program")
+    parser.add_argument(
+        "source", type=Path, metavar="RUN_OR_FILE", help="a run folder, an avatar (.safetensors), or any 3DGS .ply"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the pictures")
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
@@ -137,6 +140,7 @@ def _render_shot(arguments: argparse.Namespace) -> list[Path]:
 
 def _shot(arguments: argparse.Namespace) -> Shot:
     """What the arguments ask for."""
+    from dyngs.view.avatar_shots import shot_of_avatar
     from dyngs.view.paths import parse_times
     from dyngs.view.shots import ShotOptions, shot_of_ply, shot_of_run
 
@@ -145,7 +149,6 @@ def _shot(arguments: argparse.Namespace) -> Shot:
     if arguments.times is not None:
         times = parse_times(arguments.times)
         num_frames = len(times)
-    is_file = arguments.source.is_file()
     options = ShotOptions(
         path=None if _stands_still(arguments) else arguments.path or "orbit",
         num_frames=num_frames,
@@ -158,7 +161,14 @@ def _shot(arguments: argparse.Namespace) -> Shot:
         motion=arguments.motion,
         at_rest=arguments.pose == "rest",
     )
-    return shot_of_ply(arguments.source, options) if is_file else shot_of_run(arguments.source, options)
+    if not arguments.source.is_file():
+        return shot_of_run(arguments.source, options)
+    return (shot_of_avatar if is_avatar(arguments.source) else shot_of_ply)(arguments.source, options)
+
+
+def is_avatar(path: Path) -> bool:
+    """Whether a path names an avatar file, and neither a run nor a .ply."""
+    return path.is_file() and path.suffix.lower() == ".safetensors"
 
 
 def say(notes: tuple[str, ...], warnings: tuple[str, ...] = ()) -> None:

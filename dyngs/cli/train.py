@@ -19,7 +19,7 @@ examples:
   dyngs train --resume runs/bench
 
 CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip, dynamic,
-human.
+human, human_net.
 All keys are listed in docs/cli.md; a wrong one is answered with what is allowed.
 """
 
@@ -46,8 +46,15 @@ def run(arguments: argparse.Namespace) -> int:
     folder = train(config, resume_from=arguments.resume)
     for line in _about_motion(folder, config):
         print(line)
-    print(f"trained: {folder}\nnext:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/pictures")
+    print(f"trained: {folder}\n{_next(folder, config)}")
     return 0
+
+
+def _next(folder: Path, config: Config) -> str:
+    """What to do with the run."""
+    if config.model.kind == "human_net":
+        return f"next:    dyngs predict {folder} CAPTURE --out RUN"
+    return f"next:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/pictures"
 
 
 def _about_motion(folder: Path, config: Config) -> list[str]:

@@ -122,6 +122,11 @@ class PictureLoader:
         """Of the views, in [0, 1]; None without times."""
         return tuple(view.time for view in self._views)
 
+    @property
+    def views(self) -> tuple[View, ...]:
+        """Whose pictures these are."""
+        return self._views
+
     def __getitem__(self, index: int) -> Picture:
         """The picture of view ``index``.
 

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import Config, DataConfig, DynamicModel, HumanModel, McmcStrategy
+from dyngs.colour.colours import Colours, NetworkColours
+from dyngs.colour.network import box_around
+from dyngs.colour.thrift import ThriftyColours
+from dyngs.config import AutoColour, Config, DataConfig, DcacColour, DynamicModel, HumanModel, McmcStrategy, PointsInit
 from dyngs.data.capture import Capture, View
 from dyngs.data.images import target_size
 from dyngs.data.intrinsics import scaled_intrinsics
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
+from dyngs.data.triangulate import triangulated_points, views_of_a_moment
 from dyngs.deform.model import DynamicScene, Surroundings4D
-from dyngs.deform.residual import residual_scores
+from dyngs.deform.residual import Residuals, cameras_in_place, residuals_of, views_to_compare
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar import Skeleton, first_gaussians
+from dyngs.human.avatar import Skeleton, first_gaussians, pose_shapes
 from dyngs.human.clips import footage
 from dyngs.human.model import HumanScene, Subject, first_look
 from dyngs.human.person import rest_shape, template
@@ -42,7 +45,9 @@ from dyngs.train.schedule import (
 )
 from dyngs.train.step import Model, Trainer
 
-RESIDUAL_VIEWS = 50
+AROUND_ORIGIN = ("blender", "body_json")
+"""Formats whose scenes lie around the origin by convention."""
+FIRST_VIEWS = 50
 """Pictures that are looked at for what moves."""
 
 
@@ -52,7 +57,7 @@ def assemble(config: Config) -> Trainer:
     Raises:
         DyngsError: a capture that cannot be read.
     """
-    capture = read_capture(config.data)
+    capture = with_points(read_capture(config.data), config)
     scene = surroundings(capture)
     generator = torch.Generator().manual_seed(config.run.seed)
     start = StartValues.for_strategy(config.strategy)
@@ -60,7 +65,7 @@ def assemble(config: Config) -> Trainer:
     if isinstance(config.model, HumanModel):
         gaussians, model = human_model(config, capture, pictures)
     else:
-        gaussians = initial_gaussians(scene, config.init, start, config.model.sh_degree, generator)
+        gaussians = initial_gaussians(scene, config.init, start, stored_sh_degree(config), generator)
         model = _model(config, capture, pictures, scene.extent, generator)
     background = resolved_background(config, capture)
     x, y, z = (float(value) for value in capture.world_offset)
@@ -69,6 +74,7 @@ def assemble(config: Config) -> Trainer:
         model=model,
         optimizer=GaussianOptimizer(gaussians, config.optim),
         densifier=_densifier(config, background, scene.extent),
+        colours=_colours(config, capture, gaussians, generator),
         pictures=pictures,
         sampler=ViewSampler(len(pictures)),
         options=_render_options(config),
@@ -86,19 +92,37 @@ def human_model(config: Config, capture: Capture, pictures: PictureLoader) -> tu
     Raises:
         DyngsError: a capture without body parameters, or a template that cannot be read.
     """
-    model = config.model
+    model, sh_degree = config.model, stored_sh_degree(config)
     if not isinstance(model, HumanModel) or capture.body is None:
         raise DyngsError(f"{capture.root}: has no body parameters, which model.kind=human needs; see docs/human.md")
-    if model.sh_degree > 1:
-        raise DyngsError(f"model.sh_degree={model.sh_degree}: colours of a person turn with it up to 1; give 0 or 1")
+    if sh_degree > 1:
+        raise DyngsError(f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1")
     given, body = capture.body["train"], template(model)
     vertices, joints = rest_shape(body, torch.from_numpy(given.betas).float())
     texels = texels_of(body, model.resolution, vertices)
-    gaussians, anchors = first_gaussians(texels, sorted(set(model.heights)), model.sh_degree)
+    gaussians, anchors = first_gaussians(texels, sorted(set(model.heights)), sh_degree)
     filmed = footage(capture.root, given, capture.splits["train"], joints)
-    subject = Subject(Skeleton(joints, body.parents), anchors, filmed)
+    subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_shapes(body))
     gaussians, subject = first_look(gaussians, texels, subject, _spread(pictures, 1), model.carve)
     return gaussians, HumanScene(model, subject, config.train.steps)
+
+
+def stored_sh_degree(config: Config) -> int:
+    """Degree of the harmonics that training begins with: 0 where a network gives the colours."""
+    return 0 if isinstance(config.colour, DcacColour) else config.model.sh_degree
+
+
+def with_points(capture: Capture, config: Config) -> Capture:
+    """``capture``, with triangulated points if it has none and enough cameras show one moment.
+
+    Not where it is published custom to begin with random points: the still scenes of Blender, around the origin.
+    """
+    init, views = config.init, capture.splits["train"]
+    custom = capture.format in AROUND_ORIGIN and all(view.time is None for view in views)
+    if not isinstance(init, PointsInit) or isinstance(config.model, HumanModel) or capture.points is not None or custom:
+        return capture
+    moment = views_of_a_moment(views, init.triangulate)
+    return capture.replace(points=triangulated_points(moment, config.data))
 
 
 def surroundings(capture: Capture) -> Surroundings:
@@ -110,7 +134,7 @@ def surroundings(capture: Capture) -> Surroundings:
         camera_centers=centers,
         points=None if points is None else points.xyz,
         points_rgb=None if points is None else points.rgb,
-        around_origin=capture.format in ("blender", "body_json"),
+        around_origin=capture.format in AROUND_ORIGIN,
     )
 
 
@@ -151,16 +175,32 @@ def _model(
     schedule = deform_schedule(model, steps)
     divisor = picture_divisor(config.train, schedule.fine)
 
-    def residuals(gaussians: Gaussians) -> Tensor:
-        return residual_scores(gaussians, _spread(pictures, divisor), _render_options(config), colour)
+    looked_at = views_to_compare(capture.splits["train"])
 
-    surroundings = Surroundings4D(times, cameras, extent, residuals)
+    def residuals(gaussians_at: Callable[[float], Gaussians]) -> Residuals:
+        shown = [pictures[i].shrunk(divisor) for i in looked_at]
+        return residuals_of(gaussians_at, shown, _render_options(config), colour)
+
+    stay = bool(cameras_in_place(capture.splits["train"]))
+    surroundings = Surroundings4D(times, cameras, extent, residuals, cameras_stay=stay)
     return DynamicScene(model, schedule, surroundings, still, generator)
 
 
+def _colours(config: Config, capture: Capture, gaussians: Gaussians, generator: torch.Generator) -> Colours:
+    """The kind of colours asked for. A person's do not depend on time, which would mean nothing in another motion."""
+    colour = config.colour
+    if isinstance(colour, DcacColour):
+        sees_time = isinstance(config.model, DynamicModel) and len(set(training_times(capture))) > 1
+        box = box_around(gaussians.means)
+        return NetworkColours(colour, config.train.steps, box, generator, sees_time=sees_time)
+    if isinstance(colour, AutoColour):
+        return ThriftyColours(colour, config.train.steps, len(capture.splits["train"]))
+    return Colours(colour)
+
+
 def _spread(pictures: PictureLoader, divisor: int) -> Iterator[Picture]:
-    """At most ``RESIDUAL_VIEWS`` of the pictures, evenly chosen, with their sides divided by ``divisor``."""
-    count = min(len(pictures), RESIDUAL_VIEWS)
+    """At most ``FIRST_VIEWS`` of the pictures, evenly chosen, with their sides divided by ``divisor``."""
+    count = min(len(pictures), FIRST_VIEWS)
     return (pictures[i * len(pictures) // count].shrunk(divisor) for i in range(count))
 
 

@@ -6,28 +6,32 @@ A run folder holds ``config.yaml`` (resolved), ``checkpoints/step_0007000.safete
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
-from dyngs.config import Config, HumanModel, SceneModel
+from dyngs.colour.network import network_of
+from dyngs.config import Config, HumanModel, HumanNetModel, SceneModel
 from dyngs.config_io import load_resolved
-from dyngs.data.write import whole_file, write_text
+from dyngs.data.write import write_text
 from dyngs.deform.trained import trained_scene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.human.trained import trained_avatar
+from dyngs.storage.file import read_scene
 from dyngs.train.scene import Scene
+from dyngs.train.tensor_file import FileKind, read_tensors, write_tensors
 
-FORMAT_VERSION = 1
 KEEP_CHECKPOINTS = 2
+COMPACT_NAME = "scene.dyngs"
+"""Of the file that holds a run that is done in little space, see ``dyngs.storage``."""
+_KIND = FileKind("dyngs", "a checkpoint", 1)
 _FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
@@ -97,15 +101,8 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
         if name.startswith(("gaussians.", "model.")) and not bool(torch.isfinite(x).all()):
             field, step = name.removeprefix("gaussians.").removeprefix("model."), checkpoint.info.step
             raise DyngsError(f"{run_dir}: {field} is not finite after step {step}; not saved. {last_good(run_dir)}")
-    header = {"format": FORMAT_VERSION, **asdict(checkpoint.info)}
-    header["digest"] = _digest(tensors, header)
     path = run_dir / "checkpoints" / f"step_{checkpoint.info.step:07d}.safetensors"
-    with whole_file(path) as temporary:
-        try:
-            # One key only: the library writes several in random order.
-            save_file(tensors, temporary, metadata={"dyngs": json.dumps(header, sort_keys=True)})
-        except SafetensorError as error:
-            raise DyngsError(f"cannot write {path}: {error}; free some space, then `dyngs train --resume`") from None
+    write_tensors(path, _KIND, tensors, asdict(checkpoint.info), ", then `dyngs train --resume`")
     _write_seconds(run_dir, checkpoint.info.step, seconds_train)
     for old in checkpoint_paths(run_dir)[:-KEEP_CHECKPOINTS]:
         old.unlink(missing_ok=True)
@@ -118,21 +115,18 @@ def load_checkpoint(path: Path) -> Checkpoint:
     Raises:
         DyngsError: a file that is missing, truncated, altered, or of another version; names an older one if there is.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {}).get("dyngs", "null"))
-            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError, ValueError) as error:
-        raise DyngsError(f"{path}: cannot be read as a checkpoint ({error}){_instead_of(path)}") from None
-    if not isinstance(header, dict) or "format" not in header:
-        raise DyngsError(f"{path}: not a checkpoint of dyngs{_instead_of(path)}")
-    if header["format"] != FORMAT_VERSION:
-        raise DyngsError(f"{path}: written by another version of dyngs; use that version or train anew")
-    if header.pop("digest", None) != _digest(tensors, header):
-        raise DyngsError(f"{path}: damaged or altered, its checksum differs{_instead_of(path)}")
+    header, tensors = read_tensors(path, _KIND, _instead_of(path))
+    return Checkpoint(info_of(header), tensors)
+
+
+def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
+    """What the header of a file says.
+
+    Raises:
+        KeyError: something lacks.
+    """
     x, y, z = header["world_offset"]
-    info = CheckpointInfo(header["step"], header["extent"], (x, y, z), header["background"], header["rasterize_mode"])
-    return Checkpoint(info, tensors)
+    return CheckpointInfo(header["step"], header["extent"], (x, y, z), header["background"], header["rasterize_mode"])
 
 
 def latest_checkpoint(run_dir: Path) -> Checkpoint:
@@ -144,16 +138,29 @@ def latest_checkpoint(run_dir: Path) -> Checkpoint:
 
 
 def load_run(run_dir: Path) -> LoadedRun:
-    """The model of a run folder at its newest checkpoint.
+    """The model of a run folder at its newest checkpoint, or of its compact file where it has no checkpoints.
 
     Raises:
         DyngsError: no run folder, no checkpoint, or a damaged one.
     """
     config = load_resolved(run_dir)
-    checkpoint = latest_checkpoint(run_dir)
+    if isinstance(config.model, HumanNetModel):
+        raise DyngsError(f"{run_dir}: a network, not a scene; `dyngs predict {run_dir} CAPTURE --out RUN` makes one")
+    checkpoint = _compact_checkpoint(run_dir) if is_compact(run_dir) else latest_checkpoint(run_dir)
     scene = stored_scene(checkpoint, config.model)
     step = checkpoint.info.step
     return LoadedRun(config, scene, step, seconds_at(run_dir, step), checkpoint.info)
+
+
+def is_compact(run_dir: Path) -> bool:
+    """Whether the run is only there as the file that ``dyngs export --format compact`` writes."""
+    return (run_dir / COMPACT_NAME).is_file() and not checkpoint_paths(run_dir)
+
+
+def _compact_checkpoint(run_dir: Path) -> Checkpoint:
+    """What drawing needs; it cannot be trained on."""
+    stored = read_scene(run_dir / COMPACT_NAME)
+    return Checkpoint(CheckpointInfo(**stored.info.model_dump()), stored.tensors)
 
 
 def stored_scene(checkpoint: Checkpoint, model: SceneModel) -> Scene:
@@ -162,13 +169,14 @@ def stored_scene(checkpoint: Checkpoint, model: SceneModel) -> Scene:
     try:
         gaussians = Gaussians(**{name: part[name] for name in _FIELDS})
         state = checkpoint.part("model")
-        return (
-            trained_avatar(gaussians, state)
-            if isinstance(model, HumanModel)
-            else trained_scene(gaussians, state, model)
-        )
+        colour = network_of(checkpoint.part("model.colour"))
+        if isinstance(model, HumanModel):
+            return replace(trained_avatar(gaussians, state), colour=colour)
+        return replace(trained_scene(gaussians, state, model), colour=colour)
     except KeyError as missing:
-        raise DyngsError(f"the checkpoint of step {checkpoint.info.step} lacks {missing}") from None
+        raise DyngsError(
+            f"the checkpoint of step {checkpoint.info.step} lacks {missing}; an earlier version wrote it: train anew"
+        ) from None
 
 
 def last_good(run_dir: Path) -> str:
@@ -194,16 +202,6 @@ def _write_seconds(run_dir: Path, step: int, seconds: float) -> None:
     known = {s: value for s, value in _read_seconds(run_dir).items() if int(s) < step}
     known[str(step)] = round(seconds, 3)
     write_text(run_dir / "timing.json", json.dumps({"seconds_train": known}) + "\n")
-
-
-def _digest(tensors: dict[str, Tensor], header: dict[str, object]) -> str:
-    """Checksum over the header and the names, types, shapes and bytes of all tensors."""
-    total = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
-    for name in sorted(tensors):
-        x = tensors[name].contiguous()
-        total.update(f"{name} {x.dtype} {tuple(x.shape)}\n".encode())
-        total.update(x.reshape(-1).numpy().data)
-    return total.hexdigest()
 
 
 def _instead_of(path: Path) -> str:

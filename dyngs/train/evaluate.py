@@ -20,14 +20,15 @@ from dyngs.data.capture import Capture, Split, View
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.write import write_text
+from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.human.clips import footage, same_clip
 from dyngs.human.trained import AvatarScene
-from dyngs.rendering import RenderOptions, render
+from dyngs.rendering import RenderOptions
 from dyngs.train.background import evaluation_background
-from dyngs.train.checkpoint import LoadedRun, load_run
+from dyngs.train.checkpoint import COMPACT_NAME, LoadedRun, is_compact, load_run
 from dyngs.train.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
-from dyngs.train.scene import Scene
+from dyngs.train.scene import Scene, moment_of, num_colour_values
 from dyngs.train.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
 
 
@@ -68,6 +69,7 @@ class EvalReport:
         model_mb: float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12 bytes per
             Gaussian.
         field_mb: of these, the field's.
+        colour_floats: numbers per Gaussian that its colour takes, with its share of a network.
         fps: one over the median time of drawing one view, after a warm-up: deformation and rendering; loading and
             metrics not counted.
         deform_share: median share of that time that the deformation takes.
@@ -77,6 +79,7 @@ class EvalReport:
         reasons: metric name to why it is None.
         notes: anything else that a reader of the numbers should know.
         per_view: the single views.
+        stored_mb: size on disk of a run that ``dyngs export --format compact`` wrote; None of others.
         psnr_person, ssim_person: means inside the box around the person, where the true picture is not transparent;
             only of a human model, and None where pictures have no alpha.
     """
@@ -96,6 +99,7 @@ class EvalReport:
     moving_share: float
     model_mb: float
     field_mb: float
+    colour_floats: float
     fps: float
     deform_share: float
     seconds_train: float
@@ -108,6 +112,7 @@ class EvalReport:
     per_view: tuple[ViewScore, ...] = ()
     psnr_person: float | None = None
     ssim_person: float | None = None
+    stored_mb: float | None = None
 
     def to_json(self) -> str:
         """The report as strict JSON (no NaN or Infinity), ending in a newline."""
@@ -132,11 +137,10 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
     scene = scene_of_split(run, capture, split)
     drawing = Drawing(scene, render_options(run.config.model), colour)
-    lpips = load_lpips(lpips_net)
     with _num_threads(threads):
         loader = PictureLoader(views, run.config.data)
         pictures = (loader[i] for i in range(len(loader)))
-        scores, reasons = score_views(scene, pictures, drawing.options, colour, lpips)
+        scores, reasons = score_views(scene, pictures, drawing.options, colour, load_lpips(lpips_net))
         temporal = {
             "flicker": flicker_of_split(drawing, loader, views),
             "flicker_error": flicker_error(drawing, loader, views),
@@ -158,6 +162,7 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
         moving_share=scene.moving_share,
         model_mb=parameter_megabytes(scene),
         field_mb=4e-6 * scene.num_field_values,
+        colour_floats=num_colour_values(scene) / max(len(scene), 1),
         fps=1 / median(s.render_seconds for s in scores),
         deform_share=median(s.deform_seconds / s.render_seconds for s in scores),
         seconds_train=run.seconds_train,
@@ -170,6 +175,7 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
         per_view=tuple(scores),
         psnr_person=_mean([s.psnr_person for s in scores]),
         ssim_person=_mean([s.ssim_person for s in scores]),
+        stored_mb=1e-6 * (run_dir / COMPACT_NAME).stat().st_size if is_compact(run_dir) else None,
     )
     write_text(report_path(run_dir, split), report.to_json())
     return report
@@ -267,8 +273,14 @@ def render_options(model: SceneModel) -> RenderOptions:
 
 
 def parameter_megabytes(scene: Scene) -> float:
-    """Size in MB (1e6 bytes) as float32: 236 bytes per Gaussian at SH degree 3, and the field where something moves."""
-    return 4e-6 * (sum(x.numel() for x in scene.gaussians.tensors().values()) + scene.num_field_values)
+    """Size in MB (1e6 bytes) as float32: 236 bytes per Gaussian at SH degree 3, the field, and masks bit by bit.
+
+    Harmonics of a Gaussian that are all zero beyond the base colour do not count.
+    """
+    shapes = sum(x.numel() for name, x in scene.gaussians.tensors().items() if name != "sh")
+    masks = scene.masks if isinstance(scene, TrainedScene) else None
+    bits = 0.0 if masks is None else 1e-6 * masks.bits.numel()
+    return 4e-6 * (shapes + num_colour_values(scene) + scene.num_field_values) + bits
 
 
 def _timed_render(
@@ -277,9 +289,9 @@ def _timed_render(
     """(H, W, 3) rendered picture, the seconds that it took, and those of them that the deformation took."""
     with torch.no_grad():
         start = time.perf_counter()
-        gaussians = scene.at(picture.time)
+        moment = moment_of(scene, picture.time)
         deformed = time.perf_counter()
-        rendering = render(gaussians, picture.cameras, options, background=background)
+        rendering = moment.seen_by(picture.cameras, options, background)
         end = time.perf_counter()
     return rendering.rgb[0], end - start, deformed - start
 

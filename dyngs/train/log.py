@@ -142,6 +142,13 @@ class Progress:
             print(f"step {record.step}/{self._total} {text} {left} left", file=self._stream, flush=True)
             self._next_line = record.step + max(1, self._total // PLAIN_LINES)
 
+    def say(self, line: str) -> None:
+        """Show ``line`` above what changes."""
+        if self._bar is not None:
+            self._bar.console.print(line, markup=False, highlight=False)
+        else:
+            print(line, file=self._stream, flush=True)
+
     def pause(self, seconds: float) -> None:
         """Leave ``seconds`` that were not spent training out of the rate."""
         self._since += seconds

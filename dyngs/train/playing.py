@@ -9,7 +9,7 @@ import torch
 
 from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
-from dyngs.human.clips import clip_of_motion, placed, rest_clip
+from dyngs.human.clips import clip_of_motion, placed, upright
 from dyngs.human.motion import read_motion
 from dyngs.human.person import template
 from dyngs.human.trained import AvatarScene
@@ -46,13 +46,14 @@ def playing_motion(run: LoadedRun, path: Path) -> Played:
 
 
 def at_rest(run: LoadedRun) -> LoadedRun:
-    """The person of ``run`` in the pose of the template.
+    """The person of ``run`` in the pose of the template, upright on the floor.
 
     Raises:
         DyngsError: the run is not one of a person.
     """
     scene, _ = _avatar(run, "--pose rest")
-    return replace(run, scene=replace(scene, clip=rest_clip(scene.clip)))
+    rest = upright(scene.given_clip, scene.given_joints, scene.skeleton.parents)
+    return replace(run, scene=scene.playing(rest))
 
 
 def _avatar(run: LoadedRun, wanted: str) -> tuple[AvatarScene, HumanModel]:

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from dyngs.colour.colours import Colours
+from dyngs.colour.thrift import Look, ThriftyColours, find_thrift
 from dyngs.config import Config, HumanModel, SceneModel
+from dyngs.conventions import SH_C0
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.errors import DyngsError
-from dyngs.gaussians import Gaussians
+from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.rendering import RenderOptions, render
 from dyngs.static.densify import Densifier, EditResult
 from dyngs.static.model import Drawn
 from dyngs.static.optimizer import GaussianOptimizer
+from dyngs.static.settled import Settled
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.train.sampler import ViewSampler
 from dyngs.train.schedule import active_sh_degree, means_rate, picture_divisor
@@ -64,6 +69,7 @@ class StepReport:
         loss: regularizers included.
         picture: what was trained on.
         rendered, truth: (H, W, 3) on the same background.
+        finding: a line about what was found out after the step, or None.
     """
 
     step: int
@@ -71,6 +77,7 @@ class StepReport:
     picture: Picture
     rendered: Tensor
     truth: Tensor
+    finding: str | None = None
 
 
 @dataclass
@@ -88,6 +95,7 @@ class Trainer:
     model: Model
     optimizer: GaussianOptimizer
     densifier: Densifier
+    colours: Colours
     pictures: PictureLoader
     sampler: ViewSampler
     options: RenderOptions
@@ -106,9 +114,8 @@ class Trainer:
             DyngsError: the loss is not finite; says which term, and leaves the parameters as they were.
         """
         config, step = self.config, self.done + 1
-        times = self.pictures.times
         divisor = picture_divisor(config.train, step)
-        index = self.sampler.next(self.generator, lambda i: self.model.trains_on(times[i], step))
+        index = self.sampler.next(self.generator, self._wanted(step))
         picture = self.pictures[index].shrunk(divisor)
         background = self._background_colour()
         parameters = self.optimizer.parameters
@@ -117,38 +124,93 @@ class Trainer:
         if self.model.num_moving(len(parameters)):
             _require_finite(drawn.gaussians, step, picture, config.model)
         options = replace(self.options, sh_degree=active_sh_degree(config.train, step, parameters.sh_degree))
-        rendering = render(drawn.gaussians, picture.cameras, options, background=background, probe=probe)
+        shader = self.colours.shader(picture.time, drawn.frame)
+        rendering = render(drawn.gaussians, picture.cameras, options, background=background, probe=probe, shader=shader)
         rendered, truth = rendering.rgb[0], picture.composite(background)
         terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
         if config.train.alpha_weight > 0 and picture.alpha is not None:
             terms["alpha"] = config.train.alpha_weight * (rendering.alpha[0] - picture.alpha).abs().mean()
-        terms |= drawn.penalties | self.densifier.regularizers(parameters)
+        terms |= drawn.penalties | self.densifier.regularizers(parameters) | self.colours.penalties(parameters)
         loss = _finite_sum(terms, step, picture)
         sum(terms.values(), torch.zeros(())).backward()
         if probe is not None and probe.grad is not None:
             size = (picture.cameras.width, picture.cameras.height)
             # Fewer Gaussians suit small pictures: a gradient counts for less there.
             self.densifier.after_backward(step, probe.grad / divisor, rendering.radii, size)
-        self._update(step)
-        return StepReport(step, loss, picture, rendered.detach(), truth)
+        finding = self._update(step)
+        return StepReport(step, loss, picture, rendered.detach(), truth, finding)
 
-    def _update(self, step: int) -> None:
-        """Optimize, let the strategy act, and count the step."""
+    def _update(self, step: int) -> str | None:
+        """Optimize, let the strategy act, and count the step; a line about what was found, or None."""
         lr_means = means_rate(self.config.optim, step, self.config.train.steps, self.extent)
-        self.bad_gradients += self.optimizer.step(step, lr_means, dense=self.densifier.touches_all)
+        frozen, dense = self.colours.frozen_rest(), self.densifier.touches_all
+        self.bad_gradients += self.optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen)
+        self.bad_gradients += self.colours.after_step(step)
         result = self.densifier.edit(step, self.optimizer.parameters, self.generator)
         if result is not None:
-            self.optimizer.apply(result)
+            self._apply(result)
         self.densifier.perturb(self.optimizer.parameters, lr_means, self.generator)
         self.bad_gradients += self.model.after_step(self.optimizer.parameters, step, result)
         result = self.model.edit(self.optimizer.parameters, step)
         if result is not None:
-            self.optimizer.apply(result)
+            self._apply(result)
         self.done = step
+        return self._spare_harmonics(step)
+
+    def _apply(self, result: EditResult) -> None:
+        self.optimizer.apply(result)
+        if result.edit is not None:
+            self.colours.follow(result.edit)
+
+    def _spare_harmonics(self, step: int) -> str | None:
+        """Measure whose harmonics pay if it is time to, drop the others, and say what was found."""
+        colours, parameters = self.colours, self.optimizer.parameters.detach()
+        if not isinstance(colours, ThriftyColours) or not colours.measures_after(step) or not parameters.sh_degree:
+            return None
+        colour = torch.full((3,), 1.0 if self.background == "white" else 0.0)
+
+        def looks(views: Iterable[int]) -> Iterator[Look]:
+            for picture in (self.pictures[i] for i in views):
+                drawn = self.model.gaussians_at(parameters, picture, step).gaussians.detach()
+                yield Look(drawn, picture.cameras, picture.composite(colour), picture.mask)
+
+        may_train = [i for i, time in enumerate(self.pictures.times) if self.model.trains_on(time, step)]
+        seen = [i for i in may_train if i not in colours.held_out]
+        held_out = [i for i in may_train if i in colours.held_out]
+        if not seen or not held_out:
+            return "too few views are trained on as yet to measure where view dependence pays: all harmonics stay"
+        options = replace(self.options, sh_degree=active_sh_degree(self.config.train, step, parameters.sh_degree))
+        found = find_thrift(looks(seen), list(looks(held_out)), options, colour, colours.tolerance)
+        self.optimizer.drop_rest(parameters.sh[:, 0] + found.offsets / SH_C0, ~found.keeps)
+        colours.freeze(~found.keeps)
+        return str(found)
+
+    def _wanted(self, step: int) -> Callable[[int], bool]:
+        """Which views may be trained on in ``step``."""
+        times = self.pictures.times
+
+        def may_train(index: int) -> bool:
+            return self.model.trains_on(times[index], step)
+
+        def is_wanted(index: int) -> bool:
+            return may_train(index) and not self.colours.holds_out(index, step)
+
+        return is_wanted if any(is_wanted(i) for i in range(len(self.pictures))) else may_train
+
+    def keep(self, kept: Tensor) -> None:
+        """Leave only the Gaussians where ``kept`` (N,) is true."""
+        result = EditResult(TopologyEdit.keep(kept))
+        self._apply(result)
+        self.model.after_step(self.optimizer.parameters, self.done, result)
 
     def checkpoint(self) -> Checkpoint:
         """Everything that ``restore`` needs."""
-        parts = {"model": self.model.state(), "strategy": self.densifier.state(), "sampler": self.sampler.state()}
+        parts = {
+            "model": self.model.state(),
+            "model.colour": self.colours.state(),
+            "strategy": self.densifier.state(),
+            "sampler": self.sampler.state(),
+        }
         tensors = {f"{part}.{name}": x for part, state in parts.items() for name, x in state.items()}
         tensors |= self.optimizer.state() | {"rng": self.generator.get_state()}
         mode = self.config.model.rasterize_mode.value
@@ -163,6 +225,9 @@ class Trainer:
         try:
             self.optimizer.load_state(checkpoint.tensors)
             self.model.load_state(checkpoint.part("model"))
+            self.colours.load_state(checkpoint.part("model.colour"))
+            if checkpoint.info.step >= self.config.train.steps:
+                self.densifier = Settled()
             self.densifier.load_state(checkpoint.part("strategy"))
             self.sampler.load_state(checkpoint.part("sampler"))
             self.generator.set_state(checkpoint.tensors["rng"])

@@ -20,9 +20,9 @@ from dyngs.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.errors import DyngsError
-from dyngs.rendering import RenderOptions, render
+from dyngs.rendering import RenderOptions
 from dyngs.train.metrics import MetricValue
-from dyngs.train.scene import Scene
+from dyngs.train.scene import Scene, moment_of
 
 MAX_MOMENTS = 60
 """Up to so many training times, flicker is measured at all of them."""
@@ -57,8 +57,7 @@ class Drawing:
     @torch.no_grad()
     def picture(self, cameras: Cameras, time: float | None) -> Tensor:
         """(H, W, 3) what the one camera sees at ``time``, clamped to [0, 1]."""
-        gaussians = self.scene.at(time)
-        return render(gaussians, cameras, self.options, background=self.background).rgb[0].clamp(0, 1)
+        return moment_of(self.scene, time).seen_by(cameras, self.options, self.background).rgb[0].clamp(0, 1)
 
 
 def clamped_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:

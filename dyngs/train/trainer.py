@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from dyngs.config import Config
+from dyngs.config import Config, HumanNetModel
 from dyngs.config_io import RESOLVED_NAME, save_config
 from dyngs.errors import DyngsError
 from dyngs.ops.memory import keep_freed_memory
@@ -22,9 +22,11 @@ from dyngs.train.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
+from dyngs.train.compaction import compact_
 from dyngs.train.interrupt import Interrupts
 from dyngs.train.log import LogRecord, Progress, RunLog
 from dyngs.train.metrics import psnr
+from dyngs.train.predictor import NetworkTrainer, assemble_network
 from dyngs.train.step import StepReport, Trainer
 
 
@@ -42,16 +44,16 @@ def train(config: Config, *, resume_from: Path | None = None) -> Path:
     """
     run_dir = resume_from or config.run.dir or Path("runs") / config.run.name
     keep_freed_memory()
-    with kernel_threads(config.run.threads or _num_cores()):
+    with kernel_threads(config.run.threads or num_cores()):
         return _train(config, run_dir, resume_from)
 
 
 def _train(config: Config, run_dir: Path, resume_from: Path | None) -> Path:
     watch = _Stopwatch()
     resumed = _start_of_run(run_dir, resuming=resume_from is not None)
-    if resumed is not None and resumed.info.step >= config.train.steps:
+    if resumed is not None and resumed.info.step >= config.total_steps:
         return run_dir
-    trainer = assemble(config)
+    trainer = assemble_network(config) if isinstance(config.model, HumanNetModel) else assemble(config)
     if resumed is not None:
         trainer.restore(resumed)
         watch.pause(-seconds_at(run_dir, resumed.info.step))
@@ -59,7 +61,7 @@ def _train(config: Config, run_dir: Path, resume_from: Path | None) -> Path:
         save_config(config, run_dir / RESOLVED_NAME)
     with (
         RunLog(run_dir, trainer.done, tensorboard=config.train.tensorboard) as log,
-        Progress(config.train.steps, trainer.done) as progress,
+        Progress(config.total_steps, trainer.done) as progress,
         Interrupts() as interrupts,
     ):
         _Loop(config, run_dir, trainer, log, progress, watch).run(interrupts)
@@ -85,28 +87,33 @@ class _Stopwatch:
 class _Loop:
     config: Config
     run_dir: Path
-    trainer: Trainer
+    trainer: Trainer | NetworkTrainer
     log: RunLog
     progress: Progress
     watch: _Stopwatch
 
     def run(self, interrupts: Interrupts) -> None:
         """Step until the end, or until interrupted."""
-        options, saved = self.config.train, self.trainer.done
-        while self.trainer.done < options.steps and not interrupts.requested:
+        options, saved, total = self.config.train, self.trainer.done, self.config.total_steps
+        while self.trainer.done < total and not interrupts.requested:
             try:
+                if self.trainer.done == options.steps and isinstance(self.trainer, Trainer):
+                    self.progress.say(str(compact_(self.trainer)))
                 report = self.trainer.step()
             except DyngsError as error:
                 raise DyngsError(f"{error}. {last_good(self.run_dir)}") from error
             step = report.step
-            if step % options.log_every == 0 or step == options.steps:
+            if report.finding is not None:
+                print(f"step {step}: {report.finding}", flush=True)
+            if step % options.log_every == 0 or step == total:
                 self._tell(report)
             evaluates = options.eval_every > 0 and step % options.eval_every == 0
-            if evaluates or step == options.steps or (options.save_every > 0 and step % options.save_every == 0):
+            is_last = step in (options.steps, total)
+            if evaluates or is_last or (options.save_every > 0 and step % options.save_every == 0):
                 saved = self._save()
             if evaluates:
                 self._evaluate(step)
-        if interrupts.requested and self.trainer.done < options.steps:
+        if interrupts.requested and self.trainer.done < total:
             if self.trainer.done > saved:
                 self._save()
             raise KeyboardInterrupt(
@@ -115,13 +122,13 @@ class _Loop:
 
     def _tell(self, report: StepReport) -> None:
         quality = psnr(report.rendered, report.truth, report.picture.mask)
-        num_gaussians = len(self.trainer.optimizer.parameters)
+        num_gaussians, num_moving = _counts(self.trainer)
         record = LogRecord(
             step=report.step,
             loss=report.loss,
             psnr=quality if math.isfinite(quality) else None,
             num_gaussians=num_gaussians,
-            num_moving=self.trainer.model.num_moving(num_gaussians),
+            num_moving=num_moving,
             bad_gradients=self.trainer.bad_gradients,
             seconds=round(self.watch.seconds, 3),
         )
@@ -145,6 +152,14 @@ class _Loop:
         self.progress.pause(time.perf_counter() - start)
 
 
+def _counts(trainer: Trainer | NetworkTrainer) -> tuple[int, int]:
+    """Gaussians there are, and those of them that depend on time or pose."""
+    if isinstance(trainer, NetworkTrainer):
+        return trainer.num_gaussians, trainer.num_gaussians
+    count = len(trainer.optimizer.parameters)
+    return count, trainer.model.num_moving(count)
+
+
 def _start_of_run(run_dir: Path, *, resuming: bool) -> Checkpoint | None:
     """The checkpoint to go on from, or None for a new run.
 
@@ -160,7 +175,7 @@ def _start_of_run(run_dir: Path, *, resuming: bool) -> Checkpoint | None:
     return None
 
 
-def _num_cores() -> int:
+def num_cores() -> int:
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux

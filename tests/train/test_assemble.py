@@ -24,13 +24,20 @@ from dyngs.config import (
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic import StillOptions, write_still_capture
+from dyngs.data.synthetic import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
 from dyngs.deform.model import DynamicScene
-from dyngs.deform.residual import residual_scores
+from dyngs.deform.residual import residuals_of
 from dyngs.static.densify import DefaultDensifier
 from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.model import StaticScene
-from dyngs.train.assemble import assemble, resolved_background, surroundings, training_cameras, training_times
+from dyngs.train.assemble import (
+    assemble,
+    resolved_background,
+    surroundings,
+    training_cameras,
+    training_times,
+    with_points,
+)
 
 
 @pytest.fixture(scope="module")
@@ -138,21 +145,36 @@ def test_without_times_a_dynamic_config_is_a_static_one(
     assert all(torch.equal(x, results[1].tensors[name]) for name, x in results[0].tensors.items())
 
 
-@pytest.mark.parametrize(("most", "looked_at"), [(50, [0, 1, 2, 3, 4]), (2, [0, 2])])
-def test_motion_is_looked_for_in_pictures_from_all_over_the_clip(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, looked_at: list[int]
-) -> None:
+def test_motion_is_looked_for_in_pictures_from_all_over_the_clip(capture: Path, tmp_path: Path) -> None:
     """Drawn as in training, on the background of the evaluation."""
-    monkeypatch.setattr("dyngs.train.assemble.RESIDUAL_VIEWS", most)
     root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
     trainer = assemble(_dynamic(root, data=DataConfig(root=root, background="white")))
     assert isinstance(trainer.model, DynamicScene)
     gaussians = trainer.optimizer.parameters.detach()
-    found = trainer.model.capture.residuals(gaussians)
-    pictures = [trainer.pictures[i] for i in looked_at]
-    assert torch.equal(found, residual_scores(gaussians, pictures, trainer.options, torch.ones(3)))
-    assert found.shape == (50,)
-    assert found.max() > 0.01
+    found = trainer.model.capture.residuals(lambda _: gaussians)
+    pictures = [trainer.pictures[i] for i in range(5)]
+    expected = residuals_of(lambda _: gaussians, pictures, trainer.options, torch.ones(3))
+    assert torch.equal(found.most, expected.most)
+    assert torch.equal(found.usual, expected.usual)
+    assert found.most.shape == (50,)
+    assert found.most.max() > 0.01
+
+
+def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: Path) -> None:
+    """As many Gaussians as points, of the room and not of a cube; a still Blender scene begins with random ones."""
+    options = DynamicOptions(size=96, num_times=2, num_cameras=8, num_val=0, num_test=0, samples=1)
+    root = write_dynamic_capture("room", tmp_path / "room", options)
+    config = _dynamic(root, init=PointsInit(num_random=7))
+    found = with_points(read_capture(config.data), config).points
+    assert found is not None
+    assert len(assemble(config).optimizer.parameters) == len(found.xyz) > 7
+    without = config.model_copy(update={"init": PointsInit(num_random=7, triangulate=0)})
+    assert len(assemble(without).optimizer.parameters) == 7
+
+
+def test_a_still_blender_scene_begins_with_random_points(capture: Path) -> None:
+    config = Config(data=DataConfig(root=capture), init=PointsInit(num_random=7))
+    assert with_points(read_capture(config.data), config).points is None
 
 
 def test_the_coarse_phase_is_static_training(capture: Path, tmp_path: Path) -> None:

@@ -131,7 +131,7 @@ def test_a_failed_write_leaves_the_earlier_ones(tmp_path: Path, monkeypatch: pyt
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dyngs.train.checkpoint.save_file", full)
+    monkeypatch.setattr("dyngs.train.tensor_file.save_file", full)
     with pytest.raises(DyngsError, match=r"step_0000010.safetensors.*No space left"):
         save_checkpoint(tmp_path, _checkpoint(10), 2.0)
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["step_0000005.safetensors"]

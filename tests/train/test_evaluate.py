@@ -128,7 +128,7 @@ def test_report_of_a_run(tmp_path) -> None:
     over_time = (
         "num_moving moving_share field_mb deform_share flicker flicker_error psnr_per_time psnr_person ssim_person"
     )
-    rest = {"seconds_train", "step", "reasons", "notes", "per_view"}
+    rest = {"seconds_train", "step", "reasons", "notes", "per_view", "colour_floats", "stored_mb"}
     assert set(keys.split()) | set(over_time.split()) | rest == set(stored)
     facts = {"split": "test", "num_views": 3, "width": 16, "height": 16, "background": "white", "lpips_net": "alex"}
     facts |= {"num_gaussians": 12, "step": 7, "seconds_train": 12.5}

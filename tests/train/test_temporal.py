@@ -81,7 +81,7 @@ def test_a_linear_change_does_not_flicker_however_it_is_sampled() -> None:
     """Of a colour that rises linearly, uneven moments see no second difference either."""
 
     class Brightening(Sliding):
-        def offsets(self, means, time):
+        def offsets(self, means, time, rows=None):
             shift = torch.full((len(means), 3), 0.4 * time)
             return replace(super().offsets(means, 0.0), colors=shift)
 

@@ -1,0 +1,89 @@
+"""``dyngs compact``: a run with a fraction of its Gaussians."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from dyngs.train.compacted import Cost
+
+_EPILOG = """\
+examples:
+  dyngs compact runs/dance --out runs/dance_small                  the best known settings
+  dyngs compact runs/dance --out runs/tiny --prune 0.95 --max-loss 20 --steps 5000
+  dyngs train --resume runs/tiny                                   where it was interrupted
+
+As a part of training: dyngs train CONFIG ... compact.prune=0.8. What the options mean: docs/compact.md.
+"""
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``compact`` to the commands."""
+    parser = commands.add_parser(
+        "compact",
+        help="a run with a fraction of its Gaussians, nearly as good and faster to draw",
+        description="Remove the Gaussians of a run that are worth least, and train the others a little longer; writes "
+        "a new run folder and says what that costs and brings.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("run_dir", type=Path, metavar="RUN", help="folder that `dyngs train` wrote")
+    parser.add_argument("--out", type=Path, required=True, metavar="RUN2", help="folder of the new run")
+    parser.add_argument("--prune", default="0.8", metavar="R", help="share to remove, in [0, 1) (default 0.8)")
+    parser.add_argument(
+        "--score",
+        choices=("variation", "sensitivity", "contribution", "temporal"),
+        help="what a Gaussian is worth (default sensitivity)",
+    )
+    parser.add_argument(
+        "--max-loss", metavar="DB", help="PSNR that pruning may cost before fine-tuning, else it backs off (default 10)"
+    )
+    parser.add_argument("--masks", metavar="K", help="key times of masks of what is seen (default none)")
+    parser.add_argument("--steps", metavar="N", help="of fine-tuning (default 2000)")
+    parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compact, compare and print."""
+    from rich.console import Console
+
+    from dyngs.deform.trained import TrainedScene
+    from dyngs.train.checkpoint import load_run
+    from dyngs.train.compacted import compact_run, compared
+
+    asked = {key: getattr(arguments, key) for key in ("prune", "score", "max_loss", "masks", "steps")}
+    overrides = [f"compact.{key}={value}" for key, value in asked.items() if value is not None]
+    overrides.append(f"run.threads={arguments.threads}")
+    folder = compact_run(arguments.run_dir, arguments.out, overrides)
+    before, after = compared(arguments.run_dir, folder, arguments.threads)
+    Console().print(cost_table(before, after))
+    after_all = load_run(folder)
+    has_masks = isinstance(after_all.scene, TrainedScene) and after_all.scene.masks is not None
+    if after_all.config.compact.masks > 1 and not has_masks:
+        print("note: --masks was ignored; they are for scenes in which a deformation field moves something")
+    print(f"written: {folder}\nnext:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/pictures")
+    return 0
+
+
+def cost_table(before: Cost, after: Cost) -> Table:
+    """What was and what is, side by side."""
+    from rich.table import Table
+
+    table = Table("", "before", "after", "")
+    ratio = before.num_gaussians / after.num_gaussians
+    table.add_row("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", f"{ratio:.1f} times fewer")
+    for label, old, new in (
+        ("PSNR, training views", before.psnr_train, after.psnr_train),
+        ("PSNR, held-out views", before.psnr_test, after.psnr_test),
+    ):
+        if old is not None and new is not None:
+            table.add_row(label, f"{old:.2f} dB", f"{new:.2f} dB", f"{new - old:+.2f} dB")
+    faster, smaller = after.fps / before.fps, before.megabytes / after.megabytes
+    table.add_row("rendering", f"{before.fps:.1f} fps", f"{after.fps:.1f} fps", f"{faster:.1f} times as fast")
+    table.add_row("model", f"{before.megabytes:.2f} MB", f"{after.megabytes:.2f} MB", f"{smaller:.1f} times smaller")
+    return table

@@ -1,0 +1,146 @@
+"""A finished run as one small file, and what that does to its pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.config import Config
+from dyngs.config_io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.data.capture import Capture, View
+from dyngs.data.loader import PictureLoader
+from dyngs.data.read import read_capture
+from dyngs.errors import DyngsError
+from dyngs.rendering import RenderOptions, contributions
+from dyngs.storage.drawable import drawable
+from dyngs.storage.file import SceneInfo, encoded, write_scene
+from dyngs.storage.precision import GREY_LEVELS, Precision, assumed_precision, coarseness_of, measured_precision
+from dyngs.storage.tensors import COARSENESS
+from dyngs.train.assemble import training_cameras
+from dyngs.train.background import evaluation_background
+from dyngs.train.checkpoint import COMPACT_NAME, Checkpoint, latest_checkpoint, stored_scene
+from dyngs.train.evaluate import render_options
+from dyngs.train.scene import Scene, moment_of
+
+LOSS_DB = 0.025
+"""By how much the PSNR of training pictures may fall. That of others falls by up to twice as much."""
+COMPARED = 6
+"""Training views in which the change is measured."""
+SMALLEST_CHANGE = 0.01
+"""Grey levels of 255; less is of no use."""
+LOOKED_AT = 50
+"""Training views in which it is measured how much each Gaussian shows."""
+
+
+@dataclass(frozen=True)
+class CompactRun:
+    """What was written.
+
+    Attributes:
+        path: of the file.
+        precision: steps, and how much the pictures change.
+        num_bytes: of the file.
+        num_bytes_exact: of the same tensors before, 4 bytes per value.
+    """
+
+    path: Path
+    precision: Precision
+    num_bytes: int
+    num_bytes_exact: int
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """What one training picture shows: a camera and a time."""
+
+    cameras: Cameras
+    time: float | None
+
+
+def write_compact(run_dir: Path, out: Path, max_change: float | None = None) -> CompactRun:
+    """The file in the folder ``out``, with the run's ``config.yaml`` beside it: together a run that can be drawn.
+
+    Args:
+        run_dir: a run with a checkpoint.
+        out: a folder, made where it is missing; it may be the run's own.
+        max_change: root mean square over all values of some training pictures, grey levels of 255. None: what lowers
+            their PSNR by ``LOSS_DB``, if it is independent of the model's own errors.
+
+    Raises:
+        DyngsError: no such run, or the file cannot be written.
+    """
+    config = load_resolved(run_dir)
+    checkpoint = latest_checkpoint(run_dir)
+    tensors, precision = _precision(config, checkpoint, max_change)
+    data = encoded(SceneInfo(**asdict(checkpoint.info)), tensors, config.model, precision.steps)
+    write_scene(out / COMPACT_NAME, data)
+    if out.resolve() != run_dir.resolve():
+        save_config(config, out / RESOLVED_NAME)
+    return CompactRun(out / COMPACT_NAME, precision, len(data), num_bytes_exact(checkpoint))
+
+
+def _precision(config: Config, checkpoint: Checkpoint, max_change: float | None) -> tuple[dict[str, Tensor], Precision]:
+    """The tensors to store and how exactly: measured where the run's capture can be read."""
+    try:
+        capture = read_capture(config.data)
+    except DyngsError:
+        return checkpoint.tensors, assumed_precision(checkpoint.tensors)
+    scene = stored_scene(checkpoint, config.model)
+    options = render_options(config.model)
+    visibility = _visibility(scene, _shots(config, capture, scene, LOOKED_AT), options)
+    tensors = checkpoint.tensors | {COARSENESS: coarseness_of(visibility)}
+    _, background = evaluation_background(config.data.background, capture.has_alpha)
+    shots = _shots(config, capture, scene, COMPARED)
+
+    def draw(state: Mapping[str, Tensor]) -> list[Tensor]:
+        drawn = stored_scene(replace(checkpoint, tensors=dict(state)), config.model)
+        moments = (moment_of(drawn, shot.time) for shot in shots)
+        with torch.no_grad():
+            return [
+                moment.seen_by(shot.cameras, options, background).rgb[0]
+                for moment, shot in zip(moments, shots, strict=True)
+            ]
+
+    if max_change is None:
+        pictures = PictureLoader(_chosen(capture, COMPARED), config.data)
+        truth = (pictures[i].composite(background) for i in range(len(pictures)))
+        errors = [float((x.clamp(0, 1) - y).square().mean()) for x, y in zip(draw(tensors), truth, strict=True)]
+        max_change = GREY_LEVELS * math.sqrt((10 ** (LOSS_DB / 10) - 1) * fmean(errors))
+    return tensors, measured_precision(tensors, draw, max(max_change, SMALLEST_CHANGE))
+
+
+def num_bytes_exact(checkpoint: Checkpoint) -> int:
+    """Bytes of what drawing needs of a checkpoint, as it is there."""
+    return sum(x.numel() * x.itemsize for x in drawable(checkpoint.tensors).values())
+
+
+def _shots(config: Config, capture: Capture, scene: Scene, count: int) -> list[_Shot]:
+    """At most ``count`` training views, evenly chosen; where they have no times, those of the scene."""
+    chosen = _chosen(capture, count)
+    times: Sequence[float | None] = [view.time for view in chosen]
+    if scene.times and None in times:
+        times = [scene.times[(2 * i + 1) * len(scene.times) // (2 * len(chosen))] for i in range(len(chosen))]
+    cameras = training_cameras(chosen, config.data)
+    return [_Shot(camera, time) for camera, time in zip(cameras, times, strict=True)]
+
+
+def _chosen(capture: Capture, count: int) -> list[View]:
+    """At most ``count`` training views, evenly chosen."""
+    views = capture.splits["train"]
+    count = min(count, len(views))
+    return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
+
+
+def _visibility(scene: Scene, shots: Sequence[_Shot], options: RenderOptions) -> Tensor:
+    """(N,) sums of blending weights over the pictures."""
+    total = torch.zeros(len(scene))
+    for shot in shots:
+        total += contributions(scene.at(shot.time), shot.cameras, options)[0]
+    return total

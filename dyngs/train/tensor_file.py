@@ -1,0 +1,93 @@
+"""Files of named tensors with a header and a checksum: safetensors, so that reading them runs no code."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from dyngs.data.write import whole_file
+from dyngs.errors import DyngsError
+
+
+@dataclass(frozen=True)
+class FileKind:
+    """What a file holds.
+
+    Attributes:
+        key: of the metadata, under which the header is.
+        what: with its article, for messages.
+        version: of the format; files of another one are refused.
+    """
+
+    key: str
+    what: str
+    version: int
+
+
+def write_tensors(
+    path: Path, kind: FileKind, tensors: Mapping[str, Tensor], header: Mapping[str, object], advice: str = ""
+) -> None:
+    """Write the file, atomically; equal tensors and headers give equal bytes.
+
+    Args:
+        path: of the file.
+        kind: what it holds.
+        tensors: contiguous.
+        header: what JSON can hold.
+        advice: end of the message for a full disk.
+
+    Raises:
+        DyngsError: the file cannot be written.
+    """
+    full = {"format": kind.version, **header}
+    full["digest"] = _digest(tensors, full)
+    with whole_file(path) as temporary:
+        try:
+            # One key only: the library writes several in random order.
+            save_file(dict(tensors), temporary, metadata={kind.key: json.dumps(full, sort_keys=True)})
+        except SafetensorError as error:
+            raise DyngsError(f"cannot write {path}: {error}; free some space{advice}") from None
+
+
+def read_tensors(path: Path, kind: FileKind, advice: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Header and tensors of a file.
+
+    Args:
+        path: of the file.
+        kind: what it should hold.
+        advice: end of the messages: what to do where it is damaged.
+
+    Raises:
+        DyngsError: a file that is missing, truncated, altered, of another kind or version.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get(kind.key, "null"))
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise DyngsError(f"{path}: cannot be read as {kind.what} ({error}){advice}") from None
+    if not isinstance(header, dict) or "format" not in header:
+        raise DyngsError(f"{path}: not {kind.what} of dyngs{advice}")
+    if header["format"] != kind.version:
+        raise DyngsError(f"{path}: written by another version of dyngs; use that version or train anew")
+    if header.pop("digest", None) != _digest(tensors, header):
+        raise DyngsError(f"{path}: damaged or altered, its checksum differs{advice}")
+    return header, tensors
+
+
+def _digest(tensors: Mapping[str, Tensor], header: Mapping[str, object]) -> str:
+    """Checksum over the header and the names, types, shapes and bytes of all tensors."""
+    total = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(tensors):
+        x = tensors[name].contiguous()
+        total.update(f"{name} {x.dtype} {tuple(x.shape)}\n".encode())
+        total.update(x.reshape(-1).numpy().data)
+    return total.hexdigest()

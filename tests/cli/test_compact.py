@@ -1,0 +1,49 @@
+"""``dyngs compact`` as a user calls it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tiny_fields import busy_config, write_tiny_capture
+
+from dyngs.cli import main
+from dyngs.config_io import load_resolved
+from dyngs.train.trainer import train
+
+
+def error_line(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """What stderr says about a command line that must be refused: one line."""
+    assert main(list(arguments)) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("dyngs: error: ")
+    assert error.count("\n") == 1
+    return error
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_smaller_run_and_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = train(busy_config(write_tiny_capture(tmp_path / "capture"), tmp_path / "run", "trajectory"))
+    out = tmp_path / "small"
+    words = [
+        "compact",
+        str(run),
+        "--out",
+        str(out),
+        "--prune",
+        "0.5",
+        "--max-loss",
+        "50",
+        "--steps",
+        "3",
+        "--threads",
+        "1",
+    ]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    for word in ("Gaussians", "PSNR, training views", "PSNR, held-out views", "rendering", "model", "written"):
+        assert word in text
+    assert load_resolved(out).compact.prune == 0.5
+    assert "exists already" in error_line(capsys, *words)
+    assert "compact.prune" in error_line(capsys, *words[:3], str(tmp_path / "x"), "--prune", "1.5")
+    assert "--out" in error_line(capsys, "compact", str(run))

@@ -1,0 +1,45 @@
+"""A run in little space is drawn as before, and is told from one that can be trained on."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from moving_scene import write_moving_run
+
+from dyngs.errors import DyngsError
+from dyngs.train.checkpoint import latest_checkpoint, load_run
+from dyngs.train.compact import write_compact
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_a_compact_run_moves_as_before(tmp_path: Path, moves: bool) -> None:
+    run_dir = write_moving_run(tmp_path, moves=moves)
+    written = write_compact(run_dir, tmp_path / "small", 0.5)
+    assert written.num_bytes == written.path.stat().st_size
+    assert written.precision.change is not None
+    assert written.precision.change <= 0.5
+    before, after = load_run(run_dir), load_run(tmp_path / "small")
+    assert (after.config, after.info) == (before.config, before.info)
+    assert after.scene.is_still is not moves
+    for time in (0.0, 0.6):
+        places = [run.scene.at(time).means[:, 0].sort().values for run in (before, after)]
+        torch.testing.assert_close(places[0], places[1], atol=0.1, rtol=0)  # a pixel is 0.2 wide
+
+
+def test_without_its_capture_steps_are_assumed(tmp_path: Path) -> None:
+    run_dir = write_moving_run(tmp_path)
+    shutil.rmtree(tmp_path / "capture")
+    assert write_compact(run_dir, tmp_path / "small").precision.change is None
+    assert len(load_run(tmp_path / "small").scene) == 5
+
+
+def test_it_cannot_be_trained_on_and_damage_is_named(tmp_path: Path) -> None:
+    written = write_compact(write_moving_run(tmp_path), tmp_path / "small")
+    with pytest.raises(DyngsError, match="no checkpoints"):
+        latest_checkpoint(tmp_path / "small")
+    written.path.write_bytes(written.path.read_bytes()[:-40])
+    with pytest.raises(DyngsError, match=r"scene.dyngs: damaged or cut off"):
+        load_run(tmp_path / "small")
