@@ -51,7 +51,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--max-change",
         type=float,
         metavar="X",
-        help="compact: how much pictures may change, grey levels of 255 (default: PSNR falls by less than 0.05 dB)",
+        help="compact: how much pictures may change, grey levels of 255 (default: that of training pictures falls by about 0.025 dB PSNR)",
     )
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--static", action="store_true", help="only the Gaussians that never move")
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _export_compact(arguments: argparse.Namespace) -> int:
     """Write the run in little space, and say what that does to it."""
-    from dyngs.train.compact import SMALLEST_CHANGE, write_compact
+    from dyngs.train.stored import SMALLEST_CHANGE, write_compact
 
     options = ("time", "times", "motion", "static", "dynamic")
     given = [name for name in options if getattr(arguments, name) not in (None, False)]

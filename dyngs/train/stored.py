@@ -78,7 +78,7 @@ def write_compact(run_dir: Path, out: Path, max_change: float | None = None) -> 
     """
     config = load_resolved(run_dir)
     checkpoint = latest_checkpoint(run_dir)
-    tensors, precision = _precision(config, checkpoint, max_change)
+    tensors, precision = precision_of(config, checkpoint, max_change)
     data = encoded(SceneInfo(**asdict(checkpoint.info)), tensors, config.model, precision.steps)
     write_scene(out / COMPACT_NAME, data)
     if out.resolve() != run_dir.resolve():
@@ -86,7 +86,9 @@ def write_compact(run_dir: Path, out: Path, max_change: float | None = None) -> 
     return CompactRun(out / COMPACT_NAME, precision, len(data), num_bytes_exact(checkpoint))
 
 
-def _precision(config: Config, checkpoint: Checkpoint, max_change: float | None) -> tuple[dict[str, Tensor], Precision]:
+def precision_of(
+    config: Config, checkpoint: Checkpoint, max_change: float | None
+) -> tuple[dict[str, Tensor], Precision]:
     """The tensors to store and how exactly: measured where the run's capture can be read."""
     try:
         capture = read_capture(config.data)

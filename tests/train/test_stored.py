@@ -11,7 +11,7 @@ from moving_scene import write_moving_run
 
 from dyngs.errors import DyngsError
 from dyngs.train.checkpoint import latest_checkpoint, load_run
-from dyngs.train.compact import write_compact
+from dyngs.train.stored import write_compact
 
 
 @pytest.mark.parametrize("moves", [True, False])
