@@ -1,0 +1,136 @@
+"""``dyngs tradeoff``: what each knob of a run costs in quality and brings in speed and size."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dyngs.errors import DyngsError
+
+if TYPE_CHECKING:
+    from dyngs.tradeoff.models import Models
+    from dyngs.tradeoff.points import Point
+    from dyngs.tradeoff.requirements import Goal, Requirement
+
+_EPILOG = """\
+examples:
+  dyngs tradeoff runs/dance                                   all knobs that need no training -> runs/dance/tradeoff
+  dyngs tradeoff runs/dance --vary prune=0.5,0.8 --vary storage --finetune 2000
+  dyngs tradeoff runs/dance --require 'psnr>=30,fps>=20,mb<=5' --minimize mb
+  dyngs tradeoff configs/static.yaml data.root=scans/bench --out bench_tradeoff     trained first; colours, too
+
+Interrupted or repeated, the same command goes on and measures only what lacks. What is measured: docs/tradeoff.md.
+"""
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``tradeoff`` to the commands."""
+    parser = commands.add_parser(
+        "tradeoff",
+        help="what each knob of a run costs in quality and brings in speed and size",
+        description="Vary a run one knob at a time and then several together; writes tradeoff.csv, .json, .svg and "
+        ".html, and picks the best run within limits.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("target", metavar="RUN_OR_CONFIG", help="a run folder, or a config that is trained first")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="for a config")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="for all that is made (default RUN/tradeoff)")
+    parser.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="KNOB[=A,B]",
+        help="only this knob, mild values first; repeatable",
+    )
+    parser.add_argument("--train", action="store_true", help="knobs that train the run anew, too")
+    parser.add_argument("--finetune", type=int, default=0, metavar="N", help="steps after pruning (default: none)")
+    parser.add_argument(
+        "--combine", type=int, default=4, metavar="N", help="combinations in each direction (default 4)"
+    )
+    parser.add_argument("--split", choices=("test", "val", "train", "pose"), default="test")
+    parser.add_argument("--rounds", type=int, default=5, metavar="N", help="drawings of each timed view (default 5)")
+    parser.add_argument("--require", metavar="LIST", help="for instance 'psnr>=30,fps>=20,mb<=5'; writes the best run")
+    goal = parser.add_mutually_exclusive_group()
+    goal.add_argument("--minimize", metavar="FIGURE", help="what is best: psnr, ssim, lpips, fps, mb, memory_mb, ...")
+    goal.add_argument("--maximize", metavar="FIGURE", help="(default psnr)")
+    parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure, print, write, choose."""
+    from rich.console import Console
+
+    from dyngs.tradeoff.knobs import parse_settings
+    from dyngs.tradeoff.models import Models
+    from dyngs.tradeoff.report import write_report
+    from dyngs.tradeoff.requirements import parse_goal, parse_requirements
+    from dyngs.tradeoff.sweep import Plan, sweep
+
+    for name, least in (("finetune", 0), ("combine", 0), ("rounds", 1), ("threads", 0)):
+        if getattr(arguments, name) < least:
+            raise DyngsError(f"--{name} {getattr(arguments, name)}: give a whole number from {least} on")
+    is_run = Path(arguments.target).is_dir()
+    settings = parse_settings(arguments.vary, trains=arguments.train or not is_run)
+    asked = parse_requirements(arguments.require) if arguments.require is not None else ()
+    name = arguments.minimize or arguments.maximize or "psnr"
+    goal = parse_goal(name, smallest=arguments.minimize is not None)
+    run_dir = Path(arguments.target) if is_run else _trained(arguments)
+    models = Models(run_dir, arguments.out or run_dir / "tradeoff", arguments.threads)
+    plan = Plan(settings, arguments.finetune, arguments.combine, arguments.split, arguments.rounds)
+    try:
+        points = sweep(models, plan, print)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("what was measured is kept; the same command goes on") from None
+    files = write_report(models.out, points)
+    for table in _tables(points):
+        Console().print(table)
+    print(f"written: {files[0]} and {', '.join(file.suffix for file in files[1:])}")
+    if arguments.require or arguments.minimize or arguments.maximize:
+        _choose(points, asked, goal, models)
+    return 0
+
+
+def _trained(arguments: argparse.Namespace) -> Path:
+    """The run folder of a config, trained to its end."""
+    from dyngs.config_io import load_config
+    from dyngs.tradeoff.models import finished
+
+    if arguments.out is None:
+        raise DyngsError("give --out DIR: a config is trained there first")
+    folder = arguments.out / "run"
+    overrides = [*arguments.overrides, f"run.dir={folder}", f"run.threads={arguments.threads}"]
+    return finished(load_config(Path(arguments.target), overrides), folder)
+
+
+def _tables(points: list[Point]) -> list[object]:
+    """Points and exchange rates, for people; LPIPS only where it could be had."""
+    from rich.table import Table
+
+    from dyngs.tradeoff.front import exchanges
+    from dyngs.tradeoff.report import EXCHANGE_HEAD, TABLE_HEAD, exchange_cells, rows_of, table_cells
+
+    title = f"{points[0].num_views} views; * beaten by no other in PSNR, speed and size"
+    tables = [Table(*TABLE_HEAD, title=title), Table(*EXCHANGE_HEAD, title="each knob alone")]
+    for row in rows_of(points):
+        name, *cells = table_cells(row)
+        tables[0].add_row(f"{'* ' if row.on_front else '  '}{name}", *cells)
+    for exchange in exchanges(points[0], points):
+        tables[1].add_row(*exchange_cells(exchange))
+    return list(tables)
+
+
+def _choose(points: list[Point], asked: tuple[Requirement, ...], goal: Goal, models: Models) -> None:
+    """Write the best run and say what it is like."""
+    from dyngs.tradeoff.models import write_chosen
+    from dyngs.tradeoff.requirements import choose
+    from dyngs.tradeoff.sweep import figures_of
+
+    best = choose([f for f in figures_of(points) if f.variant.fits_a_run], asked, goal)
+    folder = write_chosen(models, best.variant)
+    print(f"chosen:  {best.variant.name}: {best.psnr:.2f} dB, {best.fps:.1f} fps, {best.mb:.2f} MB")
+    if best.variant.scale < 1:
+        print(f"note: drawn at {best.variant.scale:g} of the size; to be enlarged where it is shown")
+    print(f"written: {folder}")

@@ -1,0 +1,245 @@
+"""What of a run is varied: a variant says what it changes, a knob what may be changed and how far."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from dyngs.errors import DyngsError
+
+Value = float | int | str
+AUTO = "auto"
+"""Storage as coarse as ``dyngs export --format compact`` takes it by itself."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What is changed of a run; the defaults change nothing.
+
+    Attributes:
+        colour: ``colour.kind`` that it is trained anew with.
+        prune: share of the Gaussians removed, by ``sensitivity``.
+        masks: key times of the masks of what is seen.
+        finetune: training steps after these two.
+        sh_degree: harmonics above it are dropped.
+        storage: how much pictures may change by rounding, grey levels of 255, or "auto"; None: exact, float32.
+        mode: ``model.rasterize_mode`` that it is drawn with.
+        alpha_min, transmittance_min: of ``dyngs.rendering.RenderOptions``.
+        scale: sides of the pictures drawn over those shown.
+    """
+
+    colour: str | None = None
+    prune: float = 0.0
+    masks: int = 0
+    finetune: int = 0
+    sh_degree: int | None = None
+    storage: float | str | None = None
+    mode: str | None = None
+    alpha_min: float | None = None
+    transmittance_min: float | None = None
+    scale: float = 1.0
+
+    @property
+    def changes(self) -> dict[str, Value]:
+        """What is not as in the run."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        words = (f"{key}={value:g}" if isinstance(value, float) else f"{key}={value}" for key, value in self._items())
+        return " ".join(words) or "as it is"
+
+    @property
+    def slug(self) -> str:
+        """For files; different for different variants."""
+        exact = (f"{key}-{value!r}" if isinstance(value, float) else f"{key}-{value}" for key, value in self._items())
+        return "_".join(exact) or "as_it_is"
+
+    @property
+    def knobs(self) -> tuple[str, ...]:
+        """Names of the knobs that are turned; fine-tuning belongs to those before it."""
+        return tuple(key for key, _ in self._items() if key != "finetune")
+
+    @property
+    def knob(self) -> str:
+        """The one knob that is turned, fine-tuned or not; "" of the run itself, "several" of combinations."""
+        names = self.knobs
+        if len(names) > 1:
+            return "several"
+        return "".join(names) + (" + finetune" if self.finetune else "")
+
+    @property
+    def stored(self) -> Variant:
+        """The part that decides what lies on disk."""
+        return replace(self, mode=None, alpha_min=None, transmittance_min=None, scale=1.0)
+
+    @property
+    def fits_a_run(self) -> bool:
+        """A run folder can hold it: configurations know no cut-offs of drawing."""
+        return self.alpha_min is None and self.transmittance_min is None
+
+    @property
+    def can_be_made(self) -> bool:
+        """Masked runs are not stored rounded: what shows of each Gaussian is measured with all of them."""
+        return not (self.masks and self.storage is not None)
+
+    def merged(self, other: Variant) -> Variant:
+        """This one with what ``other`` changes, too."""
+        return replace(self, **other.changes)
+
+    def to_json(self) -> dict[str, Value]:
+        """What ``from_json`` reads."""
+        return self.changes
+
+    @staticmethod
+    def from_json(changes: dict[str, Any]) -> Variant:
+        """The variant with these changes. Raises TypeError where one is unknown."""
+        return Variant(**changes)
+
+    def _items(self) -> list[tuple[str, Value]]:
+        return list(self.changes.items())
+
+
+@dataclass(frozen=True)
+class Knob:
+    """Something that can be varied.
+
+    Attributes:
+        name: a field of ``Variant``.
+        values: tried by default, stronger ones later.
+        low, high: of numbers, both allowed; none at all where ``low > high``.
+        words: allowed beside numbers.
+        whole: numbers are whole.
+        trains: every value but the run's own is a training from the start.
+    """
+
+    name: str
+    values: tuple[Value, ...]
+    low: float = 1.0
+    high: float = 0.0
+    words: tuple[str, ...] = ()
+    whole: bool = False
+    trains: bool = False
+
+    @property
+    def allowed(self) -> str:
+        """For messages."""
+        kind = "a whole number" if self.whole else "a number"
+        number = [f"{kind} from {self.low:g} to {self.high:g}"] if self.low <= self.high else []
+        return " or ".join([*number, *self.words])
+
+    def parsed(self, text: str) -> Value:
+        """The value that is written.
+
+        Raises:
+            DyngsError: not allowed.
+        """
+        if text in self.words:
+            return text
+        try:
+            value = int(text) if self.whole else float(text)
+        except ValueError:
+            value = float("nan")
+        if not self.low <= value <= self.high:
+            raise DyngsError(f"--vary {self.name}={text}: give {self.allowed}")
+        return value
+
+
+KNOBS = (
+    Knob("prune", (0.3, 0.5, 0.7, 0.85), low=0.01, high=0.99),
+    Knob("masks", (6, 16), low=2, high=1000, whole=True),
+    Knob("sh_degree", (2, 1, 0), low=0, high=3, whole=True),
+    Knob("storage", (AUTO, 1.0, 3.0), low=0.01, high=64, words=(AUTO,)),
+    Knob("mode", ("classic", "antialiased"), words=("classic", "antialiased")),
+    Knob("alpha_min", (0.008, 0.016, 0.032), low=1e-6, high=0.5),
+    Knob("transmittance_min", (1e-3, 1e-2, 5e-2), low=1e-6, high=0.5),
+    Knob("scale", (0.75, 0.5), low=0.05, high=1.0),
+    Knob("colour", ("sh", "dcac", "auto"), words=("sh", "dcac", "auto"), trains=True),
+)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A knob and the values that are to be tried."""
+
+    knob: Knob
+    values: tuple[Value, ...]
+
+
+@dataclass(frozen=True)
+class Traits:
+    """What a run is like, as far as knobs depend on it.
+
+    Attributes:
+        sh_degree: of its harmonics, 0 where a network colours it.
+        mode: it is drawn with.
+        colour: kind.
+        moves: a field moves something, so that masks are possible.
+        is_masked: it has masks already.
+    """
+
+    sh_degree: int
+    mode: str
+    colour: str
+    moves: bool
+    is_masked: bool = False
+
+    def allows(self, knob: Knob, value: Value) -> bool:
+        """The value makes sense and is not the run's own."""
+        if knob.name == "sh_degree":
+            return value < self.sh_degree  # pyright: ignore[reportOperatorIssue]
+        if knob.name == "masks":
+            return self.moves
+        if knob.name == "storage" and self.is_masked:
+            return False
+        own = {"mode": self.mode, "colour": self.colour, "scale": 1.0}
+        return own.get(knob.name) != value
+
+
+def parse_settings(words: Sequence[str], *, trains: bool) -> tuple[Setting, ...]:
+    """What ``--vary`` asks for: KNOB, or KNOB=VALUE,VALUE; without any all knobs with their default values.
+
+    Args:
+        words: one per ``--vary``.
+        trains: knobs that need training from the start are among all.
+
+    Raises:
+        DyngsError: an unknown knob, one twice, or a value that is not allowed.
+    """
+    if not words:
+        return tuple(Setting(knob, knob.values) for knob in KNOBS if trains or not knob.trains)
+    found: dict[str, Setting] = {}
+    for word in words:
+        name, equals, listed = word.partition("=")
+        knob = next((k for k in KNOBS if k.name == name), None)
+        if knob is None:
+            raise DyngsError(f"--vary {word}: no such knob; there are {', '.join(k.name for k in KNOBS)}")
+        if knob.trains and not trains:
+            raise DyngsError(f"--vary {word}: this trains the run anew, several times; add --train")
+        if name in found:
+            raise DyngsError(f"--vary {name} is given twice; write --vary {name}=VALUE,VALUE")
+        values = tuple(knob.parsed(text) for text in re.split(r"\s*,\s*", listed.strip())) if equals else knob.values
+        found[name] = Setting(knob, tuple(dict.fromkeys(values)))
+    return tuple(found.values())
+
+
+def single_changes(settings: Sequence[Setting], traits: Traits, finetune: int) -> list[Variant]:
+    """One variant per knob and value that makes sense for a run; what is pruned or masked also with fine-tuning.
+
+    Args:
+        settings: knobs and values.
+        traits: of the run.
+        finetune: steps; 0: without.
+    """
+    variants = []
+    for setting in settings:
+        for value in setting.values:
+            if traits.allows(setting.knob, value):
+                variant = Variant(**{setting.knob.name: value})  # pyright: ignore[reportArgumentType]
+                variants.append(variant)
+                if finetune and setting.knob.name in ("prune", "masks"):
+                    variants.append(replace(variant, finetune=finetune))
+    return variants

@@ -1,0 +1,85 @@
+"""What was measured of one variant, and its file: one per point, so that nothing is measured twice."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from dyngs.data.write import write_text
+from dyngs.errors import DyngsError
+from dyngs.tradeoff.knobs import Variant
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A median and its quartiles."""
+
+    median: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How fast it is drawn, deformation and enlarging included.
+
+    Attributes:
+        ms: of one picture.
+        gain: how many times as fast as the run itself is, in pairs of pictures drawn one after the other.
+    """
+
+    ms: Spread
+    gain: Spread
+
+
+@dataclass(frozen=True)
+class Point:
+    """A variant of a run, measured.
+
+    Attributes:
+        variant: what it changes.
+        num_views: of the split, all of them.
+        psnr, ssim, lpips: means over them; LPIPS is None where it cannot be had.
+        num_gaussians: N.
+        mb: on disk, 1e6 bytes: the stored file, or 4 bytes for each value that drawing needs where nothing is rounded.
+        memory_mb: what a process grows by at most while it loads and draws it, 1e6 bytes; None where unknown.
+        speed: None as long as it is not measured.
+    """
+
+    variant: Variant
+    num_views: int
+    psnr: float
+    ssim: float
+    lpips: float | None
+    num_gaussians: int
+    mb: float
+    memory_mb: float | None
+    speed: Speed | None = None
+
+    @property
+    def gain(self) -> float:
+        """How many times as fast as the run itself; 1 as long as that is not measured."""
+        return 1.0 if self.speed is None else self.speed.gain.median
+
+
+def read_point(path: Path) -> Point:
+    """The point in a file.
+
+    Raises:
+        DyngsError: it is not one.
+    """
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        variant, speed = Variant.from_json(stored.pop("variant")), stored.pop("speed")
+        if speed is not None:
+            speed = Speed(Spread(**speed["ms"]), Spread(**speed["gain"]))
+        return Point(variant=variant, speed=speed, **stored)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DyngsError(f"{path}: not a measured point ({error}); remove it to have it measured again") from None
+
+
+def write_point(path: Path, point: Point) -> None:
+    """Write it, atomically."""
+    values = asdict(point) | {"variant": point.variant.to_json()}
+    write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")

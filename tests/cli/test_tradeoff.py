@@ -1,0 +1,56 @@
+"""``dyngs tradeoff`` as a user calls it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from moving_scene import write_moving_run
+
+from dyngs.cli import main
+from dyngs.train.checkpoint import load_run
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def error_line(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """What stderr says about a command line that must be refused: one line."""
+    assert main(list(arguments)) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("dyngs: error: ")
+    assert error.count("\n") == 1
+    return error
+
+
+def test_a_table_files_and_a_chosen_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = str(write_moving_run(tmp_path))
+    out = tmp_path / "out"
+    words = ["tradeoff", run, "--out", str(out), "--vary", "scale=0.5", "--vary", "storage=2", "--rounds", "1"]
+    assert main([*words, "--threads", "1", "--require", "fps>=0.001,mb<=1", "--minimize", "mb"]) == 0
+    text = capsys.readouterr().out
+    for word in ("as it is", "scale=0.5", "storage=2", "each knob alone", "tradeoff.csv", "chosen:"):
+        assert word in text
+    assert {f.name for f in out.iterdir()} >= {f"tradeoff.{suffix}" for suffix in ("csv", "json", "svg", "html")}
+    (chosen,) = (out / "chosen").iterdir()
+    assert len(load_run(chosen).scene) == 5
+    error = error_line(capsys, *words, "--require", "mb<=0.000001")
+    assert "no measured point has mb<=1e-06; mb<=1e-06 binds" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("nowhere", "nowhere: no such preset"),
+        ("static data.root=x", "give --out DIR"),
+        (". --vary prun", "no such knob"),
+        (". --require psnr>30", "is no condition"),
+        (". --minimize size", "no such figure"),
+        (". --rounds 0", "--rounds 0: give a whole number from 1 on"),
+        (". ", "not a run folder"),
+        (". --minimize mb --maximize psnr", "not allowed with"),
+    ],
+)
+def test_wrong_usage_ends_in_one_line(words: str, part: str, capsys: pytest.CaptureFixture[str]) -> None:
+    out = [] if "static" in words else ["--out", "x"]
+    assert part in error_line(capsys, "tradeoff", *words.split(), *out)
+    assert list(Path().iterdir()) == []

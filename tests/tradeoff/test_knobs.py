@@ -1,0 +1,119 @@
+"""Variants say what they change; knobs refuse what they cannot be."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dyngs.errors import DyngsError
+from dyngs.tradeoff.knobs import KNOBS, Traits, Variant, parse_settings, single_changes
+
+VARIANTS = st.builds(
+    Variant,
+    colour=st.sampled_from([None, "dcac"]),
+    prune=st.sampled_from([0.0, 0.5, 0.7]),
+    masks=st.sampled_from([0, 6]),
+    sh_degree=st.sampled_from([None, 0, 1]),
+    storage=st.sampled_from([None, "auto", 1.0]),
+    mode=st.sampled_from([None, "antialiased"]),
+    alpha_min=st.sampled_from([None, 0.01]),
+    scale=st.sampled_from([1.0, 0.5]),
+)
+DYNAMIC = Traits(sh_degree=2, mode="classic", colour="sh", moves=True)
+
+
+@given(VARIANTS)
+def test_a_variant_survives_its_file(variant: Variant) -> None:
+    assert Variant.from_json(json.loads(json.dumps(variant.to_json()))) == variant
+
+
+@given(VARIANTS, VARIANTS)
+def test_names_of_files_tell_variants_apart(a: Variant, b: Variant) -> None:
+    assert (a.slug == b.slug) == (a == b)
+    assert "/" not in a.slug
+    assert " " not in a.slug
+
+
+@given(VARIANTS, VARIANTS)
+def test_merging_keeps_what_the_other_changes(a: Variant, b: Variant) -> None:
+    merged = a.merged(b)
+    assert merged.changes == a.changes | b.changes
+    assert merged.merged(b) == merged
+    assert Variant().merged(a) == a
+
+
+def test_what_lies_on_disk_does_not_depend_on_drawing() -> None:
+    drawn = Variant(mode="antialiased", alpha_min=0.01, transmittance_min=0.01, scale=0.5)
+    assert drawn.stored == Variant()
+    assert replace(drawn, prune=0.5).stored == Variant(prune=0.5)
+    assert not drawn.fits_a_run
+    assert Variant(mode="antialiased", scale=0.5, prune=0.3).fits_a_run
+
+
+def test_the_knob_of_a_variant() -> None:
+    assert Variant().knob == ""
+    assert Variant().name == "as it is"
+    assert Variant(prune=0.5).knob == "prune"
+    assert Variant(prune=0.5, finetune=9).knob == "prune + finetune"
+    assert Variant(prune=0.5, sh_degree=0).knob == "several"
+    assert Variant(sh_degree=0).name == "sh_degree=0"
+
+
+def test_single_changes_leave_out_what_a_run_is_already() -> None:
+    names = [v.name for v in single_changes(parse_settings([], trains=True), DYNAMIC, 0)]
+    assert len(names) == len(set(names))
+    assert {"sh_degree=0", "sh_degree=1", "masks=6", "mode=antialiased", "colour=dcac"} <= set(names)
+    assert not {"sh_degree=2", "mode=classic", "colour=sh"} & set(names)
+    still = replace(DYNAMIC, sh_degree=0, moves=False)
+    fewer = [v.name for v in single_changes(parse_settings([], trains=False), still, 0)]
+    assert not any(name.startswith(("masks", "sh_degree", "colour")) for name in fewer)
+
+
+def test_masked_runs_are_not_stored_rounded() -> None:
+    assert not Variant(masks=6, storage=1.0).can_be_made
+    assert single_changes(parse_settings(["storage"], trains=False), replace(DYNAMIC, is_masked=True), 0) == []
+
+
+def test_fine_tuning_comes_in_addition() -> None:
+    found = single_changes(parse_settings(["prune=0.5", "scale=0.5"], trains=False), DYNAMIC, 7)
+    assert found == [Variant(prune=0.5), Variant(prune=0.5, finetune=7), Variant(scale=0.5)]
+
+
+def test_settings_keep_the_order_of_their_values() -> None:
+    (setting,) = parse_settings(["storage=auto, 2,0.5,2"], trains=False)
+    assert setting.values == ("auto", 2.0, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("prun", "no such knob; there are prune, masks, sh_degree"),
+        ("prune=1.5", "--vary prune=1.5: give a number from 0.01 to 0.99"),
+        ("prune=", "give a number"),
+        ("prune=nan", "give a number"),
+        ("masks=2.5", "give a whole number from 2 to 1000"),
+        ("storage=fine", "give a number from 0.01 to 64 or auto"),
+        ("mode=smooth", "give classic or antialiased"),
+        ("colour", "add --train"),
+    ],
+)
+def test_what_cannot_be_varied_is_refused(word: str, message: str) -> None:
+    with pytest.raises(DyngsError, match=message):
+        parse_settings([word], trains=False)
+
+
+def test_a_knob_twice_is_refused() -> None:
+    with pytest.raises(DyngsError, match="twice"):
+        parse_settings(["scale=0.5", "scale=0.7"], trains=False)
+
+
+@pytest.mark.parametrize("knob", KNOBS, ids=lambda knob: knob.name)
+def test_defaults_of_knobs_are_allowed(knob: object) -> None:
+    from dyngs.tradeoff.knobs import Knob
+
+    assert isinstance(knob, Knob)
+    assert [knob.parsed(str(value)) for value in knob.values] == list(knob.values)

@@ -1,0 +1,132 @@
+"""A whole sweep of a tiny run: measured once, resumed, reported, chosen from."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from tiny_fields import busy_config, write_tiny_capture
+
+from dyngs.config_io import load_resolved
+from dyngs.errors import DyngsError
+from dyngs.tradeoff.knobs import Variant, parse_settings
+from dyngs.tradeoff.models import Models, traits, write_chosen
+from dyngs.tradeoff.points import Point, read_point
+from dyngs.tradeoff.report import write_report
+from dyngs.tradeoff.sweep import Plan, figures_of, sweep
+from dyngs.train.checkpoint import is_compact, load_run
+from dyngs.train.evaluate import evaluate_run, render_options
+from dyngs.train.trainer import train
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+KNOBS = ("prune=0.5", "masks=3", "sh_degree=0", "storage=2", "alpha_min=0.02", "scale=0.5")
+PLAN = Plan(parse_settings(KNOBS, trains=False), finetune=2, combine=2, rounds=1)
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    return train(busy_config(write_tiny_capture(folder / "capture"), folder / "run", "trajectory"))
+
+
+@pytest.fixture(scope="module")
+def models(run_dir: Path) -> Models:
+    return Models(run_dir, run_dir / "tradeoff", 1)
+
+
+@pytest.fixture(scope="module")
+def points(models: Models) -> list[Point]:
+    return sweep(models, PLAN, lambda line: None)
+
+
+def named(points: list[Point], variant: Variant) -> Point:
+    return next(p for p in points if p.variant == variant)
+
+
+def test_the_run_itself_is_what_eval_says(points: list[Point], run_dir: Path) -> None:
+    report, base = evaluate_run(run_dir, "test", threads=1), points[0]
+    assert base.variant == Variant()
+    assert (base.psnr, base.ssim) == pytest.approx((report.psnr, report.ssim))
+    assert (base.num_views, base.num_gaussians) == (report.num_views, report.num_gaussians)
+    assert base.gain == 1.0
+
+
+def test_every_knob_does_what_it_says(points: list[Point]) -> None:
+    base, pruned = points[0], named(points, Variant(prune=0.5))
+    assert pruned.num_gaussians == base.num_gaussians / 2
+    assert pruned.mb < 0.75 * base.mb  # what moves is worth more and holds more numbers
+    assert named(points, Variant(prune=0.5, finetune=2)).num_gaussians == pruned.num_gaussians
+    assert named(points, Variant(sh_degree=0)).mb < base.mb
+    assert named(points, Variant(storage=2.0)).mb < 0.5 * base.mb
+    for variant in (Variant(alpha_min=0.02), Variant(scale=0.5)):
+        assert named(points, variant).mb == base.mb
+        assert named(points, variant).psnr != base.psnr
+    assert all(p.speed is not None and p.speed.ms.median > 0 for p in points)
+    assert all(p.memory_mb is None or p.memory_mb > 0 for p in points)
+
+
+def test_combinations_are_measured_too(points: list[Point]) -> None:
+    together = [p for p in points if p.variant.knob == "several"]
+    assert 0 < len(together) <= 3 * PLAN.combine
+
+
+def test_finished_points_are_not_measured_again(points: list[Point], models: Models) -> None:
+    said: list[str] = []
+    files = sorted((models.out / "points").iterdir())
+    times = [file.stat().st_mtime_ns for file in files]
+    assert sweep(models, PLAN, said.append) == points
+    assert said == []
+    assert [file.stat().st_mtime_ns for file in files] == times
+    assert [read_point(file).variant.slug for file in files] == [file.stem for file in files]
+
+
+def test_points_of_something_else_do_not_mix(points: list[Point], models: Models, tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="points of another run, checkpoint or split"):
+        sweep(models, replace(PLAN, split="train"), lambda line: None)
+    with pytest.raises(DyngsError, match="no views"):
+        sweep(Models(models.run_dir, tmp_path, 1), replace(PLAN, split="val"), lambda line: None)
+
+
+def test_the_report_has_every_point(points: list[Point], models: Models) -> None:
+    table, values, picture, page = write_report(models.out, points)
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert [row["name"] for row in rows] == [p.variant.name for p in points]
+    assert float(rows[0]["fps"]) == pytest.approx(figures_of(points)[0].fps)
+    stored = json.loads(values.read_text())
+    assert [Variant.from_json(p["changes"]) for p in stored["points"]] == [p.variant for p in points]
+    assert {e["knob"] for e in stored["exchange_rates"]} >= {"prune", "prune + finetune", "storage"}
+    assert picture.read_text() in page.read_text()
+    assert "src=" not in page.read_text()
+
+
+def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Point], models: Models) -> None:
+    variant = Variant(prune=0.5, storage=2.0, mode="antialiased", scale=0.5)
+    folder = write_chosen(models, variant)
+    chosen = load_run(folder)
+    assert is_compact(folder)
+    assert len(chosen.scene) == points[0].num_gaussians / 2
+    assert chosen.config.data.downscale == 2 * load_resolved(models.run_dir).data.downscale
+    assert render_options(chosen.config.model) == replace(
+        render_options(load_resolved(models.run_dir).model), mode=chosen.config.model.rasterize_mode
+    )
+    assert chosen.config.model.rasterize_mode.value == "antialiased"
+    exact = write_chosen(models, Variant(sh_degree=0))
+    assert evaluate_run(exact, "test", threads=1).psnr == pytest.approx(named(points, Variant(sh_degree=0)).psnr)
+    with pytest.raises(DyngsError, match="know no cut-offs of drawing"):
+        write_chosen(models, Variant(alpha_min=0.02))
+
+
+def test_a_stored_run_cannot_be_varied(points: list[Point], models: Models) -> None:
+    with pytest.raises(DyngsError, match=r"only scene\.dyngs is there; give the run that it was made from"):
+        traits(models.folder(Variant(storage=2.0)))
+
+
+def test_a_damaged_point_says_what_to_do(tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    for text in ("", "[]", "{}", '{"variant": {"prine": 1}, "speed": null}'):
+        path.write_text(text)
+        with pytest.raises(DyngsError, match=r"not a measured point .* remove it"):
+            read_point(path)
