@@ -362,6 +362,18 @@ class CompactConfig(Section):
         return self.prune > 0 or self.masks > 1
 
 
+class BudgetConfig(Section):
+    """Limits that a run keeps (docs/budget.md); null: none."""
+
+    max_gaussians: int | None = Field(default=None, ge=1, description="never more than so many")
+    max_mb: float | None = Field(
+        default=None, gt=0, description="1e6 bytes of the file `small/scene.dyngs`, which is then written"
+    )
+    max_minutes: float | None = Field(
+        default=None, gt=0, description="of training on this machine; fewer than `train.steps` are done if need be"
+    )
+
+
 class RunConfig(Section):
     """Where the run goes and how it is executed."""
 
@@ -384,6 +396,7 @@ class Config(Section):
     optim: OptimConfig = OptimConfig()
     train: TrainConfig = TrainConfig()
     compact: CompactConfig = CompactConfig()
+    budget: BudgetConfig = BudgetConfig()
     run: RunConfig = RunConfig()
 
     @property

@@ -24,7 +24,7 @@ from dyngs.config_io import load_config, save_config
 from dyngs.errors import DyngsError
 from dyngs.export.ply import read_ply
 
-VERBS = ("demo", "train", "compact", "eval", "render", "export", "data", "bench", "doctor", "predict")
+VERBS = ("demo", "train", "compact", "eval", "render", "export", "data", "bench", "doctor", "predict", "tradeoff")
 ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"} | {
     "PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])
 }

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from dyngs import __version__
-from dyngs.cli import bench, compact, data, demo, doctor, evaluate, export, predict, render, train
+from dyngs.cli import bench, compact, data, demo, doctor, evaluate, export, predict, render, tradeoff, train
 from dyngs.errors import DyngsError
 
 EXIT_ERROR = 2
@@ -72,7 +72,7 @@ def make_parser() -> argparse.ArgumentParser:
 def _add_commands(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for module in (demo, train, compact, predict, evaluate, render, export, data, bench, doctor):
+    for module in (demo, train, compact, predict, evaluate, render, export, tradeoff, data, bench, doctor):
         module.add_parser(commands)
     return parser
 

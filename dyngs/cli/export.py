@@ -51,7 +51,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--max-change",
         type=float,
         metavar="X",
-        help="compact: how much pictures may change, grey levels of 255 (default: that of training pictures falls by about 0.025 dB PSNR)",
+        help="compact: how much pictures may change, grey levels of 255 (default: 0.025 dB on training views)",
     )
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--static", action="store_true", help="only the Gaussians that never move")

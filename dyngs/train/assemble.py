@@ -34,6 +34,7 @@ from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.model import StaticScene
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.train.background import evaluation_background
+from dyngs.train.budget import require_within, within_cap
 from dyngs.train.sampler import ViewSampler
 from dyngs.train.schedule import (
     deform_schedule,
@@ -55,15 +56,17 @@ def assemble(config: Config) -> Trainer:
     """The trainer of a configuration: capture read, Gaussians initialised, nothing trained.
 
     Raises:
-        DyngsError: a capture that cannot be read.
+        DyngsError: a capture that cannot be read, a budget that is too small.
     """
     capture = with_points(read_capture(config.data), config)
+    config = within_cap(config, len(set(training_times(capture))))
     scene = surroundings(capture)
     generator = torch.Generator().manual_seed(config.run.seed)
     start = StartValues.for_strategy(config.strategy)
     pictures = PictureLoader(capture.splits["train"], config.data)
     if isinstance(config.model, HumanModel):
         gaussians, model = human_model(config, capture, pictures)
+        require_within(config, len(gaussians))
     else:
         gaussians = initial_gaussians(scene, config.init, start, stored_sh_degree(config), generator)
         model = _model(config, capture, pictures, scene.extent, generator)

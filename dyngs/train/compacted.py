@@ -65,7 +65,8 @@ def compact_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
         raise DyngsError(f"{out}: exists already; give another --out")
     step = latest_checkpoint(run_dir).info.step
     defaults = [f"compact.{key}={value}" for key, value in CompactConfig().model_dump().items()]
-    config = load_resolved(run_dir, [f"train.steps={step}", f"run.dir={out}", *defaults, *overrides])
+    done = [f"train.steps={step}", "budget.max_minutes=null", f"run.dir={out}"]
+    config = load_resolved(run_dir, [*done, *defaults, *overrides])
     if isinstance(config.model, HumanNetModel):
         raise DyngsError(f"{run_dir}: a network, not a scene; compact what it predicts")
     if not config.compact.is_wanted:

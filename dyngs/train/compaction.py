@@ -93,12 +93,12 @@ def compact_(trainer: Trainer) -> Compaction:
 def _pruning(trainer: Trainer, scene: Scene) -> Pruning:
     """What may go of ``scene``."""
     options = trainer.config.compact
-    found = worth(_survey(trainer, scene), slopes=options.score == "sensitivity")
+    found = worth(survey_of(trainer, scene), slopes=options.score == "sensitivity")
     pictures = [trainer.pictures[i] for i in spread(len(trainer.pictures), PROBED_VIEWS)]
-    whole = _quality(trainer, scene, pictures, None)
+    whole = quality_of(trainer, scene, pictures, None)
 
     def loss_of(kept: Tensor) -> float:
-        return whole - _quality(trainer, scene, pictures, kept)
+        return whole - quality_of(trainer, scene, pictures, kept)
 
     return prune(scores_of(found, options), options.prune, loss_of, options.max_loss)
 
@@ -128,7 +128,7 @@ def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
     return [different[i] for i in spread(len(different), count)]
 
 
-def _survey(trainer: Trainer, scene: Scene, times: Sequence[float | None] | None = None) -> Survey:
+def survey_of(trainer: Trainer, scene: Scene, times: Sequence[float | None] | None = None) -> Survey:
     """All pairs of some training cameras and some times; with no times all that matters are cameras."""
     background = torch.full((3,), 1.0 if trainer.background == "white" else 0.0)
     if times is None:
@@ -138,7 +138,7 @@ def _survey(trainer: Trainer, scene: Scene, times: Sequence[float | None] | None
     return Survey(scene.at, scene.shader_at, cameras, times, trainer.options, background)
 
 
-def _quality(trainer: Trainer, scene: Scene, pictures: Sequence[Picture], kept: Tensor | None) -> float:
+def quality_of(trainer: Trainer, scene: Scene, pictures: Sequence[Picture], kept: Tensor | None) -> float:
     """Mean PSNR of the training pictures with only ``kept`` (N,) bool of the Gaussians drawn; None: all."""
     background = torch.full((3,), 1.0 if trainer.background == "white" else 0.0)
     values = []
@@ -157,5 +157,5 @@ def _masks(trainer: Trainer, scene: Scene, kept: Tensor) -> KeyMasks:
     options, last = trainer.config.compact, len(scene.times) - 1
     count = min(options.masks, len(scene.times))
     times = [scene.times[round(k * last / (count - 1))] for k in range(count)]
-    shares = worth(_survey(trainer, scene, times), slopes=False).shares
+    shares = worth(survey_of(trainer, scene, times), slopes=False).shares
     return KeyMasks.pack(tuple(times), shares[:, kept] > options.mask_below)

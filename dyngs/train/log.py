@@ -142,6 +142,12 @@ class Progress:
             print(f"step {record.step}/{self._total} {text} {left} left", file=self._stream, flush=True)
             self._next_line = record.step + max(1, self._total // PLAIN_LINES)
 
+    def expect(self, total: int) -> None:
+        """From now on ``total`` steps are to be done."""
+        self._total = total
+        if self._bar is not None:
+            self._bar.update(self._task, total=total)
+
     def say(self, line: str) -> None:
         """Show ``line`` above what changes."""
         if self._bar is not None:

@@ -17,6 +17,7 @@ from dyngs.config_io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
+from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.rendering import RenderOptions, contributions
 from dyngs.storage.drawable import drawable
@@ -142,6 +143,7 @@ def _chosen(capture: Capture, count: int) -> list[View]:
 
 def _visibility(scene: Scene, shots: Sequence[_Shot], options: RenderOptions) -> Tensor:
     """(N,) sums of blending weights over the pictures."""
+    scene = scene.unmasked() if isinstance(scene, TrainedScene) else scene
     total = torch.zeros(len(scene))
     for shot in shots:
         total += contributions(scene.at(shot.time), shot.cameras, options)[0]

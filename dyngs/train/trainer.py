@@ -14,6 +14,9 @@ from dyngs.errors import DyngsError
 from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.train.assemble import assemble
+from dyngs.train.budget import reached, require_possible
+from dyngs.train.budget_size import has_file, write_within
+from dyngs.train.budget_time import Deadline, deadline_of, first_fit, refitted, with_steps
 from dyngs.train.checkpoint import (
     Checkpoint,
     checkpoint_paths,
@@ -39,7 +42,8 @@ def train(config: Config, *, resume_from: Path | None = None) -> Path:
             had never stopped.
 
     Raises:
-        DyngsError: bad input, a run folder that already holds a run, a loss that is not finite, a full disk.
+        DyngsError: bad input, a run folder that already holds a run, a budget that cannot be kept, a loss that is not
+            finite, a full disk.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how to go on.
     """
     run_dir = resume_from or config.run.dir or Path("runs") / config.run.name
@@ -49,23 +53,51 @@ def train(config: Config, *, resume_from: Path | None = None) -> Path:
 
 
 def _train(config: Config, run_dir: Path, resume_from: Path | None) -> Path:
+    require_possible(config)
     watch = _Stopwatch()
     resumed = _start_of_run(run_dir, resuming=resume_from is not None)
-    if resumed is not None and resumed.info.step >= config.total_steps:
+    if resumed is not None and resumed.info.step >= config.total_steps and not _owes_file(config, run_dir):
         return run_dir
-    trainer = assemble_network(config) if isinstance(config.model, HumanNetModel) else assemble(config)
+    trainer, wanted = _assembled(config), None
+    assembled_after = watch.seconds
     if resumed is not None:
         trainer.restore(resumed)
         watch.pause(-seconds_at(run_dir, resumed.info.step))
     else:
+        if config.budget.max_minutes is not None and isinstance(trainer, Trainer):
+            wanted = config.train.steps
+            config = first_fit(config, trainer, watch.seconds)
+            trainer = _assembled(config)
         save_config(config, run_dir / RESOLVED_NAME)
     with (
         RunLog(run_dir, trainer.done, tensorboard=config.train.tensorboard) as log,
         Progress(config.total_steps, trainer.done) as progress,
         Interrupts() as interrupts,
     ):
-        _Loop(config, run_dir, trainer, log, progress, watch).run(interrupts)
+        loop = _Loop(config, run_dir, trainer, log, progress, watch, deadline_of(config, wanted, assembled_after))
+        loop.run(interrupts)
+    if isinstance(loop.trainer, Trainer):
+        _keep_budget(loop.trainer, run_dir, loop.deadline, watch.seconds)
     return run_dir
+
+
+def _assembled(config: Config) -> Trainer | NetworkTrainer:
+    return assemble_network(config) if isinstance(config.model, HumanNetModel) else assemble(config)
+
+
+def _owes_file(config: Config, run_dir: Path) -> bool:
+    return config.budget.max_mb is not None and not has_file(run_dir)
+
+
+def _keep_budget(trainer: Trainer, run_dir: Path, deadline: Deadline | None, seconds: float) -> None:
+    """What a finished run still owes to its budget, and a line for each limit."""
+    budget = trainer.config.budget
+    if budget.max_gaussians is not None:
+        print(reached(trainer.config, len(trainer.optimizer.parameters)), flush=True)
+    if deadline is not None:
+        print(deadline.kept(trainer.done, seconds), flush=True)
+    if budget.max_mb is not None:
+        print(write_within(trainer, run_dir, budget.max_mb), flush=True)
 
 
 class _Stopwatch:
@@ -91,13 +123,14 @@ class _Loop:
     log: RunLog
     progress: Progress
     watch: _Stopwatch
+    deadline: Deadline | None
 
     def run(self, interrupts: Interrupts) -> None:
         """Step until the end, or until interrupted."""
-        options, saved, total = self.config.train, self.trainer.done, self.config.total_steps
-        while self.trainer.done < total and not interrupts.requested:
+        options, saved = self.config.train, self.trainer.done
+        while self.trainer.done < self.config.total_steps and not interrupts.requested:
             try:
-                if self.trainer.done == options.steps and isinstance(self.trainer, Trainer):
+                if self.trainer.done == self.config.train.steps and isinstance(self.trainer, Trainer):
                     self.progress.say(str(compact_(self.trainer)))
                 report = self.trainer.step()
             except DyngsError as error:
@@ -105,20 +138,43 @@ class _Loop:
             step = report.step
             if report.finding is not None:
                 print(f"step {step}: {report.finding}", flush=True)
+            if self.deadline is not None:
+                self._keep_time(self.deadline)
+            total = self.config.total_steps
             if step % options.log_every == 0 or step == total:
                 self._tell(report)
             evaluates = options.eval_every > 0 and step % options.eval_every == 0
-            is_last = step in (options.steps, total)
+            is_last = step in (self.config.train.steps, total)
             if evaluates or is_last or (options.save_every > 0 and step % options.save_every == 0):
                 saved = self._save()
             if evaluates:
                 self._evaluate(step)
-        if interrupts.requested and self.trainer.done < total:
+        if interrupts.requested and self.trainer.done < self.config.total_steps:
             if self.trainer.done > saved:
                 self._save()
             raise KeyboardInterrupt(
                 f"stopped after step {self.trainer.done}; go on with: dyngs train --resume {self.run_dir}"
             )
+
+    def _keep_time(self, deadline: Deadline) -> None:
+        """Go on with as many steps as fit into the time; none where it is over."""
+        done, steps = self.trainer.done, self.config.train.steps
+        found = deadline.steps(self.config, done, self.watch.seconds)
+        if found == steps or not isinstance(self.trainer, Trainer):
+            return
+        self.config = with_steps(self.config, found)
+        self.progress.expect(self.config.total_steps)
+        if found > done:
+            start = self.watch.seconds
+            self.trainer = refitted(self.trainer, self.config)
+            prepared = self.watch.seconds
+            self._save()  # a resumed run goes on from here with the new schedules
+            now = self.watch.seconds
+            deadline.refit_seconds, deadline.save_seconds = prepared - start, now - prepared
+            deadline.begin(done, now)
+        else:
+            self.trainer.config = with_steps(self.trainer.config, done)
+        save_config(self.config, self.run_dir / RESOLVED_NAME)
 
     def _tell(self, report: StepReport) -> None:
         quality = psnr(report.rendered, report.truth, report.picture.mask)

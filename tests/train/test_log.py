@@ -64,6 +64,15 @@ def test_without_a_terminal_there_are_about_ten_lines() -> None:
     assert lines[-1].endswith("0:00 left")
 
 
+def test_the_number_of_steps_may_change_on_the_way() -> None:
+    stream = io.StringIO()
+    with Progress(1000, 0, stream) as progress:
+        progress.update(_record(10))
+        progress.expect(20)
+        progress.update(_record(20))
+    assert [line.split()[1] for line in stream.getvalue().splitlines()] == ["10/1000", "20/20"]
+
+
 def test_on_a_terminal_there_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
 

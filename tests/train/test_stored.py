@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from moving_scene import write_moving_run
 
+from dyngs.deform.masks import KeyMasks
 from dyngs.errors import DyngsError
-from dyngs.train.checkpoint import latest_checkpoint, load_run
+from dyngs.train.checkpoint import latest_checkpoint, load_run, save_checkpoint
 from dyngs.train.stored import write_compact
 
 
@@ -27,6 +29,19 @@ def test_a_compact_run_moves_as_before(tmp_path: Path, moves: bool) -> None:
     for time in (0.0, 0.6):
         places = [run.scene.at(time).means[:, 0].sort().values for run in (before, after)]
         torch.testing.assert_close(places[0], places[1], atol=0.1, rtol=0)  # a pixel is 0.2 wide
+
+
+def test_a_run_with_masks_is_stored_with_them(tmp_path: Path) -> None:
+    """Of five balls the first is seen at the first key time only."""
+    run_dir = write_moving_run(tmp_path)
+    seen = torch.ones(3, 5, dtype=torch.bool)
+    seen[1:, 0] = False
+    checkpoint = latest_checkpoint(run_dir)
+    masks = {f"model.masks.{name}": x for name, x in KeyMasks.pack((0.0, 0.5, 1.0), seen).state().items()}
+    save_checkpoint(run_dir, replace(checkpoint, tensors=checkpoint.tensors | masks), 1.0)
+    write_compact(run_dir, tmp_path / "small", 0.5)
+    stored = load_run(tmp_path / "small").scene
+    assert [len(stored.at(time)) for time in (0.2, 0.7)] == [5, 4]
 
 
 def test_without_its_capture_steps_are_assumed(tmp_path: Path) -> None:
