@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 MIN_PICTURES = 3
 """Two agree by accident too often."""
+MIN_POINTS = 30
+"""Fewer say less of a scene than random ones."""
 LONGEST_SIDE = 1000
 MAX_FEATURES = 2048
 """SIFT features per picture."""
@@ -42,7 +44,7 @@ def views_of_a_moment(views: Sequence[View], limit: int) -> list[View]:
 
 
 def triangulated_points(views: Sequence[View], options: DataConfig) -> PointCloud | None:
-    """Points that several of the views see, in order of their coordinates; None where there are no such points.
+    """Points that several of the views see, in order of their coordinates; None where there are hardly any.
 
     SIFT features in pictures of at most ``LONGEST_SIDE`` px, matched between all pairs, triangulated from the given
     poses. One thread, so that the same pictures give the same points.
@@ -87,7 +89,7 @@ def _triangulated(folder: Path, pictures: Sequence[Picture]) -> PointCloud | Non
     posed = _posed(database, dict(zip(names, pictures, strict=True)))
     found = pycolmap.triangulate_points(posed, database, images, model, clear_points=True)
     points = [point for point in found.points3D.values() if point.track.length() >= MIN_PICTURES]
-    if not points:
+    if len(points) < MIN_POINTS:
         return None
     xyz = np.array([point.xyz for point in points], dtype=np.float64)
     rgb = np.array([point.color for point in points], dtype=np.uint8)

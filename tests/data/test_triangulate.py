@@ -58,7 +58,7 @@ def test_points_lie_on_the_surfaces(room: DataConfig) -> None:
 
 
 def test_the_same_pictures_give_the_same_points(room: DataConfig) -> None:
-    views = views_of_a_moment(train_views(room), 4)
+    views = views_of_a_moment(train_views(room), 24)
     first, second = (triangulated_points(views, room) for _ in range(2))
     assert first is not None
     assert second is not None
@@ -75,6 +75,13 @@ def test_two_places_are_too_few(room: DataConfig) -> None:
 def test_pictures_without_features_have_no_points(blender_root: Path) -> None:
     options = DataConfig(root=blender_root)
     assert triangulated_points(train_views(options), options) is None
+
+
+def test_a_handful_of_points_is_none(room: DataConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model that begins with them would have to grow all the rest."""
+    views = views_of_a_moment(train_views(room), 24)
+    monkeypatch.setattr("dyngs.data.triangulate.MIN_POINTS", 100_000)
+    assert triangulated_points(views, room) is None
 
 
 def test_a_missing_picture_is_named(room: DataConfig, tmp_path: Path) -> None:
