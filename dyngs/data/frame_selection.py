@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -77,3 +78,22 @@ def distinct_times(views: Iterable[View]) -> dict[float, float]:
         distinct[time] = first
         before = time
     return distinct
+
+
+def spread(length: int, count: int) -> list[int]:
+    """At most ``count`` of the indices below ``length``, evenly chosen."""
+    count = min(count, length)
+    return [i * length // count for i in range(count)]
+
+
+def standing_cameras(views: Sequence[View]) -> list[list[int]]:
+    """Indices of the views, in order of time, of each camera (pose, lens and size) that has pictures of several times.
+
+    Of several views with one pose and time, the first counts.
+    """
+    cameras: defaultdict[tuple[object, ...], dict[float, int]] = defaultdict(dict)
+    for i, view in enumerate(views):
+        if view.time is not None:
+            pose, intrinsics = (x.round(9).tobytes() for x in (view.cam_from_world, view.intrinsics))
+            cameras[pose, intrinsics, view.lens, view.width, view.height].setdefault(view.time, i)
+    return [[at[t] for t in sorted(at)] for at in cameras.values() if len(at) > 1]

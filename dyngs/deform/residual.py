@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from dyngs.data.capture import View
+from dyngs.data.frame_selection import spread, standing_cameras
 from dyngs.data.loader import Picture
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, render
 
-Thing = TypeVar("Thing")
 MIN_SAME = 3
 """Pictures of one camera, from which what they have in common is known."""
 USUAL = 0.7
@@ -94,26 +93,17 @@ def _errors_in(
 
 
 def cameras_in_place(views: Sequence[View]) -> list[list[int]]:
-    """Per camera that does not move and took ``MIN_SAME`` views or more, the indices of these."""
-    cameras: dict[bytes, list[int]] = {}
-    for index, view in enumerate(views):
-        cameras.setdefault(view.cam_from_world.tobytes() + view.intrinsics.tobytes(), []).append(index)
-    return [seen for seen in cameras.values() if len(seen) >= MIN_SAME]
+    """Per camera that stands and took ``MIN_SAME`` views or more, the indices of these."""
+    return [seen for seen in standing_cameras(views) if len(seen) >= MIN_SAME]
 
 
 def views_to_compare(views: Sequence[View], limit: int = 50) -> list[int]:
     """Indices of at most ``limit`` views, evenly chosen; where cameras stay in place, ``MOMENTS`` of each or more."""
     cameras = cameras_in_place(views)
     if not cameras:
-        return _evenly(range(len(views)), limit)
-    chosen = _evenly(cameras, max(limit // MOMENTS, 1))
-    return [index for seen in chosen for index in _evenly(seen, limit // len(chosen))]
-
-
-def _evenly(things: Sequence[Thing], limit: int) -> list[Thing]:
-    """At most ``limit`` of them."""
-    count = min(len(things), limit)
-    return [things[i * len(things) // count] for i in range(count)]
+        return spread(len(views), limit)
+    chosen = [cameras[i] for i in spread(len(cameras), max(limit // MOMENTS, 1))]
+    return [seen[i] for seen in chosen for i in spread(len(seen), limit // len(chosen))]
 
 
 def _median_pictures(pictures: Sequence[Picture], background: Tensor) -> dict[bytes, Tensor]:
@@ -125,8 +115,9 @@ def _median_pictures(pictures: Sequence[Picture], background: Tensor) -> dict[by
 
 
 def _camera_key(picture: Picture) -> bytes:
-    """Equal for pictures from the same place in the same direction."""
-    return picture.cameras.cam_from_world.numpy().tobytes() + picture.cameras.intrinsics.numpy().tobytes()
+    """Equal for pictures from the same place in the same direction, but for rounding."""
+    cameras = picture.cameras
+    return b"".join(x.round(decimals=6).numpy().tobytes() for x in (cameras.cam_from_world, cameras.intrinsics))
 
 
 def two_group_threshold(scores: Tensor) -> float:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import cast
 
 from dyngs.config_io import load_resolved
+from dyngs.data.frame_selection import spread
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.write import write_text
@@ -24,7 +25,6 @@ from dyngs.tradeoff.points import Point, read_point, write_point
 from dyngs.tradeoff.requirements import Figures
 from dyngs.train.background import evaluation_background
 from dyngs.train.checkpoint import checkpoint_paths, load_run
-from dyngs.train.compaction import spread
 from dyngs.train.evaluate import scene_of_split, split_views
 from dyngs.train.metrics import LpipsNet, load_lpips
 from dyngs.train.trainer import num_cores

@@ -13,6 +13,7 @@ from dyngs.colour.network import box_around
 from dyngs.colour.thrift import ThriftyColours
 from dyngs.config import AutoColour, Config, DataConfig, DcacColour, DynamicModel, HumanModel, McmcStrategy, PointsInit
 from dyngs.data.capture import Capture, View
+from dyngs.data.frame_selection import spread
 from dyngs.data.images import target_size
 from dyngs.data.intrinsics import scaled_intrinsics
 from dyngs.data.loader import Picture, PictureLoader
@@ -49,7 +50,7 @@ from dyngs.train.step import Model, Trainer
 AROUND_ORIGIN = ("blender", "body_json")
 """Formats whose scenes lie around the origin by convention."""
 FIRST_VIEWS = 50
-"""Pictures that are looked at for what moves."""
+"""Pictures that say what a person looks like before training."""
 
 
 def assemble(config: Config) -> Trainer:
@@ -106,7 +107,7 @@ def human_model(config: Config, capture: Capture, pictures: PictureLoader) -> tu
     gaussians, anchors = first_gaussians(texels, sorted(set(model.heights)), sh_degree)
     filmed = footage(capture.root, given, capture.splits["train"], joints)
     subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_shapes(body))
-    gaussians, subject = first_look(gaussians, texels, subject, _spread(pictures, 1), model.carve)
+    gaussians, subject = first_look(gaussians, texels, subject, _first_pictures(pictures), model.carve)
     return gaussians, HumanScene(model, subject, config.train.steps)
 
 
@@ -201,10 +202,9 @@ def _colours(config: Config, capture: Capture, gaussians: Gaussians, generator: 
     return Colours(colour)
 
 
-def _spread(pictures: PictureLoader, divisor: int) -> Iterator[Picture]:
-    """At most ``FIRST_VIEWS`` of the pictures, evenly chosen, with their sides divided by ``divisor``."""
-    count = min(len(pictures), FIRST_VIEWS)
-    return (pictures[i * len(pictures) // count].shrunk(divisor) for i in range(count))
+def _first_pictures(pictures: PictureLoader) -> Iterator[Picture]:
+    """At most ``FIRST_VIEWS`` of the pictures, evenly chosen."""
+    return (pictures[i] for i in spread(len(pictures), FIRST_VIEWS))
 
 
 def _densifier(config: Config, background: str, extent: float) -> Densifier:

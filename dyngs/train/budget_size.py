@@ -13,6 +13,7 @@ from dyngs.compact.prune import best
 from dyngs.compact.score import worth
 from dyngs.config import CompactConfig
 from dyngs.config_io import RESOLVED_NAME, save_config
+from dyngs.data.frame_selection import spread
 from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.storage.drawable import drawable
@@ -20,7 +21,7 @@ from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
 from dyngs.storage.quantize import step_below
 from dyngs.storage.tensors import COARSENESS
 from dyngs.train.checkpoint import COMPACT_NAME, Checkpoint, stored_scene
-from dyngs.train.compaction import PROBED_VIEWS, quality_of, scores_of, spread, survey_of
+from dyngs.train.compaction import PROBED_VIEWS, quality_of, scores_of, survey_of
 from dyngs.train.step import Trainer
 from dyngs.train.stored import precision_of
 

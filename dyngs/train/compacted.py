@@ -14,13 +14,13 @@ import torch
 from dyngs.config import CompactConfig, HumanNetModel
 from dyngs.config_io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.data.capture import Capture
+from dyngs.data.frame_selection import spread
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.ops.native import kernel_threads
 from dyngs.train.background import evaluation_background
 from dyngs.train.checkpoint import LoadedRun, checkpoint_paths, latest_checkpoint, load_run
-from dyngs.train.compaction import spread
 from dyngs.train.evaluate import parameter_megabytes, render_options, scene_of_split, split_views
 from dyngs.train.metrics import psnr
 from dyngs.train.temporal import Drawing

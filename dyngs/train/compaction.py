@@ -18,6 +18,7 @@ from dyngs.camera import Cameras
 from dyngs.compact.prune import Pruning, prune
 from dyngs.compact.score import Survey, Worth, worth
 from dyngs.config import CompactConfig
+from dyngs.data.frame_selection import spread
 from dyngs.data.loader import Picture
 from dyngs.deform.masks import KeyMasks
 from dyngs.deform.model import DynamicScene
@@ -110,12 +111,6 @@ def scores_of(found: Worth, options: CompactConfig) -> Tensor:
     if options.score == "temporal":
         return found.temporal
     return found.contribution if found.slopes is None else found.slopes
-
-
-def spread(length: int, count: int) -> list[int]:
-    """At most ``count`` of the indices below ``length``, evenly chosen."""
-    count = min(count, length)
-    return [i * length // count for i in range(count)]
 
 
 def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:

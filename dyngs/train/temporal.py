@@ -18,6 +18,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.capture import View
+from dyngs.data.frame_selection import standing_cameras
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.errors import DyngsError
 from dyngs.rendering import RenderOptions
@@ -136,19 +137,6 @@ def flicker_error(drawing: Drawing, loader: PictureLoader, views: Sequence[View]
     if not weight:
         return MetricValue(None, "no camera of this split stands still while time passes")
     return MetricValue(255 * total / weight)
-
-
-def standing_cameras(views: Sequence[View]) -> list[list[int]]:
-    """Indices of the views, in order of time, of each camera (pose, lens and size) that has pictures of several times.
-
-    Of several views with one pose and time, the first counts.
-    """
-    cameras: defaultdict[tuple[object, ...], dict[float, int]] = defaultdict(dict)
-    for i, view in enumerate(views):
-        if view.time is not None:
-            pose, intrinsics = (x.round(9).tobytes() for x in (view.cam_from_world, view.intrinsics))
-            cameras[pose, intrinsics, view.lens, view.width, view.height].setdefault(view.time, i)
-    return [[at[t] for t in sorted(at)] for at in cameras.values() if len(at) > 1]
 
 
 def flicker_of_split(drawing: Drawing, loader: PictureLoader, views: Sequence[View]) -> MetricValue:

@@ -5,20 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from refused import error_line
 from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.cli import main
 from dyngs.config_io import load_resolved
 from dyngs.train.trainer import train
-
-
-def error_line(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """What stderr says about a command line that must be refused: one line."""
-    assert main(list(arguments)) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("dyngs: error: ")
-    assert error.count("\n") == 1
-    return error
 
 
 @pytest.mark.usefixtures("one_thread")

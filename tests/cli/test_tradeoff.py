@@ -6,20 +6,12 @@ from pathlib import Path
 
 import pytest
 from moving_scene import write_moving_run
+from refused import error_line
 
 from dyngs.cli import main
 from dyngs.train.checkpoint import load_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def error_line(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """What stderr says about a command line that must be refused: one line."""
-    assert main(list(arguments)) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("dyngs: error: ")
-    assert error.count("\n") == 1
-    return error
 
 
 def test_a_table_files_and_a_chosen_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

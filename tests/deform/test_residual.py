@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -223,7 +224,8 @@ def test_a_camera_that_stays_is_preferred_to_one_that_does_not() -> None:
 def views(*cameras: int) -> list[View]:
     """From one of three places each."""
     poses, intrinsics = look_around(3, torch.float64).numpy(), camera().intrinsics[0].double().numpy()
-    return [View(str(i), Path("x.png"), poses[place], intrinsics, SIZE, SIZE) for i, place in enumerate(cameras)]
+    place = partial(View, image_path=Path("x.png"), intrinsics=intrinsics, width=SIZE, height=SIZE)
+    return [place(str(i), cam_from_world=poses[at], time=i / 1000) for i, at in enumerate(cameras)]
 
 
 def test_views_are_evenly_chosen_of_a_moving_camera() -> None:

@@ -22,13 +22,14 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config_io import load_resolved
+from dyngs.data.frame_selection import spread
 from dyngs.data.synthetic import StillOptions, write_still_capture
 from dyngs.deform.model import DynamicScene
 from dyngs.deform.trained import TrainedScene
 from dyngs.static.settled import Settled
 from dyngs.train.assemble import assemble
 from dyngs.train.checkpoint import checkpoint_paths, load_checkpoint, load_run
-from dyngs.train.compaction import Compaction, compact_, distinct_cameras, spread
+from dyngs.train.compaction import Compaction, compact_, distinct_cameras
 from dyngs.train.step import Trainer
 from dyngs.train.trainer import train
 

@@ -19,6 +19,7 @@ from moving_scene import (
 )
 
 from dyngs.config import DataConfig
+from dyngs.data.frame_selection import standing_cameras
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
@@ -31,7 +32,6 @@ from dyngs.train.temporal import (
     flicker_error,
     flicker_of_split,
     psnr_per_time,
-    standing_cameras,
 )
 
 
