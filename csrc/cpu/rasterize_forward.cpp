@@ -49,7 +49,7 @@ void blend_block(const Splats<S>& s, const TileFrame<S>& frame, int block, int32
     const P before = state.transmittance;
     P weight = alpha * before;
     P next = state.transmittance - weight;
-    const Mask<S> full = (next < transmittance_min) & (alpha > zero);
+    const Mask<S> full = next < transmittance_min;  // alpha > 0 there: what is left was not below it before
     if (any(full)) [[unlikely]] {
       mark_full(full, chunk_begin + i, state);
       weight = select(full, zero, weight);
@@ -80,13 +80,15 @@ template <class S, int D>
 void write_block(const Splats<S>& s, const TileFrame<S>& frame, int block, const Image<S>& image,
                  const BlockState<S, D>& state) {
   const int channels = D == kDynamic ? s.channels : D;
-  const S* background = image.background ? image.background + frame.view * channels : nullptr;
+  Packet<S> color[D == kDynamic ? kMaxChannels : D];
+  for (int c = 0; c < channels; ++c) {
+    const S behind = image.background ? image.background[frame.view * channels + c] : S(0);
+    color[c] = state.color[c] + state.transmittance * Packet<S>(behind);
+  }
   for_each_pixel(s, frame, block, [&](int i, int64_t pixel) {
-    const S t = state.transmittance[i];
-    image.transmittance[pixel] = t;
+    image.transmittance[pixel] = state.transmittance[i];
     image.stop[pixel] = state.stop[i];
-    for (int c = 0; c < channels; ++c)
-      image.color[pixel * channels + c] = state.color[c][i] + (background ? t * background[c] : S(0));
+    for (int c = 0; c < channels; ++c) image.color[pixel * channels + c] = color[c][i];
   });
 }
 

@@ -174,9 +174,15 @@ Packet<S> pixel_threshold(const Splats<S>& s, const TileFrame<S>& f, int block) 
 // Calls f(lane, pixel index within all views) for the block's pixels inside the image.
 template <class S, class F>
 void for_each_pixel(const Splats<S>& s, const TileFrame<S>& frame, int block, F&& f) {
+  const int x0 = frame.x0 + kBlockSide * (block % 4), y0 = frame.y0 + kBlockSide * (block / 4);
+  const int64_t first = (int64_t{frame.view} * s.height + y0) * s.width + x0;
+  if (x0 + kBlockSide <= s.width && y0 + kBlockSide <= s.height) {  // as nearly always: no test per pixel
+    for (int i = 0; i < kLanes; ++i) f(i, first + int64_t{i / kBlockSide} * s.width + i % kBlockSide);
+    return;
+  }
   for (int i = 0; i < kLanes; ++i) {
-    const int x = frame.x0 + kBlockSide * (block % 4) + i % 4, y = frame.y0 + kBlockSide * (block / 4) + i / 4;
-    if (x < s.width && y < s.height) f(i, (int64_t{frame.view} * s.height + y) * s.width + x);
+    const int x = i % kBlockSide, y = i / kBlockSide;
+    if (x0 + x < s.width && y0 + y < s.height) f(i, first + int64_t{y} * s.width + x);
   }
 }
 

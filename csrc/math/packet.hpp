@@ -144,6 +144,15 @@ template <class R>
 R min_of(R a, R b) { return select(a < b, a, b); }
 template <class R>
 R max_of(R a, R b) { return select(a > b, a, b); }
+#if defined(__AVX512F__)
+// The same in one instruction, NaN included: b where the comparison is false.
+inline Packet<float> min_of(Packet<float> a, Packet<float> b) {
+  return (Packet<float>::Vec)_mm512_min_ps((__m512)a.v, (__m512)b.v);
+}
+inline Packet<float> max_of(Packet<float> a, Packet<float> b) {
+  return (Packet<float>::Vec)_mm512_max_ps((__m512)a.v, (__m512)b.v);
+}
+#endif
 template <class R>
 R abs_of(R a) { return max_of(a, -a); }
 

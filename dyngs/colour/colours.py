@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from dyngs.colour.network import ColourNetwork, Frame, num_inputs
+from dyngs.colour.network import ColourNetwork, Frame
 from dyngs.config import ColourSection, DcacColour
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.ops.adam import adam_step_
 from dyngs.ops.perceptron import Layer
+from dyngs.ops.shading import num_inputs
 from dyngs.rendering import Shader
 
 _MILESTONES = (1 / 6, 1 / 2, 5 / 6)

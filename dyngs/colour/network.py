@@ -17,6 +17,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.ops.perceptron import Layer, perceptron
+from dyngs.ops.shading import Sight, shading_inputs
 from dyngs.rendering import Shader
 
 
@@ -67,81 +68,26 @@ class ColourNetwork:
 
         return colors
 
-    def shades(
-        self, geometry: Gaussians, base: Tensor, directions: Tensor, time: float | None, frame: Frame | None = None
-    ) -> Tensor:
-        """(M, 3) colours before their clamp of M Gaussians, seen along unit ``directions`` (M, 3) in the world.
-
-        Args:
-            geometry: where they are and how they lie; no gradient reaches it.
-            base: (M, 3) their base colours.
-            directions: from the camera.
-            time: as in ``shader``.
-            frame: of these M.
-        """
-        features = [*self._features(geometry, directions, frame), base - 0.5]
-        if self.sees_time:
-            moment = min(max(0.0 if time is None else time, 0.0), 1.0)
-            features.append(torch.full_like(base[:, :1], 2 * moment - 1))
-        return base + perceptron(torch.cat(features, dim=1), self.layers)
-
     def _seen_from(
         self, gaussians: Gaussians, center: Tensor, drawn: Tensor, time: float | None, frame: Frame | None
     ) -> Tensor:
         """(N, 3) colours seen from ``center``; zero, and not computed, for those that are not ``drawn`` (N,)."""
-        rows = torch.nonzero(drawn)[:, 0]
-        geometry = gaussians.detach()
-        if len(rows) < len(gaussians):
-            geometry = geometry.select(rows)
-        if frame is not None:
-            frame = Frame(frame.places[rows], frame.turn)
-        directions = torch.nn.functional.normalize(geometry.means - center.detach(), dim=1)
+        rows, dtype = torch.nonzero(drawn)[:, 0], gaussians.means.dtype
+        moment = min(max(0.0 if time is None else time, 0.0), 1.0)
+        sight = Sight(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.log_scales,
+            rows,
+            center,
+            self.box.to(dtype),
+            None if frame is None else (frame.places.to(dtype), frame.turn.to(dtype)),
+            moment if self.sees_time else None,
+            self.sees_normals,
+        )
         base = gaussians.base_rgb.index_select(0, rows)
-        shown = self.shades(geometry, base, directions, time, frame).clamp_min(0)
+        shown = (base + perceptron(shading_inputs(sight, base), self.layers)).clamp_min(0)
         return shown.new_zeros(len(gaussians), 3).index_copy(0, rows, shown)
-
-    @torch.no_grad()
-    def _features(self, geometry: Gaussians, directions: Tensor, frame: Frame | None) -> list[Tensor]:
-        """Inputs that no gradient passes: (M, 3) place and direction, and what the normal says."""
-        normals = shortest_axes(geometry.quats, geometry.log_scales) if self.sees_normals else None
-        places = geometry.means
-        if frame is not None:
-            places, directions = frame.places, directions @ frame.turn
-            normals = None if normals is None else normals @ frame.turn
-        center, half_size = self.box.to(places.dtype)
-        features = [contracted((places - center) / half_size), directions]
-        if normals is not None:
-            cosine = (normals * directions).sum(1, keepdim=True)
-            features += [cosine.abs(), directions - 2 * cosine * normals]
-        return features
-
-
-def num_inputs(*, sees_time: bool, sees_normals: bool) -> int:
-    """Width of a network's input: place, direction and base colour, and what it sees beside them."""
-    return 9 + sees_time + 4 * sees_normals
-
-
-def contracted(points: Tensor) -> Tensor:
-    """(M, 3) ``points`` as they are in the unit ball, and what lies outside drawn into one of radius 2.
-
-    (2 - 1 / |x|) x / |x|, the contraction of Barron et al. 2022 (mip-NeRF 360): far things stay bounded inputs.
-    """
-    length = points.norm(dim=1, keepdim=True).clamp_min(1)
-    return points * (2 - 1 / length) / length
-
-
-def shortest_axes(quats: Tensor, log_scales: Tensor) -> Tensor:
-    """(M, 3) unit vectors along the shortest axis of each Gaussian: the normal of what is flat, up to its sign."""
-    # Components first: long rows are what elementwise operations are fast on.
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).T.contiguous()
-    shortest = log_scales.argmin(dim=1)
-    a, b, c = ((shortest == axis).to(quats.dtype) for axis in range(3))
-    rows = (
-        a * (1 - 2 * (y * y + z * z)) + 2 * (b * (x * y - w * z) + c * (x * z + w * y)),
-        b * (1 - 2 * (x * x + z * z)) + 2 * (a * (x * y + w * z) + c * (y * z - w * x)),
-        c * (1 - 2 * (x * x + y * y)) + 2 * (a * (x * z - w * y) + b * (y * z + w * x)),
-    )
-    return torch.stack(rows, dim=1)
 
 
 def box_around(means: Tensor) -> Tensor:

@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scenes import random_scene
 from torch import Tensor
 
@@ -16,14 +14,12 @@ from dyngs.colour.network import (
     ColourNetwork,
     Frame,
     box_around,
-    contracted,
     network_of,
-    num_inputs,
-    shortest_axes,
 )
 from dyngs.gaussians import Gaussians
 from dyngs.human.covariance import rotations_of
-from dyngs.ops.perceptron import Layer
+from dyngs.ops.perceptron import Layer, reference_perceptron
+from dyngs.ops.shading import Sight, num_inputs, reference_inputs
 from dyngs.rendering import RenderOptions, render
 
 
@@ -64,9 +60,10 @@ def test_each_gaussian_has_the_colour_of_its_own_inputs() -> None:
     assert not colors[1, 2].any()
     for v, i in ((0, 0), (0, 5), (1, 3)):
         one = gaussians.select(torch.tensor([i]))
-        direction = torch.nn.functional.normalize(one.means - scene.cameras.centers[v], dim=1)
-        expected = net.shades(one, one.base_rgb, direction, 0.7)[0].clamp_min(0)
-        torch.testing.assert_close(colors[v, i], expected)
+        geometry = (one.means, one.quats, one.log_scales, torch.tensor([0]))
+        sight = Sight(*geometry, scene.cameras.centers[v], net.box, time=0.7)
+        added = reference_perceptron(reference_inputs(sight, one.base_rgb), net.layers)
+        torch.testing.assert_close(colors[v, i], (one.base_rgb + added)[0].clamp_min(0))
 
 
 def test_colours_do_not_move_gaussians() -> None:
@@ -89,14 +86,15 @@ def test_colours_do_not_move_gaussians() -> None:
 def test_gradients_are_those_of_finite_differences() -> None:
     scene = random_scene(n=4, degree=0)
     net = network(last=0.05)
-    geometry, direction = scene.gaussians, torch.nn.functional.normalize(scene.means, dim=1)
+    bright, shown = scene.gaussians.sh + 3, torch.ones(2, 4, 2, dtype=torch.int32)  # far from the clamp
 
-    def shades(base: Tensor, *parts: Tensor) -> Tensor:
+    def shades(sh: Tensor, *parts: Tensor) -> Tensor:
         layers = tuple(Layer(*parts[i : i + 2]) for i in (0, 2))
-        return replace(net, layers=layers).shades(geometry, base, direction, 0.4)
+        shader = replace(net, layers=layers).shader(0.4)
+        return shader(scene.gaussians.replace(sh=sh), scene.cameras, shown)
 
     parts = [x.clone().requires_grad_() for layer in net.layers for x in (layer.weight, layer.bias)]
-    assert torch.autograd.gradcheck(shades, (geometry.base_rgb.clone().requires_grad_(), *parts))
+    assert torch.autograd.gradcheck(shades, (bright.requires_grad_(), *parts))
 
 
 @pytest.mark.parametrize("sees_time", [False, True])
@@ -134,23 +132,6 @@ def test_colours_turn_with_a_body() -> None:
     cameras = replace(scene.cameras, cam_from_world=scene.cam_from_world @ torch.linalg.inv(world_from_world))
     now = net.shader(None, Frame(gaussians.means, turn))(moved, cameras, shown)
     torch.testing.assert_close(now, at_rest(gaussians, scene.cameras, shown))
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.integers(0, 2**32), st.floats(1e-3, 1e12))
-def test_far_places_stay_bounded_and_in_order(seed: int, scale: float) -> None:
-    points = scale * torch.randn(20, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    lengths, inside = points.norm(dim=1), contracted(points).norm(dim=1)
-    assert (inside <= 2).all()
-    assert torch.equal(contracted(points)[lengths <= 1], points[lengths <= 1])
-    assert (inside[lengths.argsort()].diff() >= -1e-12).all()
-
-
-def test_the_shortest_axis_is_the_normal() -> None:
-    quats = torch.randn(30, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    log_scales = torch.randn(30, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    expected = rotations_of(quats).gather(2, log_scales.argmin(1)[:, None, None].expand(30, 3, 1))[..., 0]
-    torch.testing.assert_close(shortest_axes(quats, log_scales), expected)
 
 
 def test_a_normal_has_no_sign() -> None:

@@ -1,0 +1,95 @@
+"""What a colour network is told: the fused kernel against plain torch, and what the inputs mean."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dyngs.human.covariance import rotations_of
+from dyngs.ops.native import kernel_threads
+from dyngs.ops.shading import Sight, contracted, num_inputs, reference_inputs, shading_inputs, shortest_axes
+
+
+def sight(seed: int, *, normals: bool, timed: bool, on_body: bool, dtype: torch.dtype = torch.float64) -> Sight:
+    """Eleven Gaussians, seven of them seen, in no order."""
+    g = torch.Generator().manual_seed(seed)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=g, dtype=torch.float64).to(dtype)
+
+    box = torch.stack([random(3), 0.1 + random(3).abs()])
+    rest = (random(11, 3), rotations_of(random(1, 4))[0]) if on_body else None
+    rows = torch.randperm(11, generator=g)[:7]
+    return Sight(
+        random(11, 3), random(11, 4), random(11, 3), rows, random(3), box, rest, 0.3 if timed else None, normals
+    )
+
+
+flags = st.booleans()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32), flags, flags, flags, st.sampled_from([torch.float32, torch.float64]))
+def test_it_is_what_torch_says(seed: int, normals: bool, timed: bool, on_body: bool, dtype: torch.dtype) -> None:
+    seen = sight(seed, normals=normals, timed=timed, on_body=on_body, dtype=dtype)
+    base = torch.rand(7, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+    found = shading_inputs(seen, base)
+    assert found.shape == (7, num_inputs(sees_time=timed, sees_normals=normals))
+    torch.testing.assert_close(found, reference_inputs(seen, base))
+
+
+def test_threads_change_nothing() -> None:
+    seen = sight(0, normals=True, timed=True, on_body=True)
+    many = replace(seen, rows=torch.randint(0, 11, (5000,), generator=torch.Generator().manual_seed(1)))
+    base = torch.rand(5000, 3, dtype=torch.float64)
+    with kernel_threads(1):
+        alone = shading_inputs(many, base)
+    with kernel_threads(3):
+        assert torch.equal(shading_inputs(many, base), alone)
+
+
+def test_only_base_colours_get_a_gradient() -> None:
+    seen = sight(0, normals=True, timed=True, on_body=False)
+    seen = replace(seen, means=seen.means.requires_grad_())
+    base = torch.rand(7, 3, dtype=torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: shading_inputs(seen, x), base)
+    assert seen.means.grad is None
+
+
+def test_what_is_degenerate_stays_finite() -> None:
+    """An eye in the centre of a Gaussian, a rotation of length zero, three equal scales, nothing seen."""
+    zeros = torch.zeros(1, 3)
+    seen = Sight(zeros, torch.zeros(1, 4), zeros, torch.tensor([0]), zeros[0], torch.tensor([[0.0] * 3, [1.0] * 3]))
+    base = torch.full((1, 3), 0.5)
+    torch.testing.assert_close(shading_inputs(seen, base), reference_inputs(seen, base))
+    assert shading_inputs(seen, base).isfinite().all()
+    assert shading_inputs(replace(seen, rows=torch.zeros(0, dtype=torch.long)), base[:0]).shape == (0, 13)
+
+
+@pytest.mark.parametrize("row", [-1, 11])
+def test_a_row_that_does_not_exist_is_refused(row: int) -> None:
+    seen = replace(sight(0, normals=True, timed=False, on_body=False), rows=torch.tensor([0, row]))
+    with pytest.raises(IndexError, match="no such Gaussian"):
+        shading_inputs(seen, torch.zeros(2, 3, dtype=torch.float64))
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32), st.floats(1e-3, 1e12))
+def test_far_places_stay_bounded_and_in_order(seed: int, scale: float) -> None:
+    points = scale * torch.randn(20, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    lengths, inside = points.norm(dim=1), contracted(points).norm(dim=1)
+    assert (inside <= 2).all()
+    assert torch.equal(contracted(points)[lengths <= 1], points[lengths <= 1])
+    assert (inside[lengths.argsort()].diff() >= -1e-12).all()
+
+
+def test_the_shortest_axis_is_the_normal() -> None:
+    quats = torch.randn(30, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    log_scales = torch.randn(30, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    expected = rotations_of(quats).gather(2, log_scales.argmin(1)[:, None, None].expand(30, 3, 1))[..., 0]
+    torch.testing.assert_close(shortest_axes(quats, log_scales), expected)
