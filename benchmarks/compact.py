@@ -1,10 +1,12 @@
-"""What pruning, masks and fine-tuning each bring to a finished run: one row per way of compacting it.
+"""What pruning, masks, fine-tuning and rounding each bring to a finished run: one row per way of compacting it.
 
-    python benchmarks/compact.py RUN FOLDER [--rows scores|parts] [--prune 0.8] [--masks 6] [--steps 2000] [--threads 1]
+    python benchmarks/compact.py RUN FOLDER [key=value ...] [--rows stages|parts|scores] [--threads 1]
 
-FOLDER keeps the compacted runs, which are used again. `parts` compares pruning alone, masks alone and both, with and
-without fine-tuning (one step); `scores` compares the scores. Pruning does not back off here. Printed as a table in
-Markdown: Gaussians, PSNR on training and held-out views (at most 20 each), how many times as fast it draws as RUN, MB.
+FOLDER keeps the compacted runs, which are used again. `stages` goes the whole way: pruned, fine-tuned, stored by
+`dyngs export --format compact`. `parts` compares pruning alone, masks alone and both, with and without fine-tuning (one
+step); `scores` compares the scores. Pruning does not back off here. Overrides (compact.prune=0.8, compact.masks=6, ...)
+hold for all rows. Printed as a table in Markdown: Gaussians, PSNR of 20 training views and of the whole test split, how
+many times as fast it draws as RUN, MB as float32 and as stored.
 """
 
 from __future__ import annotations
@@ -14,49 +16,57 @@ from pathlib import Path
 
 from dyngs.train.checkpoint import checkpoint_paths
 from dyngs.train.compacted import Cost, compact_run, compared
+from dyngs.train.evaluate import evaluate_run
+from dyngs.train.stored import write_compact
+
+ONCE = "compact.steps=1"
+NO_MASKS, NO_PRUNING = "compact.masks=0", "compact.prune=0"
+ROWS = {
+    "stages": {"pruned": (ONCE,), "fine-tuned": ()},
+    "parts": {
+        "masks only": (NO_PRUNING,),
+        "masks only, not fine-tuned": (NO_PRUNING, ONCE),
+        "pruned only": (NO_MASKS,),
+        "pruned only, not fine-tuned": (NO_MASKS, ONCE),
+        "both": (),
+        "both, not fine-tuned": (ONCE,),
+    },
+    "scores": {name: (f"compact.score={name}",) for name in ("sensitivity", "contribution", "variation", "temporal")},
+}
 
 
-def rows(which: str, prune: float, masks: int, steps: int) -> dict[str, tuple[str, ...]]:
-    """Name to what is asked for."""
-    tuned, share, bits = f"compact.steps={steps}", f"compact.prune={prune}", f"compact.masks={masks}"
-    if which == "scores":
-        names = ("sensitivity", "contribution", "variation", "temporal")
-        return {name: (tuned, share, f"compact.score={name}") for name in names}
-    return {
-        "masks only": (tuned, bits),
-        "masks only, not fine-tuned": ("compact.steps=1", bits),
-        "pruned only": (tuned, share),
-        "pruned only, not fine-tuned": ("compact.steps=1", share),
-        "both": (tuned, share, bits),
-        "both, not fine-tuned": ("compact.steps=1", share, bits),
-    }
+def line(name: str, run: Path, cost: Cost, before: Cost, threads: int) -> str:
+    """A row of the table, without the size of its file."""
+    test, faster = evaluate_run(run, threads=threads).psnr, cost.fps / before.fps
+    quality = f"{cost.psnr_train:.2f} | {test:.2f}"
+    return f"| {name} | {cost.num_gaussians} | {quality} | {faster:.2f} | {cost.megabytes:.2f} |"
 
 
-def line(name: str, cost: Cost, before: Cost) -> str:
-    """A row of the table."""
-    test = "" if cost.psnr_test is None else f"{cost.psnr_test:.2f}"
-    faster = f"{cost.fps / before.fps:.2f}"
-    return f"| {name} | {cost.num_gaussians} | {cost.psnr_train:.2f} | {test} | {faster} | {cost.megabytes:.2f} |"
+def stored(run: Path, threads: int) -> str:
+    """What the file of a run costs, its last column."""
+    folder = run / "stored"
+    size = 1e-6 * write_compact(run, folder).num_bytes
+    return f" {size:.3f}, {evaluate_run(folder, threads=threads).psnr:.2f} dB |"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run_dir", type=Path)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--rows", choices=("parts", "scores"), default="parts")
-    parser.add_argument("--prune", type=float, default=0.8)
-    parser.add_argument("--masks", type=int, default=6)
-    parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("overrides", nargs="*")
+    parser.add_argument("--rows", choices=tuple(ROWS), default="stages")
     parser.add_argument("--threads", type=int, default=1)
     given = parser.parse_args()
-    print("| | Gaussians | train dB | test dB | times as fast | MB |\n|---|---|---|---|---|---|")
-    for name, asked in rows(given.rows, given.prune, given.masks, given.steps).items():
+    print("| | Gaussians | train dB | test dB | times as fast | MB | stored |\n|---|---|---|---|---|---|---|")
+    for name, asked in ROWS[given.rows].items():
         out = given.folder / name.replace(", ", "_").replace(" ", "_")
         if not checkpoint_paths(out):
-            compact_run(given.run_dir, out, (*asked, "compact.max_loss=1000", f"run.threads={given.threads}"))
+            common = ("compact.prune=0.8", "compact.max_loss=1000", f"run.threads={given.threads}")
+            compact_run(given.run_dir, out, (*common, *given.overrides, *asked))
         before, after = compared(given.run_dir, out, given.threads)
-        print(line(name, after, before), flush=True)
-    print(line("before", before, before))
+        print(line(name, out, after, before, given.threads), end="", flush=True)
+        print(stored(out, given.threads), flush=True)
+    print(line("trained", given.run_dir, before, before, given.threads))
 
 
 if __name__ == "__main__":

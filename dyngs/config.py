@@ -14,6 +14,7 @@ from dyngs.conventions import RasterizeMode
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+CutOff = Annotated[float, Field(ge=1e-6, le=0.5)]
 
 
 class Section(BaseModel):
@@ -81,6 +82,12 @@ class SceneModel(Section):
     )
     filter_3d: bool = Field(default=False, description="Mip-Splatting's 3D smoothing filter")
     near: Positive = Field(default=0.2, description="near plane, world units")
+    alpha_min: CutOff = Field(
+        default=1 / 255, description="a pixel skips Gaussians that cover less of it; 1/255 in 3DGS"
+    )
+    transmittance_min: CutOff = Field(
+        default=1e-4, description="a pixel is done when less of what lies behind shines through"
+    )
 
 
 class StaticModel(SceneModel):
@@ -355,6 +362,9 @@ class CompactConfig(Section):
     masks: int = Field(default=0, ge=0, description="key times of the masks of what is seen; 0 or 1 = no masks")
     mask_below: float = Field(default=0.0, ge=0, description="px of a Gaussian in all views that count as not seen")
     steps: int = Field(default=2000, ge=1, description="of fine-tuning")
+    rewind: float = Field(
+        default=0.3, ge=0, le=1, description="share of training whose learning rates fine-tuning goes back to"
+    )
 
     @property
     def is_wanted(self) -> bool:
@@ -365,12 +375,15 @@ class CompactConfig(Section):
 class BudgetConfig(Section):
     """Limits that a run keeps (docs/budget.md); null: none."""
 
-    max_gaussians: int | None = Field(default=None, ge=1, description="never more than so many")
+    max_gaussians: int | None = Field(default=None, ge=1, description="no more than so many at the end")
     max_mb: float | None = Field(
         default=None, gt=0, description="1e6 bytes of the file `small/scene.dyngs`, which is then written"
     )
     max_minutes: float | None = Field(
         default=None, gt=0, description="of training on this machine; fewer than `train.steps` are done if need be"
+    )
+    min_fps: float | None = Field(
+        default=None, gt=0, description="training views drawn per second on this machine, by fewer Gaussians if need be"
     )
 
 

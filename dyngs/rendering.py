@@ -66,15 +66,20 @@ class Rendering:
 
     Attributes:
         rgb: (V, H, W, 3), background composited; not clamped above 1.
-        alpha: (V, H, W) in [0, 1].
+        transmittance: (V, H, W) in [0, 1], what remains of the background.
         depth: (V, H, W) view-space z in world units, or None; 0 where nothing is drawn.
         radii: (V, N, 2) int32 half extents in px, 0 = not drawn.
     """
 
     rgb: Tensor
-    alpha: Tensor
+    transmittance: Tensor
     depth: Tensor | None
     radii: Tensor
+
+    @property
+    def alpha(self) -> Tensor:
+        """(V, H, W) in [0, 1]."""
+        return 1 - self.transmittance
 
 
 def render(
@@ -115,13 +120,13 @@ def render(
     blended = rasterize(
         projection, opacities, colors, size, background=background, probe=probe, options=options.blending
     )
-    alpha = 1 - blended.transmittance
     depth = None
     if options.depth != "none":
         depth = blended.color[..., 3]
         if options.depth == "expected":
+            alpha = 1 - blended.transmittance
             depth = depth / torch.where(alpha > 0, alpha, 1.0)
-    return Rendering(blended.color[..., :3], alpha, depth, projection.radii)
+    return Rendering(blended.color[..., :3], blended.transmittance, depth, projection.radii)
 
 
 def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()) -> Tensor:

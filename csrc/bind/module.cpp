@@ -6,6 +6,7 @@ namespace nb = nanobind;
 
 namespace dyngs {
 void bind_planes(nb::module_& module);
+void bind_offsets(nb::module_& module);
 void bind_perceptron(nb::module_& module);
 void bind_rasterizer(nb::module_& module);
 void bind_shading(nb::module_& module);
@@ -30,6 +31,7 @@ const char* best_isa() {
 NB_MODULE(DYNGS_MODULE, module) {
   module.def("best_isa", dyngs::best_isa);
   dyngs::bind_planes(module);
+  dyngs::bind_offsets(module);
   dyngs::bind_perceptron(module);
   dyngs::bind_rasterizer(module);
   dyngs::bind_shading(module);

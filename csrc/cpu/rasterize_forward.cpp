@@ -108,10 +108,28 @@ Packet<S> light_of_block(const Splats<S>& s, const TileFrame<S>& frame, int bloc
   return light;
 }
 
+// A tile that no Gaussian meets shows the background.
+template <class S>
+void fill_tile(const Splats<S>& s, const TileFrame<S>& frame, const Image<S>& image) {
+  const int x1 = std::min(frame.x0 + kTile, s.width), y1 = std::min(frame.y0 + kTile, s.height);
+  const int64_t count = x1 - frame.x0;
+  S row[kTile * kMaxChannels] = {};
+  if (image.background)
+    for (int64_t i = 0; i < count; ++i)
+      std::copy_n(image.background + frame.view * s.channels, s.channels, row + i * s.channels);
+  for (int y = frame.y0; y < y1; ++y) {
+    const int64_t first = (int64_t{frame.view} * s.height + y) * s.width + frame.x0;
+    std::fill_n(image.transmittance + first, count, S(1));
+    std::fill_n(image.stop + first, count, std::numeric_limits<int32_t>::max());
+    std::copy_n(row, count * s.channels, image.color + first * s.channels);
+  }
+}
+
 template <class S, int D, Tally kTally>
 void blend_tile(const Splats<S>& s, const Entries& entries, const Image<S>& image, int64_t tile, S* slot_sums) {
   const TileFrame<S> frame = tile_frame(s, tile);
   const int64_t begin = entries.tile_offsets[tile], end = entries.tile_offsets[tile + 1];
+  if (begin == end) return fill_tile(s, frame, image);
   BlockState<S, D> state[kBlocks];
   for (int b = 0; b < kBlocks; ++b) {
     state[b] = {};

@@ -15,6 +15,7 @@ _EPILOG = """\
 examples:
   dyngs compact runs/dance --out runs/dance_small                  the best known settings
   dyngs compact runs/dance --out runs/tiny --prune 0.95 --max-loss 20 --steps 5000
+  dyngs compact runs/dance model.alpha_min=0.02 --out runs/fast    tuned for a higher cut-off of faint Gaussians
   dyngs train --resume runs/tiny                                   where it was interrupted
 
 As a part of training: dyngs train CONFIG ... compact.prune=0.8. What the options mean: docs/compact.md.
@@ -45,6 +46,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--masks", metavar="K", help="key times of masks of what is seen (default none)")
     parser.add_argument("--steps", metavar="N", help="of fine-tuning (default 2000)")
     parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="any other key of the run (docs/cli.md)")
     parser.set_defaults(run=run)
 
 
@@ -58,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     asked = {key: getattr(arguments, key) for key in ("prune", "score", "max_loss", "masks", "steps")}
     overrides = [f"compact.{key}={value}" for key, value in asked.items() if value is not None]
-    overrides.append(f"run.threads={arguments.threads}")
+    overrides += [f"run.threads={arguments.threads}", *arguments.overrides]
     folder = compact_run(arguments.run_dir, arguments.out, overrides)
     before, after = compared(arguments.run_dir, folder, arguments.threads)
     Console().print(cost_table(before, after))

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dyngs.deform.learned import LearnedTensors
 from dyngs.gaussians import Gaussians
+from dyngs.ops.native import array, core, num_threads
 
 MAX_KEY_TIMES = 256
 """Longer clips want a choice of their own: memory grows with it."""
@@ -101,7 +102,12 @@ def key_times(num_times: int) -> int:
 
 
 def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None) -> Gaussians:
-    """``gaussians`` with ``offsets`` applied to ``rows`` ((M,) long; None = all of them, in order); differentiable."""
+    """``gaussians`` with ``offsets`` applied to ``rows`` ((M,) long; None = all of them, in order); differentiable.
+
+    No row may occur twice. Without gradients it is done in one pass.
+    """
+    if not torch.is_grad_enabled() and gaussians.means.device.type == "cpu":
+        return _deformed_in_one_pass(gaussians, offsets, rows)
     changes = {"means": _added(gaussians.means, offsets.means, rows)}
     if offsets.quats is not None:
         own = gaussians.quats if rows is None else gaussians.quats.index_select(0, rows)
@@ -115,6 +121,20 @@ def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None)
         base = _added(gaussians.sh[:, 0], offsets.colors, rows)
         changes["sh"] = torch.cat([base[:, None], gaussians.sh[:, 1:]], dim=1)
     return gaussians.replace(**changes)
+
+
+def _deformed_in_one_pass(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None) -> Gaussians:
+    given = {name: x for name, x in vars(offsets).items() if x is not None}
+    changed = {"sh" if name == "colors" else name for name in given}
+    copies = {n: x.contiguous().clone() if n in changed else x for n, x in gaussians.detach().tensors().items()}
+    dtype = gaussians.means.dtype
+    core.add_offsets(
+        tuple(array(x) for x in copies.values()),
+        None if rows is None else array(rows),
+        tuple(None if x is None else array(x.to(dtype)) for x in vars(offsets).values()),
+        num_threads(),
+    )
+    return Gaussians(**copies)
 
 
 def chosen(x: Tensor, rows: Tensor | None) -> Tensor:

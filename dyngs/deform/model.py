@@ -27,6 +27,7 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.static.densify import EditResult
 from dyngs.static.filters import FILTER_VARIANCE, filter_std
 from dyngs.static.model import Drawn, StaticScene
+from dyngs.static.rates import Rates
 
 NOBODY = torch.zeros(0, dtype=torch.long)
 SURELY_MOVING = 1.5
@@ -46,7 +47,7 @@ class DeformSchedule:
         opens, full: steps between which the window of times grows, to all of them.
         decays: step from which the field's rates fall.
         splits: steps after which Gaussians that do not move are frozen.
-        steps: length of the run.
+        rates: how the field's rates fall.
     """
 
     fine: int
@@ -54,7 +55,7 @@ class DeformSchedule:
     full: int
     decays: int
     splits: tuple[int, ...]
-    steps: int
+    rates: Rates
 
 
 @dataclass(frozen=True)
@@ -136,8 +137,7 @@ class DynamicScene:
         self._still.after_step(parameters, step, result)
         left_out = 0
         if self.field is not None:
-            decays, steps = self.schedule.decays, self.schedule.steps
-            progress = max(step - decays, 0) / max(steps - decays, 1)
+            progress = self.schedule.rates.progress(step, since=self.schedule.decays)
             left_out = self.field.learned.step(step - self.schedule.fine, progress)
             if result is not None and result.edit is not None:
                 self._follow(result.edit, self.field)
@@ -226,7 +226,7 @@ class DynamicScene:
             return time
         gap = 1 / max(len(self.times) - 1, 1)
         noise = float(torch.randn((), generator=self._generator)) * self.options.time_jitter * gap
-        return min(max(time + noise * max(0.0, 1 - step / self.schedule.steps), 0.0), 1.0)
+        return min(max(time + noise * max(0.0, 1 - step / self.schedule.rates.steps), 0.0), 1.0)
 
     def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
         """Mean motion: what need not move should not."""

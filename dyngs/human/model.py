@@ -30,6 +30,7 @@ from dyngs.human.refine import Corrections, corrected_posing, corrected_skeleton
 from dyngs.human.uv import Texels, neighbours
 from dyngs.static.densify import EditResult
 from dyngs.static.model import Drawn
+from dyngs.static.rates import Rates
 
 NEIGHBOURS = 5
 CENTIMETRE = 0.01
@@ -87,10 +88,10 @@ class HumanScene:
         corrections: what is learned beside them.
     """
 
-    def __init__(self, options: HumanModel, subject: Subject, steps: int) -> None:
-        self.options, self.subject, self.steps = options, subject, steps
+    def __init__(self, options: HumanModel, subject: Subject, rates: Rates) -> None:
+        self.options, self.subject, self.rates = options, subject, rates
         self.anchors = subject.anchors
-        self.refines_from = round(options.refine_from * steps)
+        self.refines_from = round(options.refine_from * rates.steps)
         self.corrections = Corrections(options, subject.footage.clip, subject.skeleton, subject.anchors)
         self._rows = {frame: row for row, frame in enumerate(subject.footage.frames)}
         self._given_weights: Tensor | None = None
@@ -130,7 +131,7 @@ class HumanScene:
         """Rows left out for bad gradients; optimizes the corrections, follows ``result``."""
         left_out = 0
         if self._refines(step):
-            progress = (step - self.refines_from) / max(self.steps - self.refines_from, 1)
+            progress = self.rates.progress(step, since=self.refines_from)
             left_out = self.corrections.learned.step(step - self.refines_from, progress)
         if result is not None and result.edit is not None:
             self.anchors = self.anchors.select(result.edit.source)

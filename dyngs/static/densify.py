@@ -83,6 +83,10 @@ class Densifier(Protocol):
         """Add the strategy's noise to the parameters, in place, after the optimizer's step."""
         ...
 
+    def limit(self, max_gaussians: int) -> None:
+        """Add none beyond so many from now on; those that there are stay. Not part of the state."""
+        ...
+
     def state(self) -> dict[str, Tensor]:
         """What a checkpoint must hold."""
         ...
@@ -139,6 +143,9 @@ class DefaultDensifier:
 
     def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
         return None
+
+    def limit(self, max_gaussians: int) -> None:
+        self.options = self.options.model_copy(update={"max_gaussians": max_gaussians})
 
     def state(self) -> dict[str, Tensor]:
         return {"grad_sum": self.grad_sum, "seen": self.seen}

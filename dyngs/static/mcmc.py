@@ -29,6 +29,7 @@ class McmcDensifier:
     def __init__(self, options: McmcStrategy, schedule: DensifySchedule, growth: float) -> None:
         """``growth`` is the fraction of Gaussians added per change, adapted to the run's length."""
         self.options, self.schedule, self.growth = options, schedule, growth
+        self.max_gaussians = options.max_gaussians
 
     def wants_signal(self, step: int) -> bool:
         return False
@@ -55,7 +56,7 @@ class McmcDensifier:
             opacities, log_scales, shared = self._share(opacities, log_scales, picks)
             source[dead], opacities[dead], log_scales[dead] = picks, opacities[picks], log_scales[picks]
             is_new = is_new | shared
-        added = max(0, min(self.options.max_gaussians, int((1 + self.growth) * n)) - n)
+        added = max(0, int(min(self.max_gaussians, (1 + self.growth) * n)) - n)
         if added > 0:
             picks = torch.multinomial(opacities, added, replacement=True, generator=generator)
             opacities, log_scales, shared = self._share(opacities, log_scales, picks)
@@ -90,6 +91,9 @@ class McmcDensifier:
         opacities = torch.nn.functional.logsigmoid(logits).exp()  # unlike sigmoid, the same on any number of threads
         weight = 1 / (1 + (NOISE_STEEPNESS * (opacities - NOISE_OPACITY)).exp())
         parameters.means.detach().index_add_(0, rows, shake * (weight * (self.options.noise * lr_means))[:, None])
+
+    def limit(self, max_gaussians: int) -> None:
+        self.max_gaussians = max_gaussians
 
     def state(self) -> dict[str, Tensor]:
         return {}

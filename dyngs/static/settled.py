@@ -29,6 +29,9 @@ class Settled:
     def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
         return None
 
+    def limit(self, max_gaussians: int) -> None:
+        return None
+
     def state(self) -> dict[str, Tensor]:
         return {}
 

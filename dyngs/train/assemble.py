@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -35,7 +36,8 @@ from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.model import StaticScene
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.train.background import evaluation_background
-from dyngs.train.budget import require_within, within_cap
+from dyngs.train.budget import within_cap
+from dyngs.train.evaluate import render_options
 from dyngs.train.sampler import ViewSampler
 from dyngs.train.schedule import (
     deform_schedule,
@@ -44,6 +46,7 @@ from dyngs.train.schedule import (
     grad_threshold,
     growth_per_change,
     picture_divisor,
+    rates_of,
 )
 from dyngs.train.step import Model, Trainer
 
@@ -53,21 +56,26 @@ FIRST_VIEWS = 50
 """Pictures that say what a person looks like before training."""
 
 
-def assemble(config: Config) -> Trainer:
+def assemble(config: Config, *, restored: bool = False) -> Trainer:
     """The trainer of a configuration: capture read, Gaussians initialised, nothing trained.
+
+    Args:
+        config: of a run.
+        restored: a checkpoint will be, so that it does not matter where Gaussians begin: no points are triangulated.
 
     Raises:
         DyngsError: a capture that cannot be read, a budget that is too small.
     """
-    capture = with_points(read_capture(config.data), config)
+    capture = read_capture(config.data)
+    if not restored:
+        capture = with_points(capture, config)
+    start = StartValues.for_strategy(config.strategy)
     config = within_cap(config, len(set(training_times(capture))))
     scene = surroundings(capture)
     generator = torch.Generator().manual_seed(config.run.seed)
-    start = StartValues.for_strategy(config.strategy)
     pictures = PictureLoader(capture.splits["train"], config.data)
     if isinstance(config.model, HumanModel):
         gaussians, model = human_model(config, capture, pictures)
-        require_within(config, len(gaussians))
     else:
         gaussians = initial_gaussians(scene, config.init, start, stored_sh_degree(config), generator)
         model = _model(config, capture, pictures, scene.extent, generator)
@@ -108,7 +116,7 @@ def human_model(config: Config, capture: Capture, pictures: PictureLoader) -> tu
     filmed = footage(capture.root, given, capture.splits["train"], joints)
     subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_shapes(body))
     gaussians, subject = first_look(gaussians, texels, subject, _first_pictures(pictures), model.carve)
-    return gaussians, HumanScene(model, subject, config.train.steps)
+    return gaussians, HumanScene(model, subject, rates_of(config))
 
 
 def stored_sh_degree(config: Config) -> int:
@@ -176,7 +184,7 @@ def _model(
     if not isinstance(model, DynamicModel) or len(set(times)) < 2:
         return still
     _, colour = evaluation_background(config.data.background, capture.has_alpha)
-    schedule = deform_schedule(model, steps)
+    schedule = deform_schedule(model, rates_of(config))
     divisor = picture_divisor(config.train, schedule.fine)
 
     looked_at = views_to_compare(capture.splits["train"])
@@ -217,8 +225,6 @@ def _densifier(config: Config, background: str, extent: float) -> Densifier:
 
 
 def _render_options(config: Config) -> RenderOptions:
-    strategy, model = config.strategy, config.model
+    strategy = config.strategy
     absgrad = not isinstance(strategy, McmcStrategy) and strategy.absgrad
-    return RenderOptions(
-        near=model.near, eps2d=model.eps2d, mode=model.rasterize_mode, absgrad=absgrad, nonfinite="trust"
-    )
+    return replace(render_options(config.model), absgrad=absgrad, nonfinite="trust")

@@ -47,12 +47,9 @@ def within_cap(config: Config, num_times: int) -> Config:
     Raises:
         DyngsError: a size that has no room for a scene.
     """
-    limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
-    if config.budget.max_mb is not None and not isinstance(config.model, HumanModel):
-        limits.append(room(config, num_times, config.budget.max_mb))
-    if not limits:
+    cap, model = most_gaussians(config, num_times), config.model
+    if cap is None:
         return config
-    cap, model = min(limits), config.model
     if isinstance(model, DynamicModel):
         model = model.model_copy(update={"seeds": min(model.seeds, int(SEED_SHARE * cap))})
         cap -= model.seeds
@@ -60,13 +57,20 @@ def within_cap(config: Config, num_times: int) -> Config:
     return config.model_copy(update={"model": model, "strategy": strategy})
 
 
-def require_within(config: Config, num_gaussians: int) -> None:
-    """Raise DyngsError where training would begin with more Gaussians than are allowed: those of a person are given."""
-    most = config.budget.max_gaussians
-    if most is not None and num_gaussians > most:
-        raise DyngsError(
-            f"budget.max_gaussians={most}: this begins with {num_gaussians}; allow as many, or lower model.resolution"
-        )
+def most_gaussians(config: Config, num_times: int) -> int | None:
+    """How many Gaussians a run may end with by its limits; None: as many as it wants.
+
+    Args:
+        config: of a run.
+        num_times: distinct times of training.
+
+    Raises:
+        DyngsError: a size that has no room for a scene.
+    """
+    limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
+    if config.budget.max_mb is not None and not isinstance(config.model, HumanModel):
+        limits.append(room(config, num_times, config.budget.max_mb))
+    return min(limits, default=None)
 
 
 def room(config: Config, num_times: int, megabytes: float) -> int:
@@ -89,14 +93,6 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
             f"{1e-6 * (fixed + FEWEST * each) * 1.05:.2g} would do{field}"
         )
     return found
-
-
-def reached(config: Config, num_gaussians: int) -> str:
-    """The line about ``budget.max_gaussians`` after a run that ends with so many."""
-    asked = config.budget.max_gaussians or num_gaussians
-    held_back = num_gaussians >= CLOSE * asked
-    cost = "it held growth back; what more would bring is not known" if held_back else "it cost nothing"
-    return f"budget.max_gaussians: asked {asked:,}, got {num_gaussians:,}; {cost}"
 
 
 def _field_values(options: DeformField, num_times: int, num_moving: int) -> int:

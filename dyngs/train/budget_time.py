@@ -14,6 +14,7 @@ from statistics import fmean
 from dyngs.config import AutoColour, Config, DynamicModel
 from dyngs.deform.model import DynamicScene
 from dyngs.errors import DyngsError
+from dyngs.static.rates import Rates
 from dyngs.train.assemble import assemble
 from dyngs.train.schedule import deform_schedule, picture_divisor, scaled
 from dyngs.train.step import Trainer
@@ -43,6 +44,7 @@ class Deadline:
         fits: the number of steps may change; otherwise only the end of the time ends the run.
         refit_seconds: what preparing the run anew took last.
         save_seconds: what saving took last.
+        reserve: seconds that are needed for something else than steps before the end.
     """
 
     seconds: float
@@ -50,6 +52,7 @@ class Deadline:
     fits: bool
     refit_seconds: float = 0.0
     save_seconds: float = 0.0
+    reserve: float = 0.0
     _since: tuple[int, float] | None = None
 
     def begin(self, done: int, now: float) -> None:
@@ -68,12 +71,12 @@ class Deadline:
             return total
         since, then = self._since
         pace = (now - then) / max(done - since, 1)
-        if now + 2 * pace + self.save_seconds > self.seconds:
+        if now + 2 * pace + self.save_seconds + self.reserve > self.seconds:
             return done
         if not self.fits or done - since < max(total // FITS, 10) or done >= total:
             return total
         self.begin(done, now)
-        left = AIM * self.seconds - now - self.refit_seconds
+        left = AIM * self.seconds - now - self.refit_seconds - self.reserve
         found = fitting_steps(config, done, pace, left, self.most_steps)
         worth_it = left > 0 and abs(found - total) > SMALLEST_CHANGE * total
         return found if worth_it and same_phase(config, with_steps(config, found), done) else total
@@ -101,27 +104,29 @@ def with_steps(config: Config, steps: int) -> Config:
 
 
 def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
-    """``config`` with as many steps as fit, at most its own, by the rate at which ``trainer`` does some.
+    """``config`` with as many steps as fit, at most its own, by the rate at which a copy of ``trainer`` does some.
 
     Args:
         config: of the run.
-        trainer: newly assembled from it; of no further use.
-        used: seconds since the beginning; as many are allowed for preparing the run once more.
+        trainer: newly assembled from it; left as it is.
+        used: seconds that are not there for steps, up to now and at the end.
 
     Raises:
         DyngsError: too few fit; says how many minutes would do.
     """
     minutes, wanted = config.budget.max_minutes or math.inf, config.train.steps
     begin = time.perf_counter()
+    pilot = refitted(trainer, config)
+    prepared = time.perf_counter()
     for _ in range(min(PILOT_WARM_UP, wanted - 1)):
-        trainer.step()
-    start, done = time.perf_counter(), trainer.done
-    while trainer.done < min(done + PILOT_STEPS, wanted):
-        trainer.step()
-        if time.perf_counter() - begin > PILOT_SHARE * 60 * minutes:
+        pilot.step()
+    start, done = time.perf_counter(), pilot.done
+    while pilot.done < min(done + PILOT_STEPS, wanted):
+        pilot.step()
+        if time.perf_counter() - prepared > PILOT_SHARE * 60 * minutes:
             break
     now = time.perf_counter()
-    pace, used = (now - start) / (trainer.done - done), 2 * used + now - begin
+    pace, used = (now - start) / (pilot.done - done), used + (prepared - begin) + (now - begin)
     found = fitting_steps(config, 0, pace, AIM * 60 * minutes - used, wanted)
     fewest = min(FEWEST_STEPS, wanted)
     if found < fewest:
@@ -135,7 +140,7 @@ def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
 
 def refitted(trainer: Trainer, config: Config) -> Trainer:
     """A trainer that is where ``trainer`` is, but on the schedules of ``config``."""
-    fitted = assemble(config)
+    fitted = assemble(config, restored=True)
     fitted.pictures, fitted.bad_gradients = trainer.pictures, trainer.bad_gradients
     fitted.restore(trainer.checkpoint())
     old, new, step = trainer.model, fitted.model, trainer.done + 1
@@ -165,7 +170,7 @@ def seconds_left(config: Config, done: int, steps: int, pace: float) -> float:
     weight = fmean(_weight(picture_divisor(options, step)) for step in sampled) / now
     if done < scaled(config.strategy.stop, steps):
         weight *= GROWTH
-    if isinstance(config.model, DynamicModel) and done < deform_schedule(config.model, steps).fine:
+    if isinstance(config.model, DynamicModel) and done < deform_schedule(config.model, Rates(steps)).fine:
         weight *= MOTION
     return left * pace * weight
 
@@ -179,7 +184,7 @@ def _happened(config: Config, done: int) -> tuple[bool, ...]:
     """Which of the things that happen once in a run have happened after ``done`` steps."""
     steps, happened = config.train.steps, []
     if isinstance(config.model, DynamicModel):
-        schedule = deform_schedule(config.model, steps)
+        schedule = deform_schedule(config.model, Rates(steps))
         happened += [done >= schedule.fine]
     if isinstance(config.colour, AutoColour):
         happened += [done >= max(1, round(config.colour.measure_at * steps))]

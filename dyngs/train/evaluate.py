@@ -268,8 +268,14 @@ def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
 
 
 def render_options(model: SceneModel) -> RenderOptions:
-    """How a trained model wants to be drawn."""
-    return RenderOptions(near=model.near, eps2d=model.eps2d, mode=model.rasterize_mode)
+    """How a model wants to be drawn."""
+    return RenderOptions(
+        near=model.near,
+        eps2d=model.eps2d,
+        mode=model.rasterize_mode,
+        alpha_min=model.alpha_min,
+        transmittance_min=model.transmittance_min,
+    )
 
 
 def parameter_megabytes(scene: Scene) -> float:

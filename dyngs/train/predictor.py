@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -20,9 +20,11 @@ from dyngs.human.predict.maps import Maps, maps_of, to_atlas
 from dyngs.human.predict.network import AtlasNetwork
 from dyngs.human.predict.sitter import Sitter, sitter_of, spread_views
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.rendering import RenderOptions, render
+from dyngs.rendering import render
+from dyngs.static.rates import Rates
 from dyngs.train.background import evaluation_background
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.train.evaluate import render_options
 from dyngs.train.sampler import ViewSampler
 from dyngs.train.step import StepReport
 
@@ -91,12 +93,12 @@ class NetworkTrainer:
         person = self.people[self.sampler.next(self.generator, lambda _: True)]
         choice = self._draw(len(person.choices))
         targets = self._targets(person, person.choices[choice])
-        background = self._background_colour()
+        background, drawing = self._background_colour(), replace(render_options(self.model), nonfinite="trust")
         avatar = filled(person.sitter, person.maps(choice), self.mean, self.network, self.model.carve)
         posed = _scene(self.model, avatar).gaussians_at(avatar.gaussians, targets[0], step).gaussians
         total = torch.zeros(())
         for picture in targets:
-            rendering = render(posed, picture.cameras, render_options(self.model), background=background)
+            rendering = render(posed, picture.cameras, drawing, background=background)
             truth = picture.composite(background)
             loss = l1_ssim_loss(rendering.rgb[0], truth, options.ssim_weight, picture.mask)
             if options.alpha_weight > 0 and picture.alpha is not None:
@@ -223,14 +225,10 @@ def load_network(network: AtlasNetwork, checkpoint: Checkpoint) -> Tensor:
 
 def human_options(model: HumanNetModel) -> HumanModel:
     """The section of one person with the same template, texels and scaffolds; nothing of it is learned."""
-    shared = ("body", "uv", "resolution", "heights", "carve", "near", "eps2d", "rasterize_mode")
+    shared = ("body", "uv", "resolution", "heights", "carve")
+    drawn = ("near", "eps2d", "rasterize_mode", "alpha_min", "transmittance_min")
     none = {"refine": False, "offset_weight": 0, "scale_weight": 0, "rigidity": 0, "smoothness": 0}
-    return HumanModel.model_validate({"sh_degree": 0, **none} | {name: getattr(model, name) for name in shared})
-
-
-def render_options(model: HumanNetModel) -> RenderOptions:
-    """How predictions are drawn."""
-    return RenderOptions(near=model.near, eps2d=model.eps2d, mode=model.rasterize_mode, nonfinite="trust")
+    return HumanModel.model_validate({"sh_degree": 0, **none} | {name: getattr(model, name) for name in shared + drawn})
 
 
 def captures_in(data: DataConfig) -> list[DataConfig]:
@@ -286,4 +284,4 @@ def _choices(sitter: Sitter, model: HumanNetModel, generator: torch.Generator) -
 
 
 def _scene(model: HumanNetModel, avatar: Avatar) -> HumanScene:
-    return HumanScene(human_options(model), avatar.subject, 1)
+    return HumanScene(human_options(model), avatar.subject, Rates(1))

@@ -16,6 +16,7 @@ from dyngs.human.person import template
 from dyngs.human.predict.fill import Avatar, filled
 from dyngs.human.predict.sitter import Sitter, named_views, spread_views
 from dyngs.static.optimizer import GaussianOptimizer
+from dyngs.static.rates import Rates
 from dyngs.train.assemble import assemble
 from dyngs.train.checkpoint import checkpoint_paths, latest_checkpoint, save_checkpoint
 from dyngs.train.predictor import filmed, human_options, load_network, new_network
@@ -104,7 +105,7 @@ def write_run(out: Path, avatar: Avatar, data: DataConfig, model: HumanNetModel,
     )
     trainer = replace(
         assemble(config),
-        model=HumanScene(human, avatar.subject, config.train.steps),
+        model=HumanScene(human, avatar.subject, Rates(config.train.steps)),
         optimizer=GaussianOptimizer(avatar.gaussians, config.optim),
     )
     save_config(config, out / RESOLVED_NAME)

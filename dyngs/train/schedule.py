@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
-from dyngs.config import DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, TrainConfig
+from dyngs.config import Config, DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, TrainConfig
 from dyngs.deform.model import DeformSchedule
 from dyngs.static.densify import DensifySchedule
+from dyngs.static.rates import Rates
 
 PUBLISHED_STEPS = 30_000
 MIN_START = 100
@@ -36,10 +37,15 @@ def picture_divisor(options: TrainConfig, step: int) -> int:
     return options.coarsest >> sum(step / options.steps >= share for share in shares)
 
 
-def means_rate(options: OptimConfig, step: int, steps: int, extent: float) -> float:
-    """Learning rate of the means at ``step``, world units: log-linear over the run, times the scene's extent."""
-    t = min(max(step / steps, 0.0), 1.0)
-    return extent * math.exp((1 - t) * math.log(options.lr_means) + t * math.log(options.lr_means_final))
+def rates_of(config: Config) -> Rates:
+    """When the learning rates of a run fall."""
+    stage = config.compact
+    return Rates(config.train.steps, stage.steps, stage.rewind) if stage.is_wanted else Rates(config.train.steps)
+
+
+def means_rate(options: OptimConfig, progress: float, extent: float) -> float:
+    """Learning rate of the means, world units: log-linear in ``progress`` from 0 to 1, times the scene's extent."""
+    return extent * math.exp((1 - progress) * math.log(options.lr_means) + progress * math.log(options.lr_means_final))
 
 
 def active_sh_degree(options: TrainConfig, step: int, max_degree: int) -> int:
@@ -82,8 +88,8 @@ def growth_per_change(strategy: McmcStrategy, steps: int) -> float:
     Changes come every ``every`` steps whatever the run's length, so that a short run has fewer of them; each then adds
     more, up to a quarter, and the count follows the same curve over the run.
     """
-    grown = (1 + strategy.growth) ** (PUBLISHED_STEPS / steps) - 1
-    return max(strategy.growth, min(grown, MAX_GROWTH)) if steps < PUBLISHED_STEPS else strategy.growth
+    rate = math.log1p(strategy.growth) * max(PUBLISHED_STEPS / steps, 1.0)
+    return max(strategy.growth, math.expm1(min(rate, math.log1p(MAX_GROWTH))))
 
 
 def filter_steps(strategy: DefaultStrategy | McmcStrategy, steps: int) -> range:
@@ -92,14 +98,15 @@ def filter_steps(strategy: DefaultStrategy | McmcStrategy, steps: int) -> range:
     return range(first, steps - FILTER_EVERY + 1, FILTER_EVERY)
 
 
-def deform_schedule(model: DynamicModel, steps: int) -> DeformSchedule:
-    """The phases of a dynamic model in a run of ``steps``; where ``still_below`` is 0 nothing is ever frozen.
+def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
+    """The phases of a dynamic model in a run with ``rates``; where ``still_below`` is 0 nothing is ever frozen.
 
     While new times come in, the field learns at its first rate: what has slowed down follows nothing.
     """
+    steps = rates.steps
     fine = min(max(1, round(model.coarse * steps), min(MIN_COARSE_STEPS, steps // 3)), steps)
     opens = max(fine, round(model.first_views_until * steps))
     full = max(opens, round(model.all_views_at * steps))
     decays = full if model.first_views < 1 else fine
     splits = sorted({full + round(share * (steps - full)) for share in SPLITS}) if model.still_below > 0 else []
-    return DeformSchedule(fine, opens, full, decays, tuple(step for step in splits if step > full), steps)
+    return DeformSchedule(fine, opens, full, decays, tuple(step for step in splits if step > full), rates)

@@ -25,7 +25,7 @@ from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.settled import Settled
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.train.sampler import ViewSampler
-from dyngs.train.schedule import active_sh_degree, means_rate, picture_divisor
+from dyngs.train.schedule import active_sh_degree, means_rate, picture_divisor, rates_of
 
 
 class Model(Protocol):
@@ -142,7 +142,7 @@ class Trainer:
 
     def _update(self, step: int) -> str | None:
         """Optimize, let the strategy act, and count the step; a line about what was found, or None."""
-        lr_means = means_rate(self.config.optim, step, self.config.train.steps, self.extent)
+        lr_means = means_rate(self.config.optim, rates_of(self.config).progress(step), self.extent)
         frozen, dense = self.colours.frozen_rest(), self.densifier.touches_all
         self.bad_gradients += self.optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen)
         self.bad_gradients += self.colours.after_step(step)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dyngs.config import Config, HumanNetModel
@@ -14,8 +14,10 @@ from dyngs.errors import DyngsError
 from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.train.assemble import assemble
-from dyngs.train.budget import reached, require_possible
+from dyngs.train.budget import require_possible
+from dyngs.train.budget_count import CountLimit, count_limit_of
 from dyngs.train.budget_size import has_file, write_within
+from dyngs.train.budget_speed import SpeedLimit
 from dyngs.train.budget_time import Deadline, deadline_of, first_fit, refitted, with_steps
 from dyngs.train.checkpoint import (
     Checkpoint,
@@ -31,6 +33,9 @@ from dyngs.train.log import LogRecord, Progress, RunLog
 from dyngs.train.metrics import psnr
 from dyngs.train.predictor import NetworkTrainer, assemble_network
 from dyngs.train.step import StepReport, Trainer
+
+COUNT, SPEED = "budget.count", "budget.speed"
+"""Parts of a checkpoint: what was done for limits."""
 
 
 def train(config: Config, *, resume_from: Path | None = None) -> Path:
@@ -58,46 +63,64 @@ def _train(config: Config, run_dir: Path, resume_from: Path | None) -> Path:
     resumed = _start_of_run(run_dir, resuming=resume_from is not None)
     if resumed is not None and resumed.info.step >= config.total_steps and not _owes_file(config, run_dir):
         return run_dir
-    trainer, wanted = _assembled(config), None
-    assembled_after = watch.seconds
+    trainer, wanted, preparing = _assembled(config, restored=resumed is not None), None, 0.0
     if resumed is not None:
         trainer.restore(resumed)
         watch.pause(-seconds_at(run_dir, resumed.info.step))
-    else:
+    speed = _speed_of(config, trainer, resumed)
+    if resumed is None:
         if config.budget.max_minutes is not None and isinstance(trainer, Trainer):
             wanted = config.train.steps
-            config = first_fit(config, trainer, watch.seconds)
-            trainer = _assembled(config)
+            config = first_fit(config, trainer, watch.seconds + (speed.reserve() if speed else 0.0))
+            preparing = -watch.seconds
+            trainer = refitted(trainer, config)
+            preparing += watch.seconds
         save_config(config, run_dir / RESOLVED_NAME)
     with (
         RunLog(run_dir, trainer.done, tensorboard=config.train.tensorboard) as log,
         Progress(config.total_steps, trainer.done) as progress,
         Interrupts() as interrupts,
     ):
-        loop = _Loop(config, run_dir, trainer, log, progress, watch, deadline_of(config, wanted, assembled_after))
+        deadline = deadline_of(config, wanted, preparing)
+        loop = _Loop(config, run_dir, trainer, log, progress, watch, deadline, speed)
+        if isinstance(trainer, Trainer):
+            loop.count = count_limit_of(trainer, resumed.part(COUNT) if resumed is not None else {})
         loop.run(interrupts)
     if isinstance(loop.trainer, Trainer):
-        _keep_budget(loop.trainer, run_dir, loop.deadline, watch.seconds)
+        _keep_budget(loop, loop.trainer)
     return run_dir
 
 
-def _assembled(config: Config) -> Trainer | NetworkTrainer:
-    return assemble_network(config) if isinstance(config.model, HumanNetModel) else assemble(config)
+def _assembled(config: Config, *, restored: bool) -> Trainer | NetworkTrainer:
+    if isinstance(config.model, HumanNetModel):
+        return assemble_network(config)
+    return assemble(config, restored=restored)
+
+
+def _speed_of(config: Config, trainer: Trainer | NetworkTrainer, resumed: Checkpoint | None) -> SpeedLimit | None:
+    """The speed that a run owes, as it was in a checkpoint or as it is possible; None: none."""
+    if config.budget.min_fps is None or not isinstance(trainer, Trainer):
+        return None
+    speed = SpeedLimit(config.budget.min_fps)
+    speed.begin(trainer, resumed.part(SPEED) if resumed is not None else {})
+    return speed
 
 
 def _owes_file(config: Config, run_dir: Path) -> bool:
     return config.budget.max_mb is not None and not has_file(run_dir)
 
 
-def _keep_budget(trainer: Trainer, run_dir: Path, deadline: Deadline | None, seconds: float) -> None:
+def _keep_budget(loop: _Loop, trainer: Trainer) -> None:
     """What a finished run still owes to its budget, and a line for each limit."""
     budget = trainer.config.budget
-    if budget.max_gaussians is not None:
-        print(reached(trainer.config, len(trainer.optimizer.parameters)), flush=True)
-    if deadline is not None:
-        print(deadline.kept(trainer.done, seconds), flush=True)
+    if loop.count is not None:
+        print(loop.count.reached(trainer), flush=True)
+    if loop.deadline is not None:
+        print(loop.deadline.kept(trainer.done, loop.watch.seconds), flush=True)
     if budget.max_mb is not None:
-        print(write_within(trainer, run_dir, budget.max_mb), flush=True)
+        print(write_within(trainer, loop.run_dir, budget.max_mb), flush=True)
+    if loop.speed is not None:
+        print(loop.speed.reached(trainer), flush=True)
 
 
 class _Stopwatch:
@@ -124,6 +147,8 @@ class _Loop:
     progress: Progress
     watch: _Stopwatch
     deadline: Deadline | None
+    speed: SpeedLimit | None = None
+    count: CountLimit | None = None
 
     def run(self, interrupts: Interrupts) -> None:
         """Step until the end, or until interrupted."""
@@ -140,6 +165,7 @@ class _Loop:
                 print(f"step {step}: {report.finding}", flush=True)
             if self.deadline is not None:
                 self._keep_time(self.deadline)
+            self._remove()
             total = self.config.total_steps
             if step % options.log_every == 0 or step == total:
                 self._tell(report)
@@ -167,6 +193,8 @@ class _Loop:
         if found > done:
             start = self.watch.seconds
             self.trainer = refitted(self.trainer, self.config)
+            if self.speed is not None:
+                self.speed.hold(self.trainer)
             prepared = self.watch.seconds
             self._save()  # a resumed run goes on from here with the new schedules
             now = self.watch.seconds
@@ -175,6 +203,20 @@ class _Loop:
         else:
             self.trainer.config = with_steps(self.trainer.config, done)
         save_config(self.config, self.run_dir / RESOLVED_NAME)
+
+    def _remove(self) -> None:
+        """Remove Gaussians where there are too many of them, or drawing is measured to be too slow."""
+        if not isinstance(self.trainer, Trainer):
+            return
+        used, given = self.watch.seconds, self.deadline.seconds if self.deadline is not None else math.inf
+        said = [self.count.after_step(self.trainer, used / given)] if self.count is not None else []
+        if self.speed is not None:
+            said.append(self.speed.after_step(self.trainer, used, given))
+            if self.deadline is not None:
+                self.deadline.reserve = self.speed.reserve()
+        for line in said:
+            if line is not None:
+                self.progress.say(line)
 
     def _tell(self, report: StepReport) -> None:
         quality = psnr(report.rendered, report.truth, report.picture.mask)
@@ -192,7 +234,12 @@ class _Loop:
         self.progress.update(record)
 
     def _save(self) -> int:
-        save_checkpoint(self.run_dir, self.trainer.checkpoint(), self.watch.seconds)
+        checkpoint = self.trainer.checkpoint()
+        for part, limit in ((COUNT, self.count), (SPEED, self.speed)):
+            if limit is not None:
+                kept = {f"{part}.{name}": x for name, x in limit.state().items()}
+                checkpoint = replace(checkpoint, tensors=checkpoint.tensors | kept)
+        save_checkpoint(self.run_dir, checkpoint, self.watch.seconds)
         return self.trainer.done
 
     def _evaluate(self, step: int) -> None:

@@ -16,6 +16,8 @@ from dyngs.gaussians import Gaussians
 
 SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "colors": (3,)}
 
+ATTRIBUTES = ["quats", "log_scales", "logit_opacities", "colors"]
+
 
 def some_offsets(count: int, dtype: torch.dtype = torch.float32, seed: int = 1) -> Offsets:
     generator = torch.Generator().manual_seed(seed)
@@ -80,7 +82,7 @@ def test_gradients_reach_the_canonical_gaussians(kind: str) -> None:
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.sets(st.integers(0, 8)), st.sets(st.sampled_from(["quats", "log_scales", "logit_opacities", "colors"])))
+@given(st.sets(st.integers(0, 8)), st.sets(st.sampled_from(ATTRIBUTES)))
 def test_rows_alone_are_changed_and_as_without_rows(chosen: set[int], absent: set[str]) -> None:
     gaussians, rows = cloud(), torch.tensor(sorted(chosen), dtype=torch.long)
     offsets = Offsets(**{k: None if k in absent else x for k, x in vars(some_offsets(len(rows))).items()})
@@ -90,6 +92,34 @@ def test_rows_alone_are_changed_and_as_without_rows(chosen: set[int], absent: se
     for name, x in gaussians.tensors().items():
         assert torch.equal(getattr(moved, name)[rows], getattr(alone, name)), name
         assert torch.equal(getattr(moved, name)[others], x[others]), name
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.none() | st.sets(st.integers(0, 8)),
+    st.sets(st.sampled_from(ATTRIBUTES)),
+    st.sampled_from([torch.float32, torch.float64]),
+)
+def test_one_pass_without_gradients_does_the_same(
+    chosen: set[int] | None, absent: set[str], dtype: torch.dtype
+) -> None:
+    gaussians = Gaussians(**{name: x.to(dtype) for name, x in cloud().tensors().items()})
+    before = {name: x.clone() for name, x in gaussians.tensors().items()}
+    rows = None if chosen is None else torch.tensor(sorted(chosen), dtype=torch.long)
+    given = vars(some_offsets(9 if rows is None else len(rows), dtype)).items()
+    offsets = Offsets(**{name: None if name in absent else x for name, x in given})
+    expected = deformed(gaussians, offsets, rows)
+    with torch.no_grad():
+        found = deformed(gaussians, offsets, rows)
+    for name, x in expected.tensors().items():
+        torch.testing.assert_close(getattr(found, name), x)
+        assert torch.equal(getattr(gaussians, name), before[name]), "what is given stays as it is"
+
+
+@pytest.mark.parametrize("row", [-1, 9])
+def test_a_row_that_does_not_exist_is_refused(row: int) -> None:
+    with torch.no_grad(), pytest.raises(IndexError):
+        deformed(cloud(), some_offsets(1), torch.tensor([row]))
 
 
 def test_each_offset_is_added_to_its_own_attribute() -> None:

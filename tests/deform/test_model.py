@@ -26,6 +26,7 @@ from dyngs.rendering import render
 from dyngs.static.densify import EditResult
 from dyngs.static.model import StaticScene
 from dyngs.static.optimizer import GaussianOptimizer
+from dyngs.static.rates import Rates
 
 FINE, FULL, SPLIT, STEPS = 2, 4, 6, 20
 TIMES = tuple(i / 20 for i in range(21))
@@ -69,7 +70,7 @@ def new_scene(
     line = TrajectoryField(polynomial=1, fourier=0, move_rotations=False, move_scales=False)
     defaults = {"deform": line, "seeds": 0, "motion_sparsity": 0.0, "still_below": THRESHOLD}
     capture = Surroundings4D(times, [camera()], 1.0, residuals, cameras_stay)
-    schedule = DeformSchedule(FINE, FINE, FULL, FINE, (SPLIT,), STEPS)
+    schedule = DeformSchedule(FINE, FINE, FULL, FINE, (SPLIT,), Rates(STEPS))
     model = DynamicModel.model_validate(defaults | options)
     return DynamicScene(model, schedule, capture, still or StaticScene(), torch.Generator())
 
@@ -239,7 +240,7 @@ def test_motion_is_learned_from_pictures(kind: str) -> None:
     options = tiny_options(kind, everything=False).model_copy(update=rates.get(kind, {"lr_means": 0.01}))
     steps = 150
     scene = begun(gaussians, deform=options, motion_sparsity=0.0)
-    scene.schedule = DeformSchedule(0, 0, 0, 0, (), steps)
+    scene.schedule = DeformSchedule(0, 0, 0, 0, (), Rates(steps))
     shift = torch.tensor([0.3, 0.0, 0.0])
     times = [(7 * i % 11) / 10 for i in range(steps)]
     for step, time in enumerate(times, start=1):

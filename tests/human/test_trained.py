@@ -22,6 +22,7 @@ from dyngs.human.skinning import rotations
 from dyngs.human.trained import AvatarScene, trained_avatar
 from dyngs.human.uv import texels_of
 from dyngs.rendering import render
+from dyngs.static.rates import Rates
 
 
 def random_clip(frames: int, seed: int = 0) -> Clip:
@@ -37,7 +38,7 @@ def stirred() -> tuple[HumanScene, Gaussians, AvatarScene]:
     gaussians, anchors = first_gaussians(texels_of(body, 24), (0.0,), 0)
     gaussians = gaussians.replace(sh=torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(1)))
     subject = Subject(Skeleton(body.joints, body.parents), anchors, Footage(random_clip(4), (0, 1, 2, 3)))
-    model = HumanScene(HumanModel(sh_degree=0), subject, 10)
+    model = HumanScene(HumanModel(sh_degree=0), subject, Rates(10))
     generator = torch.Generator().manual_seed(2)
     for x in model.corrections.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)

@@ -164,6 +164,18 @@ def test_the_cap_holds_and_the_best_come_first(seed: int, cap: int, n: int) -> N
         assert score[chosen].min() >= score[wanted & ~chosen].max()
 
 
+@pytest.mark.parametrize(("cap", "expected"), [(3, 4), (5, 5), (9, 8)])
+def test_a_later_limit_replaces_the_cap(cap: int, expected: int) -> None:
+    densifier = _densifier(DefaultStrategy(max_gaussians=6))
+    densifier.limit(cap)
+    _signal(densifier, [1.0] * 4)
+    step = next(step for step in range(1, 1000) if densifier.schedule.densifies_at(step))
+    result = densifier.edit(step, _gaussians([SMALL] * 4, [0.5] * 4), torch.Generator().manual_seed(0))
+    assert result is not None
+    assert result.edit is not None
+    assert len(result.edit.source) == expected
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_bad_values_are_never_multiplied(bad: float) -> None:
     gaussians = _gaussians([SMALL, SMALL], [0.5, 0.5])

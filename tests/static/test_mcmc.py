@@ -101,6 +101,24 @@ def test_the_set_grows_to_its_cap_and_no_further() -> None:
         assert torch.equal(result.changes["log_scales"][:100][untouched], _gaussians([0.4] * 100).log_scales[untouched])
 
 
+@pytest.mark.parametrize(("cap", "expected"), [(104, 104), (50, 100), (200, 110)])
+def test_a_later_limit_replaces_the_cap(cap: int, expected: int) -> None:
+    densifier = McmcDensifier(McmcStrategy(max_gaussians=100), SCHEDULE, 0.1)
+    densifier.limit(cap)
+    result = densifier.edit(200, _gaussians([0.4] * 100), torch.Generator().manual_seed(0))
+    assert result is not None
+    assert result.edit is not None
+    assert len(result.edit.source) == expected
+
+
+def test_growth_beyond_all_numbers_ends_at_the_cap() -> None:
+    densifier = McmcDensifier(McmcStrategy(max_gaussians=120), SCHEDULE, 1e308)
+    result = densifier.edit(200, _gaussians([0.4] * 100), torch.Generator().manual_seed(0))
+    assert result is not None
+    assert result.edit is not None
+    assert len(result.edit.source) == 120
+
+
 def test_nothing_outside_the_schedule_or_without_survivors() -> None:
     densifier = McmcDensifier(McmcStrategy(), SCHEDULE, 0.05)
     assert densifier.edit(250, _gaussians([0.5]), torch.Generator()) is None

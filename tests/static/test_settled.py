@@ -15,6 +15,7 @@ def test_nothing_changes() -> None:
     settled.after_backward(100, torch.ones(1, 5, 4), torch.ones(1, 5, 2), (8, 8))
     settled.perturb(gaussians, 1.0, generator)
     settled.load_state({"grad_sum": torch.ones(3)})
+    settled.limit(3)
     assert not settled.wants_signal(100)
     assert settled.edit(100, gaussians, generator) is None
     assert (settled.regularizers(gaussians), settled.state()) == ({}, {})

@@ -67,7 +67,7 @@ def test_surroundings_of_a_blender_capture(capture: Path) -> None:
 def test_parts_follow_the_config(capture: Path) -> None:
     config = Config(
         data=DataConfig(root=capture),
-        model=StaticModel(rasterize_mode=RasterizeMode.ANTIALIASED, eps2d=0.1, near=0.5, sh_degree=2),
+        model=StaticModel(rasterize_mode=RasterizeMode.ANTIALIASED, eps2d=0.1, near=0.5, sh_degree=2, alpha_min=0.01),
         init=PointsInit(num_random=40),
         strategy=DefaultStrategy(absgrad=True),
     )
@@ -75,6 +75,7 @@ def test_parts_follow_the_config(capture: Path) -> None:
     assert isinstance(trainer.densifier, DefaultDensifier)
     assert (trainer.options.mode, trainer.options.eps2d, trainer.options.near) == (RasterizeMode.ANTIALIASED, 0.1, 0.5)
     assert trainer.options.absgrad
+    assert trainer.options.alpha_min == 0.01
     assert trainer.optimizer.parameters.sh.shape == (40, 9, 3)
     assert (trainer.background, trainer.has_test_views, len(trainer.pictures)) == ("white", True, 5)
     mcmc = assemble(config.model_copy(update={"strategy": McmcStrategy(max_gaussians=30)}))
@@ -121,7 +122,7 @@ def test_times_make_a_dynamic_model(capture: Path, tmp_path: Path) -> None:
     model = assemble(_dynamic(root)).model
     assert isinstance(model, DynamicScene)
     assert model.times == (0.0, 0.25, 0.5, 1.0)
-    assert model.schedule.steps == 12
+    assert model.schedule.rates.steps == 12
     assert isinstance(assemble(_dynamic(root, model=StaticModel())).model, StaticScene)
 
 
@@ -170,6 +171,24 @@ def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: P
     assert len(assemble(config).optimizer.parameters) == len(found.xyz) > 7
     without = config.model_copy(update={"init": PointsInit(num_random=7, triangulate=0)})
     assert len(assemble(without).optimizer.parameters) == 7
+
+
+def test_no_points_are_triangulated_for_what_is_restored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And it goes on as if they had been."""
+    options = DynamicOptions(size=96, num_times=2, num_cameras=8, num_val=0, num_test=0, samples=1)
+    config = _dynamic(write_dynamic_capture("room", tmp_path / "room", options), init=PointsInit(num_random=7))
+    trainer = assemble(config)
+    trainer.step()
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("triangulated again")
+
+    monkeypatch.setattr("dyngs.train.assemble.triangulated_points", refuse)
+    again = assemble(config, restored=True)
+    again.restore(trainer.checkpoint())
+    assert again.step().loss == trainer.step().loss
+    tensors = trainer.checkpoint().tensors
+    assert all(torch.equal(x, tensors[name]) for name, x in again.checkpoint().tensors.items())
 
 
 def test_a_still_blender_scene_begins_with_random_points(capture: Path) -> None:

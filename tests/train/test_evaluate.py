@@ -13,7 +13,7 @@ from moving_scene import TEST_TIMES, Sliding, moving_scene, still_scene, write_m
 
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, StaticModel
-from dyngs.config_io import RESOLVED_NAME, save_config
+from dyngs.config_io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import RasterizeMode
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Picture
@@ -178,6 +178,18 @@ def test_options_are_those_of_training() -> None:
     options = render_options(model)
     assert (options.mode, options.eps2d, options.near) == (RasterizeMode.ANTIALIASED, 0.1, 0.05)
     assert options.depth == "none"
+    assert render_options(StaticModel()) == RenderOptions()
+    cut = render_options(StaticModel(alpha_min=0.02, transmittance_min=0.01))
+    assert (cut.alpha_min, cut.transmittance_min) == (0.02, 0.01)
+
+
+def test_cut_offs_are_the_runs_own_and_runs_from_before_have_the_usual(tmp_path) -> None:
+    run_dir = write_run(tmp_path, some_gaussians())
+    file, config, usual = run_dir / RESOLVED_NAME, load_resolved(run_dir), evaluate_run(run_dir).psnr
+    file.write_text("\n".join(line for line in file.read_text().splitlines() if "_min:" not in line))
+    assert load_resolved(run_dir) == config
+    save_config(load_resolved(run_dir, ["model.alpha_min=0.5"]), file)
+    assert evaluate_run(run_dir).psnr != usual
 
 
 def test_size_is_that_of_the_papers() -> None:

@@ -9,7 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.config import DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, TrainConfig
+from dyngs.static.rates import Rates
 from dyngs.train.schedule import (
+    MAX_GROWTH,
     MIN_RESET_GAP,
     active_sh_degree,
     deform_schedule,
@@ -64,9 +66,9 @@ def test_short_runs_densify_from_a_lower_gradient_on() -> None:
 
 def test_means_rate_is_log_linear_times_the_extent() -> None:
     options = OptimConfig()
-    assert means_rate(options, 0, 7000, 2.0) == pytest.approx(3.2e-4)
-    assert means_rate(options, 3500, 7000, 2.0) == pytest.approx(2 * 1.6e-5)
-    assert means_rate(options, 7000, 7000, 2.0) == pytest.approx(3.2e-6)
+    assert means_rate(options, 0.0, 2.0) == pytest.approx(3.2e-4)
+    assert means_rate(options, 0.5, 2.0) == pytest.approx(2 * 1.6e-5)
+    assert means_rate(options, 1.0, 2.0) == pytest.approx(3.2e-6)
 
 
 @pytest.mark.parametrize(("steps", "every"), [(30_000, 1000), (7000, 233), (2000, 67), (10, 1)])
@@ -84,6 +86,13 @@ def test_mcmc_can_reach_its_cap_at_any_length(steps: int) -> None:
     assert (1 + growth_per_change(McmcStrategy(), steps)) ** changes > 15
 
 
+@pytest.mark.parametrize(("growth", "steps"), [(0.5, 20), (1e300, 1), (1e-300, 1), (0.01, 7000), (0.5, 30_000)])
+def test_growth_is_what_is_asked_or_more_up_to_a_quarter_at_any_length(growth: float, steps: int) -> None:
+    """Powers that no float holds included."""
+    found = growth_per_change(McmcStrategy(growth=growth), steps)
+    assert growth <= found <= max(growth * (1 + 1e-12), MAX_GROWTH)
+
+
 def test_the_filter_is_refreshed_after_densification_only() -> None:
     steps = filter_steps(DefaultStrategy(), 7000)
     assert (steps[0], steps[-1], steps.step) == (3500, 6900, 100)
@@ -95,27 +104,27 @@ def test_the_filter_is_refreshed_after_densification_only() -> None:
 def test_phases_of_a_dynamic_model_come_in_order(steps: int, coarse: float, all_views_at: float) -> None:
     """Coarse, fine, all times, splits; each within the run, and never is there none before motion begins."""
     model = DynamicModel(coarse=coarse, all_views_at=all_views_at)
-    schedule = deform_schedule(model, steps)
-    assert schedule.steps == steps
+    schedule = deform_schedule(model, Rates(steps))
+    assert schedule.rates.steps == steps
     assert 1 <= schedule.fine <= schedule.full <= steps
     assert all(schedule.full < split <= steps for split in schedule.splits)
     assert list(schedule.splits) == sorted(set(schedule.splits))
-    assert deform_schedule(model.model_copy(update={"still_below": 0.0}), steps).splits == ()
+    assert deform_schedule(model.model_copy(update={"still_below": 0.0}), Rates(steps)).splits == ()
 
 
 def test_phases_of_runs_of_usual_lengths() -> None:
     """Splits come after a tenth, three tenths and a half of the steps that see all times."""
-    schedule = deform_schedule(DynamicModel(coarse=0.13, all_views_at=0.4), 20_000)
+    schedule = deform_schedule(DynamicModel(coarse=0.13, all_views_at=0.4), Rates(20_000))
     assert (schedule.fine, schedule.full, schedule.splits) == (2600, 8000, (9200, 11_600, 14_000))
-    assert deform_schedule(DynamicModel(all_views_at=0.69), 1000).splits == (721, 783, 845)
-    assert deform_schedule(DynamicModel(), 1).fine == 1
+    assert deform_schedule(DynamicModel(all_views_at=0.69), Rates(1000)).splits == (721, 783, 845)
+    assert deform_schedule(DynamicModel(), Rates(1)).fine == 1
 
 
 @pytest.mark.parametrize(("steps", "fine"), [(300, 100), (2000, 666), (5000, 1000), (10_000, 1300)])
 def test_short_runs_stay_still_for_longer(steps: int, fine: int) -> None:
     """1000 steps, but no more than a third of the run, unless a larger share is asked for."""
-    assert deform_schedule(DynamicModel(coarse=0.13), steps).fine == fine
-    assert deform_schedule(DynamicModel(coarse=0.5), steps).fine == steps // 2
+    assert deform_schedule(DynamicModel(coarse=0.13), Rates(steps)).fine == fine
+    assert deform_schedule(DynamicModel(coarse=0.5), Rates(steps)).fine == steps // 2
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,44 @@
+#include "cpu/offsets.hpp"
+
+#include "cpu/parallel.hpp"
+
+namespace dyngs {
+namespace {
+
+constexpr int64_t kGrain = 2048;
+
+template <class S>
+void add3(S* to, const S* by) {
+  for (int c = 0; c < 3; ++c) to[c] += by[c];
+}
+
+// The Hamilton product (identity + by) q.
+template <class S>
+void turn(S* q, const S* by) {
+  const S w1 = by[0] + 1, x1 = by[1], y1 = by[2], z1 = by[3], w2 = q[0], x2 = q[1], y2 = q[2], z2 = q[3];
+  q[0] = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2;
+  q[1] = w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2;
+  q[2] = w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2;
+  q[3] = w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2;
+}
+
+}  // namespace
+
+template <class S>
+void add_offsets(const RowOffsets<S>& offsets, const MovedGaussians<S>& gaussians, int threads) {
+  parallel_for(offsets.count, kGrain, threads, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      const int64_t row = offsets.rows ? offsets.rows[i] : i;
+      add3(gaussians.means + 3 * row, offsets.means + 3 * i);
+      if (offsets.quats) turn(gaussians.quats + 4 * row, offsets.quats + 4 * i);
+      if (offsets.log_scales) add3(gaussians.log_scales + 3 * row, offsets.log_scales + 3 * i);
+      if (offsets.logit_opacities) gaussians.logit_opacities[row] += offsets.logit_opacities[i];
+      if (offsets.colors) add3(gaussians.sh + gaussians.sh_stride * row, offsets.colors + 3 * i);
+    }
+  });
+}
+
+template void add_offsets<float>(const RowOffsets<float>&, const MovedGaussians<float>&, int);
+template void add_offsets<double>(const RowOffsets<double>&, const MovedGaussians<double>&, int);
+
+}  // namespace dyngs
