@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +13,7 @@ from dyngs.errors import DyngsError
 if TYPE_CHECKING:
     from dyngs.tradeoff.models import Models
     from dyngs.tradeoff.points import Point
+    from dyngs.tradeoff.ranks import Ranks
     from dyngs.tradeoff.requirements import Goal, Requirement
 
 _EPILOG = """\
@@ -19,9 +22,12 @@ examples:
   dyngs tradeoff runs/dance --vary prune=0.5,0.8 --vary storage --finetune 2000
   dyngs tradeoff runs/dance --require 'psnr>=30,fps>=20,mb<=5' --minimize mb
   dyngs tradeoff configs/static.yaml data.root=scans/bench --out bench_tradeoff     trained first; colours, too
+  torchrun --nproc-per-node 4 -m dyngs tradeoff runs/dance    shared by four processes
 
 Interrupted or repeated, the same command goes on and measures only what lacks. What is measured: docs/tradeoff.md.
 """
+WIDTH = 100
+"""Columns of tables where there is no terminal."""
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -29,8 +35,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = commands.add_parser(
         "tradeoff",
         help="what each knob of a run costs in quality and brings in speed and size",
-        description="Vary a run one knob at a time and then several together; writes tradeoff.csv, .json, .svg and "
-        ".html, and picks the best run within limits.",
+        description="Vary a run one knob at a time and then several together; writes tradeoff.csv, .json, .svg, .png "
+        "and .html, and picks the best run within limits.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -65,6 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from dyngs.tradeoff.knobs import parse_settings
     from dyngs.tradeoff.models import Models
+    from dyngs.tradeoff.ranks import Ranks
     from dyngs.tradeoff.report import write_report
     from dyngs.tradeoff.requirements import parse_goal, parse_requirements
     from dyngs.tradeoff.sweep import Plan, sweep
@@ -72,54 +79,76 @@ def run(arguments: argparse.Namespace) -> int:
     for name, least in (("finetune", 0), ("combine", 0), ("rounds", 1), ("threads", 0)):
         if getattr(arguments, name) < least:
             raise DyngsError(f"--{name} {getattr(arguments, name)}: give a whole number from {least} on")
-    is_run = Path(arguments.target).is_dir()
+    is_run, ranks = Path(arguments.target).is_dir(), Ranks.from_environment()
     settings = parse_settings(arguments.vary, trains=arguments.train or not is_run)
     asked = parse_requirements(arguments.require) if arguments.require is not None else ()
     name = arguments.minimize or arguments.maximize or "psnr"
     goal = parse_goal(name, smallest=arguments.minimize is not None)
-    run_dir = Path(arguments.target) if is_run else _trained(arguments)
-    models = Models(run_dir, arguments.out or run_dir / "tradeoff", arguments.threads)
-    plan = Plan(settings, arguments.finetune, arguments.combine, arguments.split, arguments.rounds)
+    run_dir = Path(arguments.target) if is_run else _trained(arguments, ranks)
+    models = Models(run_dir, arguments.out or run_dir / "tradeoff", arguments.threads or ranks.cores)
+    plan = Plan(settings, arguments.finetune, arguments.combine, arguments.split, arguments.rounds, arguments.threads)
     try:
-        points = sweep(models, plan, print)
+        points = sweep(models, plan, print, ranks)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("what was measured is kept; the same command goes on") from None
+    if not ranks.is_first:
+        return 0
     files = write_report(models.out, points)
+    console = Console(width=None if sys.stdout.isatty() else WIDTH)
     for table in _tables(points):
-        Console().print(table)
+        console.print(table)
     print(f"written: {files[0]} and {', '.join(file.suffix for file in files[1:])}")
     if arguments.require or arguments.minimize or arguments.maximize:
         _choose(points, asked, goal, models)
     return 0
 
 
-def _trained(arguments: argparse.Namespace) -> Path:
-    """The run folder of a config, trained to its end."""
-    from dyngs.config_io import load_config
+def _trained(arguments: argparse.Namespace, ranks: Ranks) -> Path:
+    """The run folder of a config, trained to its end by the first process."""
+    from dyngs.config_io import find_preset, load_config
     from dyngs.tradeoff.models import finished
 
+    try:
+        config = find_preset(Path(arguments.target))
+    except DyngsError as error:
+        raise DyngsError(f"{error}; nor is it the folder of a run") from None
     if arguments.out is None:
-        raise DyngsError("give --out DIR: a config is trained there first")
+        raise DyngsError(f"{arguments.target}: give --out DIR; a config is trained there first")
     folder = arguments.out / "run"
     overrides = [*arguments.overrides, f"run.dir={folder}", f"run.threads={arguments.threads}"]
-    return finished(load_config(Path(arguments.target), overrides), folder)
+    if ranks.is_first:
+        finished(load_config(config, overrides), folder)
+    ranks.wait()
+    return folder
 
 
 def _tables(points: list[Point]) -> list[object]:
-    """Points and exchange rates, for people; LPIPS only where it could be had."""
+    """Points and exchange rates, for people; the files have more."""
+    from rich import box
     from rich.table import Table
 
     from dyngs.tradeoff.front import exchanges
-    from dyngs.tradeoff.report import EXCHANGE_HEAD, TABLE_HEAD, exchange_cells, rows_of, table_cells
+    from dyngs.tradeoff.report import EXCHANGE_HEAD, exchange_cells, rows_of
+
+    def table(title: str, head: Sequence[str]) -> Table:
+        empty = Table(head[0], title=title, box=box.SIMPLE_HEAD)
+        for name in head[1:]:
+            empty.add_column(name, justify="right")
+        return empty
 
     title = f"{points[0].num_views} views; * beaten by no other in PSNR, speed and size"
-    tables = [Table(*TABLE_HEAD, title=title), Table(*EXCHANGE_HEAD, title="each knob alone")]
-    for row in rows_of(points):
-        name, *cells = table_cells(row)
-        tables[0].add_row(f"{'* ' if row.on_front else '  '}{name}", *cells)
+    rows = rows_of(points)
+    optional = ("LPIPS",) if any(row.lpips is not None for row in rows) else ()
+    shown = table(title, ("  changed", "PSNR", "SSIM", *optional, "fps", "speed x", "MB", "RAM MB"))
+    for row in rows:
+        lpips, memory = ("" if x is None else f"{x:.{n}f}" for x, n in ((row.lpips, 4), (row.memory_mb, 0)))
+        quality = (f"{row.psnr:.2f}", f"{row.ssim:.4f}", *(lpips for _ in optional))
+        name = f"{'* ' if row.on_front else '  '}{row.name}"
+        shown.add_row(name, *quality, f"{row.fps:.1f}", f"{row.gain:.2f}", f"{row.mb:.2f}", memory)
+    prices = table("each knob alone", EXCHANGE_HEAD)
     for exchange in exchanges(points[0], points):
-        tables[1].add_row(*exchange_cells(exchange))
-    return list(tables)
+        prices.add_row(*exchange_cells(exchange))
+    return [shown, prices]
 
 
 def _choose(points: list[Point], asked: tuple[Requirement, ...], goal: Goal, models: Models) -> None:
@@ -128,7 +157,7 @@ def _choose(points: list[Point], asked: tuple[Requirement, ...], goal: Goal, mod
     from dyngs.tradeoff.requirements import choose
     from dyngs.tradeoff.sweep import figures_of
 
-    best = choose([f for f in figures_of(points) if f.variant.fits_a_run], asked, goal)
+    best = choose(figures_of(points), asked, goal)
     folder = write_chosen(models, best.variant)
     print(f"chosen:  {best.variant.name}: {best.psnr:.2f} dB, {best.fps:.1f} fps, {best.mb:.2f} MB")
     if best.variant.scale < 1:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import DynamicModel, SceneModel, TrajectoryField
+from dyngs.deform.masks import BITS, KeyMasks
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.storage.order import storage_order
@@ -26,6 +27,7 @@ GAUSSIANS = tuple(field.name for field in fields(Gaussians))
 _TRAINING_ONLY = ("model.near", "model.colour.frozen", "model.field.buffers.neighbours")
 _PER_GAUSSIAN = ("gaussians.", "model.filter_std", "model.anchors.", "model.learned.pose_dirs")
 _PER_MOVING = ("model.field.buffers.followed",)
+_MASKS = "model.masks."
 
 
 def drawable(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -68,7 +70,8 @@ def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     full = dict(tensors)
     base, rest = full.pop("gaussians.sh_base"), full.pop("gaussians.sh_rest")
     full["gaussians.sh"] = torch.cat([base[:, None], rest], dim=1)
-    Gaussians(**{name: full[f"gaussians.{name}"] for name in GAUSSIANS})  # they must fit together
+    gaussians = Gaussians(**{name: full[f"gaussians.{name}"] for name in GAUSSIANS})  # they must fit together
+    _require_fitting_masks(full, len(gaussians))
     for name, x in tensors.items():
         if name.startswith(LEARNED):
             full |= {f"{LEARNED}{moment}.{name[len(LEARNED) :]}": torch.zeros_like(x) for moment in MOMENTS}
@@ -96,7 +99,7 @@ def in_storage_order(tensors: Mapping[str, Tensor], means: np.ndarray, model: Sc
     per_moving = _PER_MOVING
     if isinstance(model, DynamicModel) and isinstance(model.deform, TrajectoryField):
         per_moving = (*_PER_MOVING, LEARNED)
-    others = [n for n in tensors if not n.startswith((*_PER_GAUSSIAN, *per_moving, "model.rows"))]
+    others = [n for n in tensors if not n.startswith((*_PER_GAUSSIAN, *per_moving, "model.rows", _MASKS))]
     if any(x.ndim and len(x) in (len(means), len(rows)) for x in (tensors[name] for name in others)):
         return dict(tensors)
     order = torch.from_numpy(storage_order(means, rows.numpy()))
@@ -109,7 +112,27 @@ def in_storage_order(tensors: Mapping[str, Tensor], means: np.ndarray, model: Sc
             ordered[name] = x[of_moving]
     if "model.rows" in ordered:
         ordered["model.rows"] = torch.arange(len(rows))
+    masks = KeyMasks.restored(_masks(tensors))
+    if masks is not None:
+        ordered |= {f"{_MASKS}{name}": x for name, x in masks.select(order).state().items()}
     return ordered
+
+
+def _masks(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The state of the masks; empty without any."""
+    return {name[len(_MASKS) :]: x for name, x in tensors.items() if name.startswith(_MASKS)}
+
+
+def _require_fitting_masks(tensors: Mapping[str, Tensor], count: int) -> None:
+    """Raises ValueError for masks that are not those of ``count`` Gaussians, KeyError where a part of them lacks."""
+    state = _masks(tensors)
+    if not state:
+        return
+    times, bits = state["times"], state["bits"]
+    ascends = times.ndim == 1 and len(times) > 1 and bool((times[1:] > times[:-1]).all())
+    of_all = bits.dtype == torch.uint8 and bits.shape[1:] == (-(-count // BITS),) and state["count"].tolist() == [count]
+    if not (ascends and of_all and len(bits) == len(times)):
+        raise ValueError("the masks are not those of the Gaussians")
 
 
 def _is_needed(name: str) -> bool:

@@ -107,9 +107,7 @@ def measured_precision(tensors: Mapping[str, Tensor], draw: Draw, max_change: fl
     steps = {}
     for name, group in groups.items():
         share = sum(x.numel() for x in group) / num_values
-        found = _largest_step(lambda step, name=name: change({name: step}), group, allowed * share)
-        if found is not None:
-            steps[name] = found
+        steps[name] = _largest_step(lambda step, name=name: change({name: step}), group, allowed * share)
     return _scaled(steps, change, allowed)
 
 
@@ -129,15 +127,19 @@ def _scaled(steps: dict[str, float], change: Callable[[Mapping[str, float]], flo
     return Precision(kept, math.sqrt(error) * GREY_LEVELS)
 
 
-def _largest_step(change: Callable[[float], float], group: Sequence[Tensor], allowed: float) -> float | None:
-    """The largest step tried that changes the pictures by at most ``allowed``; None: pictures do not depend on it."""
+def _largest_step(change: Callable[[float], float], group: Sequence[Tensor], allowed: float) -> float:
+    """The largest step tried that changes the pictures by at most ``allowed``.
+
+    The first one tried where these pictures do not depend on the group at all: others may.
+    """
     size = max((float(x.abs().max()) for x in group if x.numel()), default=0.0)
     if size == 0:
         return 1.0
     count = sum(x.numel() for x in group)
     mean_square = sum(float(x.double().square().sum()) for x in group) / count
     finest, coarsest = 2 * size / LIMIT, 4 * size
-    step, best = FIRST_STEP * math.sqrt(mean_square), finest
+    step = first = min(max(FIRST_STEP * math.sqrt(mean_square), finest), coarsest)
+    best = finest
     for _ in range(TRIALS):
         step = step_below(min(max(step, finest), coarsest))
         found = change(step)
@@ -146,7 +148,7 @@ def _largest_step(change: Callable[[float], float], group: Sequence[Tensor], all
             if found > CLOSE**2 * allowed or step >= coarsest / 2:
                 break
         step *= min(max(math.sqrt(0.9 * allowed / max(found, 1e-300)), 1 / WIDEST_JUMP), WIDEST_JUMP)
-    return None if best >= coarsest / 2 else best
+    return step_below(first) if best >= coarsest / 2 else best
 
 
 def _groups(tensors: Mapping[str, Tensor]) -> dict[str, list[Tensor]]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from dyngs.tradeoff.knobs import Variant
+from dyngs.tradeoff.knobs import SEVERAL, Variant
 from dyngs.tradeoff.points import Point
 
 NO_GAIN = 0.05
@@ -20,7 +20,7 @@ class Exchange:
     """What one knob costs and brings.
 
     Attributes:
-        knob: its name, "prune + finetune" where fine-tuned.
+        knob: its name, "prune + finetune" where fine-tuned, "storage + field_step".
         db_per_speed, db_per_size: PSNR lost per doubling of the speed, and per halving of the size; None where no value
             of the knob brings any. Negative: it brings both.
         speed, size: the most that a value brings, as factors.
@@ -68,7 +68,7 @@ def exchanges(base: Point, points: Iterable[Point]) -> list[Exchange]:
     """
     groups: dict[str, list[Point]] = {}
     for point in points:
-        if point.variant.knob not in ("", "several"):
+        if point.variant.knob not in ("", SEVERAL):
             groups.setdefault(point.variant.knob, []).append(point)
     return [
         Exchange(
@@ -85,9 +85,9 @@ def exchanges(base: Point, points: Iterable[Point]) -> list[Exchange]:
 def combinations(base: Point, singles: Sequence[Point], count: int) -> list[Variant]:
     """Variants worth measuring next: single changes put together, the cheapest first.
 
-    Three ways are gone from the run on: for speed, for size, and for both as far as a run folder can hold it. Each adds
-    the change that loses least PSNR per factor 2, then the next; a stronger value of a knob takes the place of a weaker
-    one. Ways end after ``count`` steps.
+    Three ways are gone from the run on: for speed, for size, and for both. Each adds the change that loses least PSNR
+    per factor 2, then the next; a stronger value of a knob takes the place of a weaker one. Ways end after ``count``
+    steps.
 
     Args:
         base: the run itself.
@@ -99,8 +99,7 @@ def combinations(base: Point, singles: Sequence[Point], count: int) -> list[Vari
         loss, smaller = base.psnr - point.psnr, base.mb / point.mb
         if loss > TOO_MUCH_DB:
             continue
-        gains = (point.gain, smaller, point.gain * smaller if point.variant.fits_a_run else 1.0)
-        for way, gain in zip(ways, gains, strict=True):
+        for way, gain in zip(ways, (point.gain, smaller, point.gain * smaller), strict=True):
             price = rate(loss, gain)
             if price is not None:
                 way.append((price, point))
@@ -110,7 +109,7 @@ def combinations(base: Point, singles: Sequence[Point], count: int) -> list[Vari
     for way in ways:
         way.sort(key=lambda priced: (priced[0], priced[1].variant.slug))
         for variant in _way(base.variant, [point.variant for _, point in way], order)[:count]:
-            if variant not in known and variant.can_be_made:
+            if variant not in known:
                 found[variant] = None
     return list(found)
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from dyngs.errors import DyngsError
 
 Value = float | int | str
+SEVERAL = "several"
+"""In place of a knob's name, of combinations."""
 AUTO = "auto"
 """Storage as coarse as ``dyngs export --format compact`` takes it by itself."""
 
@@ -20,22 +22,27 @@ class Variant:
 
     Attributes:
         colour: ``colour.kind`` that it is trained anew with.
+        field: ``model.deform.kind`` that it is trained anew with.
+        field_size: how many times as many nodes, channels, neurons or frequencies the field has, trained anew.
         prune: share of the Gaussians removed, by ``sensitivity``.
         masks: key times of the masks of what is seen.
         finetune: training steps after these two.
         sh_degree: harmonics above it are dropped.
         storage: how much pictures may change by rounding, grey levels of 255, or "auto"; None: exact, float32.
-        mode: ``model.rasterize_mode`` that it is drawn with.
-        alpha_min, transmittance_min: of ``dyngs.rendering.RenderOptions``.
+        field_step: how many times as coarsely the field is rounded as ``storage`` has it.
+        mode, alpha_min, transmittance_min: ``model.rasterize_mode`` and so on that it is drawn with.
         scale: sides of the pictures drawn over those shown.
     """
 
     colour: str | None = None
+    field: str | None = None
+    field_size: float = 1.0
     prune: float = 0.0
     masks: int = 0
     finetune: int = 0
     sh_degree: int | None = None
     storage: float | str | None = None
+    field_step: float = 1.0
     mode: str | None = None
     alpha_min: float | None = None
     transmittance_min: float | None = None
@@ -60,16 +67,13 @@ class Variant:
 
     @property
     def knobs(self) -> tuple[str, ...]:
-        """Names of the knobs that are turned; fine-tuning belongs to those before it."""
-        return tuple(key for key, _ in self._items() if key != "finetune")
+        """Names of the knobs that are turned; fine-tuning and the field's steps belong to those before them."""
+        return tuple(key for key, _ in self._items() if key not in ("finetune", "field_step"))
 
     @property
     def knob(self) -> str:
-        """The one knob that is turned, fine-tuned or not; "" of the run itself, "several" of combinations."""
-        names = self.knobs
-        if len(names) > 1:
-            return "several"
-        return "".join(names) + (" + finetune" if self.finetune else "")
+        """The one knob that is turned, with what belongs to it; "" of the run itself, ``SEVERAL`` of combinations."""
+        return SEVERAL if len(self.knobs) > 1 else " + ".join(self.changes)
 
     @property
     def stored(self) -> Variant:
@@ -77,14 +81,9 @@ class Variant:
         return replace(self, mode=None, alpha_min=None, transmittance_min=None, scale=1.0)
 
     @property
-    def fits_a_run(self) -> bool:
-        """A run folder can hold it: configurations know no cut-offs of drawing."""
-        return self.alpha_min is None and self.transmittance_min is None
-
-    @property
-    def can_be_made(self) -> bool:
-        """Masked runs are not stored rounded: what shows of each Gaussian is measured with all of them."""
-        return not (self.masks and self.storage is not None)
+    def trained(self) -> Variant:
+        """The part that is a training from the start."""
+        return Variant(colour=self.colour, field=self.field, field_size=self.field_size)
 
     def merged(self, other: Variant) -> Variant:
         """This one with what ``other`` changes, too."""
@@ -148,6 +147,7 @@ class Knob:
         return value
 
 
+FIELDS = ("trajectory", "hexplane", "mlp", "skeleton")
 KNOBS = (
     Knob("prune", (0.3, 0.5, 0.7, 0.85), low=0.01, high=0.99),
     Knob("masks", (6, 16), low=2, high=1000, whole=True),
@@ -157,7 +157,10 @@ KNOBS = (
     Knob("alpha_min", (0.008, 0.016, 0.032), low=1e-6, high=0.5),
     Knob("transmittance_min", (1e-3, 1e-2, 5e-2), low=1e-6, high=0.5),
     Knob("scale", (0.75, 0.5), low=0.05, high=1.0),
+    Knob("field_step", (4.0, 16.0), low=1 / 64, high=1024),
     Knob("colour", ("sh", "dcac", "auto"), words=("sh", "dcac", "auto"), trains=True),
+    Knob("field", FIELDS, words=FIELDS, trains=True),
+    Knob("field_size", (0.5, 0.25), low=1 / 64, high=64, trains=True),
 )
 
 
@@ -175,27 +178,27 @@ class Traits:
 
     Attributes:
         sh_degree: of its harmonics, 0 where a network colours it.
-        mode: it is drawn with.
+        mode, alpha_min, transmittance_min: it is drawn with.
+        masks: key times that it has.
         colour: kind.
-        moves: a field moves something, so that masks are possible.
-        is_masked: it has masks already.
+        field: kind of what moves something; None: nothing moves.
     """
 
     sh_degree: int
     mode: str
+    alpha_min: float
+    transmittance_min: float
+    masks: int
     colour: str
-    moves: bool
-    is_masked: bool = False
+    field: str | None
 
     def allows(self, knob: Knob, value: Value) -> bool:
         """The value makes sense and is not the run's own."""
         if knob.name == "sh_degree":
             return value < self.sh_degree  # pyright: ignore[reportOperatorIssue]
-        if knob.name == "masks":
-            return self.moves
-        if knob.name == "storage" and self.is_masked:
+        if knob.name in ("masks", "field", "field_size", "field_step") and self.field is None:
             return False
-        own = {"mode": self.mode, "colour": self.colour, "scale": 1.0}
+        own = asdict(self) | {"scale": 1.0, "field_size": 1.0, "field_step": 1.0}
         return own.get(knob.name) != value
 
 
@@ -239,6 +242,8 @@ def single_changes(settings: Sequence[Setting], traits: Traits, finetune: int) -
         for value in setting.values:
             if traits.allows(setting.knob, value):
                 variant = Variant(**{setting.knob.name: value})  # pyright: ignore[reportArgumentType]
+                if setting.knob.name == "field_step":
+                    variant = replace(variant, storage=AUTO)
                 variants.append(variant)
                 if finetune and setting.knob.name in ("prune", "masks"):
                     variants.append(replace(variant, finetune=finetune))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import fmean, median
 
 import numpy as np
@@ -61,16 +61,20 @@ class Quality:
     lpips: float | None
 
 
+def drawn_so(variant: Variant, model: SceneModel) -> SceneModel:
+    """The ``model`` of a run with how a variant of it is drawn."""
+    mode = None if variant.mode is None else RasterizeMode(variant.mode)
+    changes = {
+        "rasterize_mode": mode,
+        "alpha_min": variant.alpha_min,
+        "transmittance_min": variant.transmittance_min,
+    }
+    return model.model_copy(update={name: value for name, value in changes.items() if value is not None})
+
+
 def options_of(variant: Variant, model: SceneModel) -> RenderOptions:
     """How a variant is drawn that changes a run of ``model``."""
-    options = render_options(model)
-    if variant.mode is not None:
-        options = replace(options, mode=RasterizeMode(variant.mode))
-    if variant.alpha_min is not None:
-        options = replace(options, alpha_min=variant.alpha_min)
-    if variant.transmittance_min is not None:
-        options = replace(options, transmittance_min=variant.transmittance_min)
-    return options
+    return render_options(drawn_so(variant, model))
 
 
 def shrunk(cameras: Cameras, scale: float) -> Cameras:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dyngs.config import Config, HumanNetModel
+from dyngs.config import BudgetConfig, CompactConfig, Config, DynamicModel, FieldSection, HumanNetModel, SceneModel
 from dyngs.config_io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.conventions import RasterizeMode, num_sh_terms
-from dyngs.deform.trained import TrainedScene
+from dyngs.config_schema import section_class
+from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.ops.native import kernel_threads
 from dyngs.storage.file import write_scene
 from dyngs.tradeoff.knobs import Traits, Variant
+from dyngs.tradeoff.measure import drawn_so
 from dyngs.train.assemble import assemble
 from dyngs.train.checkpoint import (
     COMPACT_NAME,
@@ -31,6 +32,12 @@ from dyngs.train.metrics import MAX_PSNR
 from dyngs.train.stored import num_bytes_exact, write_compact
 from dyngs.train.trainer import num_cores, train
 
+FIELD_SIZE = {"skeleton": "nodes", "hexplane": "channels", "mlp": "width", "trajectory": "fourier"}
+"""What the size of a field is, by its kind: a key of its section."""
+
+NO_BUDGET = tuple(f"budget.{name}=null" for name in BudgetConfig.model_fields)
+"""Variants are what they are: a limit of the run that they come from would change them again."""
+
 
 @dataclass(frozen=True)
 class Models:
@@ -39,7 +46,7 @@ class Models:
     Attributes:
         run_dir: the run, with a checkpoint.
         out: folder of all that is made.
-        threads: for training and drawing; 0 = all cores.
+        threads: for training, drawing and pruning; 0 = all cores.
     """
 
     run_dir: Path
@@ -63,8 +70,9 @@ class Models:
 
     def _make(self, wanted: Variant, folder: Path) -> None:
         if wanted.storage is not None:
-            exact = self.folder(replace(wanted, storage=None))
-            write_compact(exact, folder, wanted.storage if isinstance(wanted.storage, float) else None)
+            exact = self.folder(replace(wanted, storage=None, field_step=1.0))
+            max_change = wanted.storage if isinstance(wanted.storage, float) else None
+            write_compact(exact, folder, max_change, wanted.field_step)
         elif wanted.sh_degree is not None:
             source = self.folder(replace(wanted, sh_degree=None))
             _write(folder, *_with_degree(source, wanted.sh_degree), source)
@@ -72,32 +80,35 @@ class Models:
             trained = self._finetuned(wanted)
             _write(folder, latest_checkpoint(trained), load_resolved(trained), trained)
         elif wanted.prune or wanted.masks:
-            source = self.folder(Variant(colour=wanted.colour))
+            source = self.folder(wanted.trained)
             _write(folder, *self._compacted(source, wanted), source)
         else:
             trained = self._trained(wanted)
             _write(folder, latest_checkpoint(trained), load_resolved(trained), trained, whole=True)
 
     def _trained(self, wanted: Variant) -> Path:
-        """The run trained anew with other colours."""
+        """The run trained anew with other colours or another field."""
         out = self.out / "training" / wanted.slug
-        overrides = [f"colour.kind={wanted.colour}", f"run.dir={out}", f"run.threads={self.threads}"]
-        return finished(load_resolved(self.run_dir, overrides), out)
+        changes = [*field_changes(load_resolved(self.run_dir).model, wanted)]
+        if wanted.colour is not None:
+            changes.append(f"colour.kind={wanted.colour}")
+        changes += [*NO_BUDGET, f"run.dir={out}", f"run.threads={self.threads}"]
+        return finished(load_resolved(self.run_dir, changes), out)
 
     def _finetuned(self, wanted: Variant) -> Path:
-        source, out = self.folder(Variant(colour=wanted.colour)), self.out / "training" / wanted.slug
+        source, out = self.folder(wanted.trained), self.out / "training" / wanted.slug
         if checkpoint_paths(out):
             return finished(load_resolved(out), out)
-        steps = [f"compact.steps={wanted.finetune}", f"run.threads={self.threads}"]
-        return compact_run(source, out, [*_compaction(wanted), *steps])
+        steps = [*NO_BUDGET, f"compact.steps={wanted.finetune}", f"run.threads={self.threads}"]
+        return compact_run(source, out, [*_compaction(wanted, load_resolved(source).compact), *steps])
 
     def _compacted(self, source: Path, wanted: Variant) -> tuple[Checkpoint, Config]:
         """Pruned and masked, and nothing trained after it."""
         checkpoint = latest_checkpoint(source)
-        overrides = [f"train.steps={checkpoint.info.step}", "budget.max_minutes=null", *_compaction(wanted)]
-        config = load_resolved(source, overrides)
+        changes = [f"train.steps={checkpoint.info.step}", *NO_BUDGET]
+        config = load_resolved(source, [*changes, *_compaction(wanted, load_resolved(source).compact)])
         with kernel_threads(self.threads or num_cores()):
-            trainer = assemble(config)
+            trainer = assemble(config, restored=True)
             trainer.restore(checkpoint)
             compact_(trainer)
             return trainer.checkpoint(), config
@@ -120,9 +131,16 @@ def traits(run_dir: Path) -> Traits:
     if isinstance(config.model, HumanNetModel):
         raise DyngsError(f"{run_dir}: a network, not a scene; vary what it predicts")
     scene = load_run(run_dir).scene
-    moves = isinstance(scene, TrainedScene) and not scene.is_still
-    is_masked = isinstance(scene, TrainedScene) and scene.masks is not None
-    return Traits(scene.gaussians.sh_degree, config.model.rasterize_mode.value, config.colour.kind, moves, is_masked)
+    model = config.model
+    return Traits(
+        sh_degree=scene.gaussians.sh_degree,
+        mode=model.rasterize_mode.value,
+        alpha_min=model.alpha_min,
+        transmittance_min=model.transmittance_min,
+        masks=config.compact.masks,
+        colour=config.colour.kind,
+        field=model.deform.kind if isinstance(model, DynamicModel) and not scene.is_still else None,
+    )
 
 
 def megabytes_on_disk(folder: Path) -> float:
@@ -136,31 +154,42 @@ def write_chosen(models: Models, variant: Variant) -> Path:
     """The folder of a run that is drawn as the variant says, by every command: what was made, and its configuration.
 
     Pictures that are drawn smaller are so by ``data.downscale`` and ``data.longest_side``.
-
-    Raises:
-        DyngsError: no run folder can hold the variant.
     """
-    if not variant.fits_a_run:
-        raise DyngsError(f"{variant.name}: configurations know no cut-offs of drawing; it cannot be written as a run")
     made, out = models.folder(variant), models.out / "chosen" / variant.slug
     config = load_resolved(made)
-    model, data = config.model, config.data
-    if variant.mode is not None:
-        model = model.model_copy(update={"rasterize_mode": RasterizeMode(variant.mode)})
+    model, data = drawn_so(variant, config.model), config.data
     if variant.scale < 1:
         longest = None if data.longest_side is None else max(1, round(data.longest_side * variant.scale))
         data = data.model_copy(update={"downscale": data.downscale / variant.scale, "longest_side": longest})
-    drawn_so = config.model_copy(update={"model": model, "data": data})
+    chosen = config.model_copy(update={"model": model, "data": data})
     if is_compact(made):
         write_scene(out / COMPACT_NAME, (made / COMPACT_NAME).read_bytes())
-        save_config(drawn_so, out / RESOLVED_NAME)
+        save_config(chosen, out / RESOLVED_NAME)
     else:
-        _write(out, latest_checkpoint(made), drawn_so, made)
+        _write(out, latest_checkpoint(made), chosen, made)
     return out
 
 
-def _compaction(wanted: Variant) -> Sequence[str]:
-    return (f"compact.prune={wanted.prune}", f"compact.masks={wanted.masks}", f"compact.max_loss={MAX_PSNR}")
+def _compaction(wanted: Variant, own: CompactConfig) -> Sequence[str]:
+    """Overrides of the last stage; masks are the run's ``own`` where no others are wanted."""
+    masks = (f"compact.masks={wanted.masks or own.masks}", f"compact.mask_below={own.mask_below}")
+    return (f"compact.prune={wanted.prune}", f"compact.max_loss={MAX_PSNR}", *masks)
+
+
+def field_changes(model: SceneModel, wanted: Variant) -> Iterator[str]:
+    """Overrides that make a field of another kind, which moves the same attributes, or of another size."""
+    if not isinstance(model, DynamicModel):
+        return
+    field, kind = model.deform, wanted.field or model.deform.kind
+    if kind != field.kind:
+        moves = FieldSection.model_fields
+        field = section_class(DynamicModel.model_fields["deform"], kind)(
+            **{name: getattr(field, name) for name in moves}
+        )
+        yield f"model.deform.kind={kind}"
+        yield from (f"model.deform.{name}={str(getattr(field, name)).lower()}" for name in moves)
+    size = round(wanted.field_size * getattr(field, FIELD_SIZE[kind]))
+    yield f"model.deform.{FIELD_SIZE[kind]}={max(1, size)}"
 
 
 def _with_degree(source: Path, degree: int) -> tuple[Checkpoint, Config]:

@@ -1,13 +1,14 @@
-"""The plot of a sweep as SVG: PSNR against speed and against size, each point with its name."""
+"""The plot of a sweep: PSNR against speed and against size."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from html import escape
 
+from dyngs.tradeoff.canvas import Dot, Drawing, Label, Line, Shape
 from dyngs.tradeoff.front import pareto
+from dyngs.tradeoff.knobs import SEVERAL
 from dyngs.tradeoff.requirements import Figures
 
 PANEL = (520, 400)
@@ -27,9 +28,13 @@ COLOURS = (
     "#997755",
     "#7755dd",
     "#009988",
-    "#bbbbbb",
+    "#ee3399",
+    "#88aa22",
+    "#cc3311",
+    "#0077bb",
+    "#555555",
 )
-"""The run itself first, combinations last."""
+"""The run itself first."""
 HEADROOM = 0.06
 
 
@@ -59,32 +64,27 @@ class _Axis:
         return [k * step for k in range(first, math.floor(self.high / step) + 1)]
 
 
-def svg(points: Sequence[Figures]) -> str:
-    """A picture of two panels side by side and a legend; the line in each joins what nothing beats in both its axes.
-
-    Hollow points cannot be written as a run. Values that are not above 0 are left out of logarithmic axes.
+def plot(points: Sequence[Figures]) -> Drawing:
+    """Two panels side by side and a legend: a thin line joins the values of a knob, in order, with the run itself; the
+    thick grey one what nothing beats in both axes. Values that are not above 0 are left out of logarithmic axes.
 
     Args:
         points: the run itself first.
     """
-    knobs = list(dict.fromkeys(p.variant.knob for p in points if p.variant.knob != "several"))
-    colours = {knob: COLOURS[min(i, len(COLOURS) - 2)] for i, knob in enumerate(knobs)} | {"several": COLOURS[-1]}
-    if any(p.variant.knob == "several" for p in points):
-        knobs.append("several")
+    knobs = list(dict.fromkeys(p.variant.knob for p in points if p.variant.knob != SEVERAL))
+    colours = {knob: COLOURS[i % len(COLOURS)] for i, knob in enumerate(knobs)} | {SEVERAL: "#888888"}
+    if any(p.variant.knob == SEVERAL for p in points):
+        knobs.append(SEVERAL)
     rows = math.ceil(len(knobs) / PER_ROW)
     width, height = 2 * PANEL[0], PANEL[1] + rows * LEGEND_ROW + 8
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
-        'font-family="sans-serif" font-size="12">',
-        f'<rect width="{width}" height="{height}" fill="white"/>',
+    shapes = [
         *_panel(points, colours, 0, ("speed", "frames per second (more is better)", lambda p: p.fps), 1),
         *_panel(points, colours, PANEL[0], ("size", "MB on disk (less is better)", lambda p: p.mb), -1),
     ]
     for i, knob in enumerate(knobs):
         x, y = LEFT + (i % PER_ROW) * (width - LEFT) / PER_ROW, PANEL[1] + 12 + LEGEND_ROW * (i // PER_ROW)
-        parts.append(f'<circle cx="{x:.1f}" cy="{y - 4:.1f}" r="5" fill="{colours[knob]}"/>')
-        parts.append(f'<text x="{x + 10:.1f}" y="{y:.1f}">{escape(knob or "the run itself")}</text>')
-    return "\n".join([*parts, "</svg>"]) + "\n"
+        shapes += [Dot(x, y - 4, 5, colours[knob]), Label(x + 10, y, knob or "the run itself")]
+    return Drawing(width, height, shapes)
 
 
 def _panel(
@@ -93,7 +93,7 @@ def _panel(
     left: float,
     what: tuple[str, str, Callable[[Figures], float]],
     sign: int,
-) -> list[str]:
+) -> list[Shape]:
     """One plot; ``sign``: of the goal along x."""
     title, label, value = what
     shown = [p for p in points if value(p) > 0]
@@ -102,34 +102,33 @@ def _panel(
     low, high = _wider([value(p) for p in shown], logarithmic=True)
     across = _Axis(low, high, left + LEFT, left + PANEL[0] - RIGHT, True)
     up = _Axis(*_wider([p.psnr for p in shown], logarithmic=False), PANEL[1] - BOTTOM, TOP, False)
-    parts = [f'<text x="{across.start:.1f}" y="20" font-weight="bold">PSNR and {title}</text>']
+    places = {p.variant: (across.at(value(p)), up.at(p.psnr)) for p in shown}
+    best = pareto([(p.psnr, sign * value(p)) for p in shown])
+    front = sorted({places[p.variant] for p, is_best in zip(shown, best, strict=True) if is_best})
+    shapes = [*_frame(across, up, f"PSNR and {title}", label), Line(tuple(front), "#d4d4d4", 5)]
+    for knob, colour in colours.items():
+        if knob not in ("", SEVERAL):
+            turned = tuple(places[p.variant] for p in shown if p.variant.knob in ("", knob))
+            shapes.append(Line(turned, colour, 0.75))
+    for p in reversed(shown):  # the run itself on top
+        tip = f"{p.variant.name}: {p.psnr:.2f} dB, {p.fps:.1f} fps, {p.mb:.2f} MB"
+        shapes.append(Dot(*places[p.variant], 6.5 if not p.variant.knob else 5, colours[p.variant.knob], tip))
+    return shapes
+
+
+def _frame(across: _Axis, up: _Axis, title: str, label: str) -> list[Shape]:
+    """Grid, numbers and words around a panel."""
+    shapes: list[Shape] = [Label(across.start, 20, title, size=13, bold=True), Label(across.start - 44, TOP - 8, "dB")]
     for tick in across.ticks():
         x = across.at(tick)
-        parts.append(f'<line x1="{x:.1f}" y1="{up.start}" x2="{x:.1f}" y2="{up.end}" stroke="#dddddd"/>')
-        parts.append(f'<text x="{x:.1f}" y="{up.start + 16}" text-anchor="middle">{tick:.3g}</text>')
+        shapes.append(Line(((x, up.start), (x, up.end)), "#e4e4e4", 1))
+        shapes.append(Label(x, up.start + 16, f"{tick:,.6g}", "middle"))
     for tick in up.ticks():
         y = up.at(tick)
-        parts.append(f'<line x1="{across.start}" y1="{y:.1f}" x2="{across.end}" y2="{y:.1f}" stroke="#dddddd"/>')
-        parts.append(f'<text x="{across.start - 6}" y="{y + 4:.1f}" text-anchor="end">{tick:.4g}</text>')
+        shapes.append(Line(((across.start, y), (across.end, y)), "#e4e4e4", 1))
+        shapes.append(Label(across.start - 6, y + 4, f"{tick:,.6g}", "end"))
     middle = (across.start + across.end) / 2
-    parts.append(f'<text x="{middle:.1f}" y="{up.start + 34}" text-anchor="middle">{label}, logarithmic</text>')
-    parts.append(f'<text x="{left + 14:.1f}" y="{TOP - 8}" font-size="11">dB</text>')
-    best = pareto([(p.psnr, sign * value(p)) for p in shown])
-    line = sorted({(value(p), p.psnr) for p, is_best in zip(shown, best, strict=True) if is_best})
-    joined = " ".join(f"{across.at(x):.1f},{up.at(y):.1f}" for x, y in line)
-    parts.append(f'<polyline points="{joined}" fill="none" stroke="#888888" stroke-width="1.5"/>')
-    for point in reversed(shown):  # the run itself on top
-        colour, radius = colours[point.variant.knob], 6 if not point.variant.knob else 4.5
-        fill = colour if point.variant.fits_a_run else "white"
-        parts.append(
-            f'<circle cx="{across.at(value(point)):.1f}" cy="{up.at(point.psnr):.1f}" r="{radius}" fill="{fill}" '
-            f'stroke="{colour}" stroke-width="2"><title>{escape(_tip(point))}</title></circle>'
-        )
-    return parts
-
-
-def _tip(p: Figures) -> str:
-    return f"{p.variant.name}: {p.psnr:.2f} dB, {p.fps:.1f} fps, {p.mb:.2f} MB"
+    return [*shapes, Label(middle, up.start + 34, f"{label}, logarithmic", "middle")]
 
 
 def _wider(values: Sequence[float], *, logarithmic: bool) -> tuple[float, float]:

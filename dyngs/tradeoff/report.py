@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
 
-from dyngs.data.write import write_text
+from dyngs.data.write import write_image, write_text
 from dyngs.tradeoff.front import Exchange, exchanges, on_front
-from dyngs.tradeoff.plot import svg
+from dyngs.tradeoff.plot import plot
 from dyngs.tradeoff.points import Point
 from dyngs.tradeoff.sweep import figures_of
 
@@ -38,7 +38,6 @@ class Row:
         ms: median of one picture, as it was measured.
         mb, memory_mb, gaussians: see ``Point``.
         on_front: no other point is as good in PSNR, speed and size.
-        fits_a_run: it can be written as a run folder.
     """
 
     name: str
@@ -54,7 +53,6 @@ class Row:
     memory_mb: float | None
     gaussians: int
     on_front: bool
-    fits_a_run: bool
 
 
 def rows_of(points: Sequence[Point]) -> list[Row]:
@@ -78,21 +76,22 @@ def rows_of(points: Sequence[Point]) -> list[Row]:
                     memory_mb=point.memory_mb,
                     gaussians=point.num_gaussians,
                     on_front=front,
-                    fits_a_run=point.variant.fits_a_run,
                 )
             )
     return rows
 
 
 def write_report(out: Path, points: Sequence[Point]) -> list[Path]:
-    """``tradeoff.csv``, ``.json``, ``.svg`` and ``.html`` in ``out``; the page needs nothing beside it, and no network.
+    """``tradeoff.csv``, ``.json``, ``.svg``, ``.html`` and ``.png`` in ``out``.
+
+    The page needs nothing beside it, and no network.
 
     Args:
         out: folder.
         points: timed, the run itself first.
     """
     rows, found = rows_of(points), exchanges(points[0], points)
-    picture = svg(figures_of(points))
+    drawing = plot(figures_of(points))
     table = io.StringIO()
     writer = csv.DictWriter(table, list(asdict(rows[0])), lineterminator="\n")
     writer.writeheader()
@@ -105,30 +104,41 @@ def write_report(out: Path, points: Sequence[Point]) -> list[Path]:
     texts = {
         "csv": table.getvalue(),
         "json": json.dumps(values, indent=2, allow_nan=False) + "\n",
-        "svg": picture,
-        "html": _page(rows, found, picture),
+        "svg": drawing.svg(),
+        "html": _page(rows, found, drawing.svg()),
     }
     for suffix, text in texts.items():
         write_text(out / f"{STEM}.{suffix}", text)
-    return [out / f"{STEM}.{suffix}" for suffix in texts]
+    write_image(out / f"{STEM}.png", drawing.pixels())
+    return [out / f"{STEM}.{suffix}" for suffix in (*texts, "png")]
 
 
-def table_cells(row: Row) -> tuple[str, ...]:
-    """What people read of a row, below ``TABLE_HEAD``."""
+def _table_cells(row: Row) -> tuple[str, ...]:
+    """What people read of a row, below ``_TABLE_HEAD``."""
     return (
         row.name,
         f"{row.psnr:.2f}",
         f"{row.ssim:.4f}",
-        "" if row.lpips is None else f"{row.lpips:.4f}",
+        "-" if row.lpips is None else f"{row.lpips:.4f}",
         f"{row.fps:.1f}",
         f"{row.gain:.2f} ({row.gain_low:.2f} to {row.gain_high:.2f})",
         f"{row.mb:.2f}",
-        "" if row.memory_mb is None else f"{row.memory_mb:.0f}",
+        "-" if row.memory_mb is None else f"{row.memory_mb:.0f}",
         f"{row.gaussians:,}",
     )
 
 
-TABLE_HEAD = ("changed", "PSNR dB", "SSIM", "LPIPS", "fps", "times as fast (quartiles)", "MB", "memory MB", "Gaussians")
+_TABLE_HEAD = (
+    "changed",
+    "PSNR dB",
+    "SSIM",
+    "LPIPS",
+    "fps",
+    "times as fast (quartiles)",
+    "MB",
+    "memory MB",
+    "Gaussians",
+)
 
 
 def exchange_cells(exchange: Exchange) -> tuple[str, ...]:
@@ -152,15 +162,15 @@ EXCHANGE_HEAD = (
 
 
 def _page(rows: Sequence[Row], found: Sequence[Exchange], picture: str) -> str:
-    body = [_line("th", TABLE_HEAD), *(_line("td", table_cells(row), front=row.on_front) for row in rows)]
+    body = [_line("th", _TABLE_HEAD), *(_line("td", _table_cells(row), front=row.on_front) for row in rows)]
     prices = [_line("th", EXCHANGE_HEAD), *(_line("td", exchange_cells(exchange)) for exchange in found)]
     return "\n".join(
         [
             '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Tradeoff</title>',
             f"<style>{_STYLE}</style></head><body><h1>What each knob costs and brings</h1>",
             picture,
-            "<p>The lines join what nothing beats in both axes. Hollow: only by cut-offs of drawing, which no run "
-            "folder can hold. Rest the pointer on a point for its name.</p>",
+            "<p>The thick lines join what nothing beats in both axes, thin ones the values of a knob in their order. "
+            "Rest the pointer on a point for its name.</p>",
             "<h2>Knobs, each alone</h2><table>",
             *prices,
             "</table><h2>Points</h2><p>Shaded: beaten by no other in PSNR, speed and size together.</p><table>",

@@ -134,7 +134,7 @@ def _what_binds(points: Sequence[Figures], requirements: Sequence[Requirement], 
         if fitting:
             nearest = min(fitting, key=lambda p: (_miss(binding, p), goal.key(p)))
             relaxed.append(
-                f"{binding} binds: with the others {nearest.value(binding.name):.4g} ({nearest.variant.name})"
+                f"{binding} binds: with the others {nearest.value(binding.name):.5g} ({nearest.variant.name})"
             )
     if not relaxed:
         relaxed = [f"{r} alone: {_best_of(points, r)}" for r in requirements]
@@ -152,4 +152,4 @@ def _best_of(points: Sequence[Figures], requirement: Requirement) -> str:
     known = [value for p in points if (value := p.value(requirement.name)) is not None]
     if not known:
         return "not measured here"
-    return f"the best is {min(known) if requirement.at_most else max(known):.4g}"
+    return f"the best is {min(known) if requirement.at_most else max(known):.5g}"

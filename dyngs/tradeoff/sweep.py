@@ -22,6 +22,7 @@ from dyngs.tradeoff.measure import Drawer, options_of, quality, race
 from dyngs.tradeoff.memory import MemoryMeter
 from dyngs.tradeoff.models import Models, megabytes_on_disk, traits
 from dyngs.tradeoff.points import Point, read_point, write_point
+from dyngs.tradeoff.ranks import ALONE, Ranks
 from dyngs.tradeoff.requirements import Figures
 from dyngs.train.background import evaluation_background
 from dyngs.train.checkpoint import checkpoint_paths, load_run
@@ -47,6 +48,7 @@ class Plan:
         combine: combinations along each of three ways, see ``front.combinations``.
         split: "test", "val" or "train".
         rounds: how often each timed view is drawn.
+        threads: while speed is measured; 0 = all cores.
         lpips_net: backbone of LPIPS.
     """
 
@@ -55,26 +57,33 @@ class Plan:
     combine: int = 4
     split: str = "test"
     rounds: int = 5
+    threads: int = 0
     lpips_net: LpipsNet = "alex"
 
 
-def sweep(models: Models, plan: Plan, say: Callable[[str], None]) -> list[Point]:
+def sweep(models: Models, plan: Plan, say: Callable[[str], None], ranks: Ranks = ALONE) -> list[Point]:
     """All points, the run itself first; those kept in ``models.out / "points"`` are not measured again.
 
     Args:
         models: the run and where its variants go.
         plan: what is measured.
         say: takes a line per point.
+        ranks: processes that call this together.
 
     Raises:
         DyngsError: no such run or split, or the folder holds points of something else.
     """
-    with kernel_threads(models.threads or num_cores()), MemoryMeter() as meter:
+    with MemoryMeter() as meter:
         bench = _Bench(models, plan, meter, say)
-        singles = [Variant(), *single_changes(plan.settings, traits(models.run_dir), plan.finetune)]
-        points = bench.timed([bench.point(variant) for variant in singles])
+        _require_same_source(models, plan, is_first=ranks.is_first)
+        own = traits(models.run_dir)
+        idle = [s.knob.name for s in plan.settings if not any(own.allows(s.knob, value) for value in s.values)]
+        if idle and ranks.is_first:
+            say(f"nothing to vary in this run: {', '.join(idle)}")
+        singles = [Variant(), *single_changes(plan.settings, own, plan.finetune)]
+        points = bench.measured(singles, ranks)
         together = combinations(points[0], points[1:], plan.combine)
-        return bench.timed([*points, *(bench.point(variant) for variant in together)])
+        return bench.measured([*singles, *together], ranks)
 
 
 def figures_of(points: Sequence[Point]) -> list[Figures]:
@@ -97,7 +106,18 @@ class _Bench:
         self._loader = PictureLoader(split_views(self._capture, plan.split), config.data)
         self._background = evaluation_background(config.data.background, self._capture.has_alpha)[1]
         self._lpips = load_lpips(plan.lpips_net)
-        _require_same_source(models, plan)
+
+    def measured(self, variants: Sequence[Variant], ranks: Ranks) -> list[Point]:
+        """The points of ``variants``: each process makes its share, then the first measures the speed of all."""
+        with kernel_threads(self._models.threads or num_cores()):
+            for variant in ranks.share(variants):
+                self.point(variant)
+        ranks.wait()
+        if ranks.is_first:
+            with kernel_threads(self._plan.threads or num_cores()):
+                self._time([self.point(variant) for variant in variants])
+        ranks.wait()
+        return [self.point(variant) for variant in variants]
 
     def point(self, variant: Variant) -> Point:
         """The point of a variant, its speed perhaps not measured yet."""
@@ -121,10 +141,10 @@ class _Bench:
         self._say(f"{variant.name}: {point.psnr:.2f} dB, {point.num_gaussians:,} Gaussians, {point.mb:.2f} MB")
         return point
 
-    def timed(self, points: Sequence[Point]) -> list[Point]:
-        """The same with their speeds, measured in turn with the first where they lack."""
-        lacking = [point for point in points if point.speed is None and point.variant != Variant()]
-        first, measured = points[0], dict[Variant, Point]()
+    def _time(self, points: Sequence[Point]) -> None:
+        """Measure speeds, in turn with the first, where they lack."""
+        lacking = [point for point in points[1:] if point.speed is None]
+        first = points[0]
         groups = [lacking[i : i + SERIES] for i in range(0, len(lacking), SERIES)]
         if first.speed is None and not groups:
             groups = [[]]
@@ -133,13 +153,10 @@ class _Bench:
             self._say(f"timing {len(group) + 1} variants in turn")
             together = [first, *group]
             speeds = race([self._drawer(p.variant) for p in together], pictures, self._plan.rounds)
-            if first.speed is not None:
-                together, speeds = together[1:], speeds[1:]
             for point, speed in zip(together, speeds, strict=True):
-                measured[point.variant] = replace(point, speed=speed)
-                write_point(self._path(point.variant), measured[point.variant])
-            first = measured.get(first.variant, first)
-        return [measured.get(point.variant, point) for point in points]
+                if point.speed is None:
+                    write_point(self._path(point.variant), replace(point, speed=speed))
+            first = self.point(first.variant)
 
     def _drawer(self, variant: Variant) -> Drawer:
         run = load_run(self._models.folder(variant))
@@ -153,8 +170,8 @@ class _Bench:
         return self._models.out / "points" / f"{variant.slug}.json"
 
 
-def _require_same_source(models: Models, plan: Plan) -> None:
-    """Note what is measured; points of another run, or of one that was trained on, must not mix with these."""
+def _require_same_source(models: Models, plan: Plan, *, is_first: bool) -> None:
+    """The first process notes what is measured: points of another run, or of one that was trained on, must not mix."""
     newest = checkpoint_paths(models.run_dir)[-1]
     source = {
         "run": str(models.run_dir.absolute()),
@@ -164,7 +181,8 @@ def _require_same_source(models: Models, plan: Plan) -> None:
     }
     path = models.out / SOURCE_NAME
     if not path.is_file():
-        write_text(path, json.dumps(source, indent=2) + "\n")
+        if is_first:
+            write_text(path, json.dumps(source, indent=2) + "\n")
         return
     try:
         known = cast(object, json.loads(path.read_text(encoding="utf-8")))

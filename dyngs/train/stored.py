@@ -20,7 +20,7 @@ from dyngs.data.read import read_capture
 from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.rendering import RenderOptions, contributions
-from dyngs.storage.drawable import drawable
+from dyngs.storage.drawable import LEARNED, drawable
 from dyngs.storage.file import SceneInfo, encoded, write_scene
 from dyngs.storage.precision import GREY_LEVELS, Precision, assumed_precision, coarseness_of, measured_precision
 from dyngs.storage.tensors import COARSENESS
@@ -65,7 +65,7 @@ class _Shot:
     time: float | None
 
 
-def write_compact(run_dir: Path, out: Path, max_change: float | None = None) -> CompactRun:
+def write_compact(run_dir: Path, out: Path, max_change: float | None = None, field_step: float = 1.0) -> CompactRun:
     """The file in the folder ``out``, with the run's ``config.yaml`` beside it: together a run that can be drawn.
 
     Args:
@@ -73,6 +73,7 @@ def write_compact(run_dir: Path, out: Path, max_change: float | None = None) -> 
         out: a folder, made where it is missing; it may be the run's own.
         max_change: root mean square over all values of some training pictures, grey levels of 255. None: what lowers
             their PSNR by ``LOSS_DB``, if it is independent of the model's own errors.
+        field_step: how many times as coarsely as that the field is rounded.
 
     Raises:
         DyngsError: no such run, or the file cannot be written.
@@ -80,7 +81,8 @@ def write_compact(run_dir: Path, out: Path, max_change: float | None = None) -> 
     config = load_resolved(run_dir)
     checkpoint = latest_checkpoint(run_dir)
     tensors, precision = precision_of(config, checkpoint, max_change)
-    data = encoded(SceneInfo(**asdict(checkpoint.info)), tensors, config.model, precision.steps)
+    steps = {name: step * (field_step if name.startswith(LEARNED) else 1) for name, step in precision.steps.items()}
+    data = encoded(SceneInfo(**asdict(checkpoint.info)), tensors, config.model, steps)
     write_scene(out / COMPACT_NAME, data)
     if out.resolve() != run_dir.resolve():
         save_config(config, out / RESOLVED_NAME)

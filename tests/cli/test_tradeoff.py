@@ -22,7 +22,8 @@ def test_a_table_files_and_a_chosen_run(tmp_path: Path, capsys: pytest.CaptureFi
     text = capsys.readouterr().out
     for word in ("as it is", "scale=0.5", "storage=2", "each knob alone", "tradeoff.csv", "chosen:"):
         assert word in text
-    assert {f.name for f in out.iterdir()} >= {f"tradeoff.{suffix}" for suffix in ("csv", "json", "svg", "html")}
+    assert max(len(line) for line in text.splitlines() if str(out) not in line) <= 100
+    assert {f.name for f in out.iterdir()} >= {f"tradeoff.{suffix}" for suffix in ("csv", "json", "svg", "html", "png")}
     (chosen,) = (out / "chosen").iterdir()
     assert len(load_run(chosen).scene) == 5
     error = error_line(capsys, *words, "--require", "mb<=0.000001")
@@ -33,6 +34,7 @@ def test_a_table_files_and_a_chosen_run(tmp_path: Path, capsys: pytest.CaptureFi
     ("words", "part"),
     [
         ("nowhere", "nowhere: no such preset"),
+        ("nowhere", "nor is it the folder of a run"),
         ("static data.root=x", "give --out DIR"),
         (". --vary prun", "no such knob"),
         (". --require psnr>30", "is no condition"),

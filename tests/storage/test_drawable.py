@@ -9,6 +9,7 @@ from tiny_fields import KINDS, cloud, stirred_field, tiny_options, tiny_setup
 
 from dyngs.config import DynamicModel, StaticModel
 from dyngs.deform.fields import field_state
+from dyngs.deform.masks import KeyMasks
 from dyngs.deform.trained import trained_scene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -93,3 +94,43 @@ def test_what_is_not_finite_is_refused() -> None:
     tensors["gaussians.means"][1, 1] = torch.nan
     with pytest.raises(DyngsError, match="means is not finite"):
         drawable(tensors)
+
+
+def masked_tensors() -> tuple[dict[str, torch.Tensor], DynamicModel]:
+    """As ``moving_tensors``; each Gaussian is seen at one of three key times."""
+    tensors, model = moving_tensors("trajectory")
+    masks = KeyMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])
+    return tensors | {f"model.masks.{name}": x for name, x in masks.state().items()}, model
+
+
+def test_masks_follow_their_gaussians() -> None:
+    tensors, model = masked_tensors()
+    kept = drawable(tensors)
+    stored = in_storage_order(kept, kept["gaussians.means"].numpy(), model)
+    assert not torch.equal(stored["gaussians.means"], kept["gaussians.means"])
+    for time in (0.1, 0.8):
+        expected = picture(tensors, model, time)
+        torch.testing.assert_close(picture(completed(stored), model, time), expected, atol=1e-5, rtol=0)
+        unmasked = {name: x for name, x in tensors.items() if not name.startswith("model.masks.")}
+        assert not torch.allclose(picture(unmasked, model, time), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("times", torch.tensor(0.5)),
+        ("times", torch.tensor([0.0, 0.5, 0.5])),
+        ("times", torch.tensor([0.0, 1.0])),
+        ("bits", torch.zeros(3, 1, dtype=torch.uint8)),
+        ("bits", torch.zeros(3, 2, dtype=torch.int64)),
+        ("count", torch.tensor([8])),
+        ("count", torch.tensor([[9, 9]])),
+    ],
+)
+def test_masks_of_other_gaussians_are_refused(name: str, value: torch.Tensor) -> None:
+    tensors, model = masked_tensors()
+    kept = drawable(tensors)
+    stored = in_storage_order(kept, kept["gaussians.means"].numpy(), model)
+    completed(stored)
+    with pytest.raises(ValueError, match="masks are not those of the Gaussians"):
+        completed(stored | {f"model.masks.{name}": value})

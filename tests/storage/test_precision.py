@@ -46,6 +46,15 @@ def test_more_change_makes_larger_steps() -> None:
     assert fine["gaussians.sh_rest"] < coarse["gaussians.sh_rest"]
 
 
+def test_what_does_not_show_is_kept_finely_but_not_for_nothing() -> None:
+    def draw_grey(state: Mapping[str, Tensor]) -> list[Tensor]:
+        return draw(dict(state) | {"gaussians.sh": torch.zeros_like(state["gaussians.sh"])})
+
+    mean_size = float(drawable(tensors())["gaussians.sh_rest"].square().mean().sqrt())
+    step = measured_precision(tensors(), draw_grey, 1.0).steps["gaussians.sh_rest"]
+    assert mean_size / 128 < step < mean_size / 8
+
+
 def test_without_pictures_steps_follow_the_size_of_gaussians() -> None:
     small = assumed_precision(tensors()).steps
     larger = tensors()

@@ -22,8 +22,13 @@ VARIANTS = st.builds(
     mode=st.sampled_from([None, "antialiased"]),
     alpha_min=st.sampled_from([None, 0.01]),
     scale=st.sampled_from([1.0, 0.5]),
+    field=st.sampled_from([None, "mlp"]),
+    field_size=st.sampled_from([1.0, 0.5]),
+    field_step=st.sampled_from([1.0, 4.0]),
 )
-DYNAMIC = Traits(sh_degree=2, mode="classic", colour="sh", moves=True)
+DYNAMIC = Traits(
+    sh_degree=2, mode="classic", alpha_min=1 / 255, transmittance_min=1e-4, masks=0, colour="sh", field="skeleton"
+)
 
 
 @given(VARIANTS)
@@ -50,8 +55,7 @@ def test_what_lies_on_disk_does_not_depend_on_drawing() -> None:
     drawn = Variant(mode="antialiased", alpha_min=0.01, transmittance_min=0.01, scale=0.5)
     assert drawn.stored == Variant()
     assert replace(drawn, prune=0.5).stored == Variant(prune=0.5)
-    assert not drawn.fits_a_run
-    assert Variant(mode="antialiased", scale=0.5, prune=0.3).fits_a_run
+    assert replace(drawn, colour="sh", field="mlp", prune=0.5).trained == Variant(colour="sh", field="mlp")
 
 
 def test_the_knob_of_a_variant() -> None:
@@ -59,6 +63,7 @@ def test_the_knob_of_a_variant() -> None:
     assert Variant().name == "as it is"
     assert Variant(prune=0.5).knob == "prune"
     assert Variant(prune=0.5, finetune=9).knob == "prune + finetune"
+    assert Variant(storage="auto", field_step=4.0).knob == "storage + field_step"
     assert Variant(prune=0.5, sh_degree=0).knob == "several"
     assert Variant(sh_degree=0).name == "sh_degree=0"
 
@@ -66,16 +71,23 @@ def test_the_knob_of_a_variant() -> None:
 def test_single_changes_leave_out_what_a_run_is_already() -> None:
     names = [v.name for v in single_changes(parse_settings([], trains=True), DYNAMIC, 0)]
     assert len(names) == len(set(names))
-    assert {"sh_degree=0", "sh_degree=1", "masks=6", "mode=antialiased", "colour=dcac"} <= set(names)
-    assert not {"sh_degree=2", "mode=classic", "colour=sh"} & set(names)
-    still = replace(DYNAMIC, sh_degree=0, moves=False)
-    fewer = [v.name for v in single_changes(parse_settings([], trains=False), still, 0)]
-    assert not any(name.startswith(("masks", "sh_degree", "colour")) for name in fewer)
+    assert {"sh_degree=0", "sh_degree=1", "masks=6", "mode=antialiased", "colour=dcac", "field=mlp"} <= set(names)
+    assert not {"sh_degree=2", "mode=classic", "colour=sh", "field=skeleton"} & set(names)
+    still = replace(DYNAMIC, sh_degree=0, field=None)
+    fewer = [v.name for v in single_changes(parse_settings([], trains=True), still, 0)]
+    assert not any(name.startswith(("masks", "sh_degree", "field")) or "field_step" in name for name in fewer)
 
 
-def test_masked_runs_are_not_stored_rounded() -> None:
-    assert not Variant(masks=6, storage=1.0).can_be_made
-    assert single_changes(parse_settings(["storage"], trains=False), replace(DYNAMIC, is_masked=True), 0) == []
+def test_own_values_are_the_start() -> None:
+    settings = parse_settings(["alpha_min=0.008,0.016"], trains=False)
+    assert single_changes(settings, replace(DYNAMIC, alpha_min=0.008), 0) == [Variant(alpha_min=0.016)]
+    settings = parse_settings(["masks=6,16"], trains=False)
+    assert single_changes(settings, replace(DYNAMIC, masks=6), 0) == [Variant(masks=16)]
+
+
+def test_steps_of_the_field_are_those_of_storage() -> None:
+    settings = parse_settings(["field_step=4"], trains=False)
+    assert single_changes(settings, DYNAMIC, 0) == [Variant(storage="auto", field_step=4.0)]
 
 
 def test_fine_tuning_comes_in_addition() -> None:

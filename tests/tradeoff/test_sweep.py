@@ -10,10 +10,13 @@ from pathlib import Path
 import pytest
 from tiny_fields import busy_config, write_tiny_capture
 
-from dyngs.config_io import load_resolved
+from dyngs.config import DynamicModel
+from dyngs.config_io import load_resolved, save_config
+from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.tradeoff.knobs import Variant, parse_settings
-from dyngs.tradeoff.models import Models, traits, write_chosen
+from dyngs.tradeoff.measure import options_of
+from dyngs.tradeoff.models import Models, field_changes, traits, write_chosen
 from dyngs.tradeoff.points import Point, read_point
 from dyngs.tradeoff.report import write_report
 from dyngs.tradeoff.sweep import Plan, figures_of, sweep
@@ -22,8 +25,8 @@ from dyngs.train.evaluate import evaluate_run, render_options
 from dyngs.train.trainer import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-KNOBS = ("prune=0.5", "masks=3", "sh_degree=0", "storage=2", "alpha_min=0.02", "scale=0.5")
-PLAN = Plan(parse_settings(KNOBS, trains=False), finetune=2, combine=2, rounds=1)
+KNOBS = ("prune=0.5", "masks=3", "sh_degree=0", "storage=2", "field_step=64", "alpha_min=0.02", "scale=0.5")
+PLAN = Plan(parse_settings(KNOBS, trains=False), finetune=2, combine=2, rounds=1, threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +64,8 @@ def test_every_knob_does_what_it_says(points: list[Point]) -> None:
     assert named(points, Variant(prune=0.5, finetune=2)).num_gaussians == pruned.num_gaussians
     assert named(points, Variant(sh_degree=0)).mb < base.mb
     assert named(points, Variant(storage=2.0)).mb < 0.5 * base.mb
+    coarser = named(points, Variant(storage="auto", field_step=64.0))
+    assert coarser.psnr != base.psnr
     for variant in (Variant(alpha_min=0.02), Variant(scale=0.5)):
         assert named(points, variant).mb == base.mb
         assert named(points, variant).psnr != base.psnr
@@ -91,32 +96,69 @@ def test_points_of_something_else_do_not_mix(points: list[Point], models: Models
 
 
 def test_the_report_has_every_point(points: list[Point], models: Models) -> None:
-    table, values, picture, page = write_report(models.out, points)
+    table, values, picture, page, pixels = write_report(models.out, points)
+    assert pixels.read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert [row["name"] for row in rows] == [p.variant.name for p in points]
     assert float(rows[0]["fps"]) == pytest.approx(figures_of(points)[0].fps)
     stored = json.loads(values.read_text())
     assert [Variant.from_json(p["changes"]) for p in stored["points"]] == [p.variant for p in points]
-    assert {e["knob"] for e in stored["exchange_rates"]} >= {"prune", "prune + finetune", "storage"}
+    knobs = {e["knob"] for e in stored["exchange_rates"]}
+    assert knobs >= {"prune", "prune + finetune", "storage", "storage + field_step"}
     assert picture.read_text() in page.read_text()
     assert "src=" not in page.read_text()
 
 
 def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Point], models: Models) -> None:
-    variant = Variant(prune=0.5, storage=2.0, mode="antialiased", scale=0.5)
+    variant = Variant(prune=0.5, masks=3, storage=2.0, mode="antialiased", alpha_min=0.02, scale=0.5)
     folder = write_chosen(models, variant)
     chosen = load_run(folder)
     assert is_compact(folder)
     assert len(chosen.scene) == points[0].num_gaussians / 2
     assert chosen.config.data.downscale == 2 * load_resolved(models.run_dir).data.downscale
-    assert render_options(chosen.config.model) == replace(
-        render_options(load_resolved(models.run_dir).model), mode=chosen.config.model.rasterize_mode
-    )
-    assert chosen.config.model.rasterize_mode.value == "antialiased"
-    exact = write_chosen(models, Variant(sh_degree=0))
-    assert evaluate_run(exact, "test", threads=1).psnr == pytest.approx(named(points, Variant(sh_degree=0)).psnr)
-    with pytest.raises(DyngsError, match="know no cut-offs of drawing"):
-        write_chosen(models, Variant(alpha_min=0.02))
+    assert isinstance(chosen.scene, TrainedScene)
+    assert chosen.scene.masks is not None
+    assert render_options(chosen.config.model) == options_of(variant, load_resolved(models.run_dir).model)
+    for single in (Variant(sh_degree=0), Variant(alpha_min=0.02), Variant(storage=2.0)):
+        folder = write_chosen(models, single)
+        assert evaluate_run(folder, "test", threads=1).psnr == pytest.approx(named(points, single).psnr)
+
+
+@pytest.mark.parametrize(
+    ("variant", "kind", "size"),
+    [
+        (Variant(field_size=0.5), "trajectory", {"fourier": 2}),
+        (Variant(field="skeleton", field_size=0.25), "skeleton", {"nodes": 128}),
+        (Variant(field="hexplane"), "hexplane", {"channels": 32}),
+    ],
+)
+def test_another_field_moves_the_same(
+    variant: Variant, kind: str, size: dict[str, int], run_dir: Path, tmp_path: Path
+) -> None:
+    before = load_resolved(run_dir, ["model.deform.fourier=4", "model.deform.move_scales=false"])
+    save_config(before, tmp_path / "config.yaml")
+    changed = load_resolved(tmp_path, field_changes(before.model, variant)).model
+    assert isinstance(changed, DynamicModel)
+    assert changed.deform.kind == kind
+    assert {name: getattr(changed.deform, name) for name in size} == size
+    assert not changed.deform.move_scales
+    assert changed.deform.move_rotations
+
+
+def test_masks_that_a_run_has_stay(points: list[Point], models: Models, tmp_path: Path) -> None:
+    masked = Models(models.out / "training" / Variant(masks=3, finetune=2).slug, tmp_path, 1)
+    assert traits(masked.run_dir).masks == 3
+    for variant in (Variant(prune=0.5), Variant(prune=0.5, finetune=1)):
+        scene = load_run(masked.folder(variant)).scene
+        assert isinstance(scene, TrainedScene)
+        assert scene.masks is not None
+        assert len(scene.masks.times) == 3
+
+
+def test_what_cannot_be_varied_is_named(models: Models) -> None:
+    said: list[str] = []
+    sweep(models, replace(PLAN, settings=parse_settings(["sh_degree=3"], trains=False), combine=0), said.append)
+    assert said == ["nothing to vary in this run: sh_degree"]
 
 
 def test_a_stored_run_cannot_be_varied(points: list[Point], models: Models) -> None:

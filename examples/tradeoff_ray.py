@@ -1,0 +1,49 @@
+"""`dyngs tradeoff` of many runs at once, on this machine or on a Ray cluster whose machines see the same folders.
+
+    pip install 'dyngs[ray]'
+    python examples/tradeoff_ray.py runs/* --cpus 4 -- --vary prune=0.5,0.8 --vary storage
+    RAY_ADDRESS=auto python examples/tradeoff_ray.py ...        on a cluster that runs already
+
+What follows `--` goes to every `dyngs tradeoff`. Each writes RUN/tradeoff, and goes on where it was when started again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+import ray
+
+
+@ray.remote
+def measured(run: str, words: list[str]) -> tuple[str, int, str]:
+    """The run, the exit code of its sweep, and the last line that it said."""
+    command = [sys.executable, "-m", "dyngs", "tradeoff", run, *words]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    return run, done.returncode, (done.stdout.strip().splitlines() or [""])[-1]
+
+
+def main() -> int:
+    """1 if any sweep failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--cpus", type=int, default=1, help="threads of each, and cores that Ray sets aside for it")
+    split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    arguments, words = parser.parse_args(sys.argv[1:split]), [*sys.argv[split + 1 :]]
+    words += ["--threads", str(arguments.cpus)]
+    ray.init()
+    task = measured.options(num_cpus=arguments.cpus)
+    waiting = [task.remote(str(run.absolute()), words) for run in arguments.runs]
+    failed = False
+    while waiting:
+        (ready,), waiting = ray.wait(waiting)
+        run, code, said = ray.get(ready)
+        failed |= code != 0
+        print(f"{run}: {said}", flush=True)
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
