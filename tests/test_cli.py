@@ -214,6 +214,30 @@ def test_a_full_disk_gets_no_traceback() -> None:
 # ---------------------------------------------------------------------------------------------------- train's words
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["compact", "RUN", "model.alpha_min=0.02", "compact.masks=6", "--out", "RUN2"],
+        ["compact", "RUN", "--out", "RUN2", "model.alpha_min=0.02", "compact.masks=6"],
+        ["compact", "--out", "RUN2", "RUN", "model.alpha_min=0.02", "--prune", "0.5", "compact.masks=6"],
+    ],
+)
+def test_overrides_may_stand_anywhere(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[argparse.Namespace] = []
+    monkeypatch.setattr("dyngs.cli.compact.run", lambda arguments: found.append(arguments) or 0)
+    assert main(words) == 0
+    assert found[0].overrides == ["model.alpha_min=0.02", "compact.masks=6"]
+    assert (found[0].run_dir, found[0].out) == (Path("RUN"), Path("RUN2"))
+
+
+@pytest.mark.parametrize(
+    "words", [["compact", "RUN", "--out", "X", "a.b=1", "foo"], ["eval", "RUN", "--split", "val", "a.b=1"]]
+)
+def test_other_words_may_not(words: list[str], capsys: Capture) -> None:
+    assert main(words) == 2
+    assert f"unrecognized arguments: {words[-1]} " in capsys.readouterr().err
+
+
 def test_words_after_train() -> None:
     config = parse_config(["static", "data.root=x", "train.steps=5", "run.threads=2"], None)
     assert (config.train.steps, config.run.threads, config.data.root) == (5, 2, Path("x").absolute())

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import errno
 import os
+import re
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
@@ -22,6 +23,7 @@ from dyngs.errors import DyngsError
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
+_OVERRIDE = re.compile(r"[a-z]\w*(\.\w+)+=.*", re.DOTALL)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,13 +48,25 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _dispatch(arguments: list[str]) -> int:
     parser = make_parser()
     try:
-        parsed = parser.parse_args(arguments)
+        parsed = _parsed(parser, arguments)
     except SystemExit as stop:  # after --help or --version
         return int(stop.code or 0)
     if "run" not in parsed:
         parser.print_help()
         return 0
     return parsed.run(parsed)
+
+
+def _parsed(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.Namespace:
+    """``arguments`` by their names; overrides may stand anywhere, also after options, where argparse takes none."""
+    parsed, rest = parser.parse_known_args(arguments)
+    overrides = getattr(parsed, "overrides", None)
+    unknown = [word for word in rest if overrides is None or not _OVERRIDE.fullmatch(word)]
+    if unknown:
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+    if overrides is not None:
+        overrides += rest
+    return parsed
 
 
 class _Parser(argparse.ArgumentParser):

@@ -33,14 +33,14 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("config", nargs="*", metavar="CONFIG key=value", help="preset and overrides")
+    parser.add_argument("overrides", nargs="*", metavar="CONFIG key=value", help="preset and overrides")
     parser.add_argument("--resume", type=Path, metavar="RUN", help="go on with an interrupted run")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Train, and say what to do next."""
-    config = parse_config(arguments.config, arguments.resume)
+    config = parse_config(arguments.overrides, arguments.resume)
     from dyngs.train.trainer import train
 
     folder = train(config, resume_from=arguments.resume)
