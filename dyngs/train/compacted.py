@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, median
+from tempfile import TemporaryDirectory
 
 import torch
 
@@ -71,14 +72,23 @@ def compact_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
         raise DyngsError(f"{run_dir}: a network, not a scene; compact what it predicts")
     if not config.compact.is_wanted:
         raise DyngsError("nothing to do: give a share to --prune, or key times to --masks")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent, ignore_cleanup_errors=True) as folder:
+        started = Path(folder) / out.name  # becomes the run folder when it is whole
+        _copy_start(run_dir, started)
+        save_config(config, started / RESOLVED_NAME)
+        started.replace(out)
+    return train(config, resume_from=out)
+
+
+def _copy_start(run_dir: Path, folder: Path) -> None:
+    """What a run goes on from: its last checkpoint, its time and its log."""
     newest = checkpoint_paths(run_dir)[-1]
-    (out / newest.parent.name).mkdir(parents=True)
-    save_config(config, out / RESOLVED_NAME)
+    (folder / newest.parent.name).mkdir(parents=True)
+    shutil.copyfile(newest, folder / newest.parent.name / newest.name)
     for name in ("timing.json", "log.jsonl"):
         if (run_dir / name).is_file():
-            shutil.copyfile(run_dir / name, out / name)
-    shutil.copyfile(newest, out / newest.parent.name / newest.name)
-    return train(config, resume_from=out)
+            shutil.copyfile(run_dir / name, folder / name)
 
 
 def compared(before: Path, after: Path, threads: int = 0) -> tuple[Cost, Cost]:

@@ -56,6 +56,19 @@ def test_compared_numbers_are_those_of_eval(run_dir: Path, tmp_path: Path) -> No
     assert costs[1].num_gaussians < costs[0].num_gaussians
 
 
+def test_an_interruption_at_the_start_leaves_nothing(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("dyngs.train.compacted.save_config", interrupted)
+        compact_run(run_dir, tmp_path / "small", ASKED)
+    assert not list(tmp_path.iterdir())
+    assert checkpoint_paths(compact_run(run_dir, tmp_path / "small", ASKED))
+
+
 def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:
     run_dir = write_moving_run(tmp_path)
     taken = tmp_path / "taken"
