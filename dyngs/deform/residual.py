@@ -12,7 +12,7 @@ from dyngs.data.capture import View
 from dyngs.data.frame_selection import spread, standing_cameras
 from dyngs.data.loader import Picture
 from dyngs.gaussians import Gaussians
-from dyngs.rendering import RenderOptions, render
+from dyngs.rendering import RenderOptions, Shader, render
 
 MIN_SAME = 3
 """Pictures of one camera, from which what they have in common is known."""
@@ -42,6 +42,7 @@ def residuals_of(
     pictures: Sequence[Picture],
     options: RenderOptions,
     background: Tensor,
+    shader_at: Callable[[float], Shader | None] = lambda _: None,
 ) -> Residuals:
     """How far the pictures disagree with what is still, where each Gaussian is seen.
 
@@ -59,13 +60,18 @@ def residuals_of(
         gaussians_at: N Gaussians at a time.
         pictures: one or more, as many as are to be looked at.
         background: (3,) colour.
+        shader_at: what colours the Gaussians at a time; None: their harmonics.
     """
     expected = _median_pictures(pictures, background)
     looked_at = [p for p in pictures if _camera_key(p) in expected] if expected else pictures
     found: list[tuple[Tensor, Tensor]] = []
     for picture in looked_at:
-        gaussians = gaussians_at(picture.time or 0.0).detach()
-        found.append(_errors_in(gaussians, picture, options, background, expected.get(_camera_key(picture))))
+        gaussians, shown = gaussians_at(picture.time or 0.0).detach(), expected.get(_camera_key(picture))
+        if shown is None:
+            with torch.no_grad():
+                shader = shader_at(picture.time or 0.0)
+                shown = render(gaussians, picture.cameras, options, background=background, shader=shader).rgb[0]
+        found.append(_errors_in(gaussians, picture, options, background, shown))
     errors, weights = torch.stack([x for x, _ in found]), torch.stack([x for _, x in found])
     if not expected:
         mean = errors.sum(0) / weights.sum(0).clamp_min(1e-6)
@@ -77,12 +83,9 @@ def residuals_of(
 
 
 def _errors_in(
-    gaussians: Gaussians, picture: Picture, options: RenderOptions, background: Tensor, expected: Tensor | None
+    gaussians: Gaussians, picture: Picture, options: RenderOptions, background: Tensor, expected: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """(N,) sums of errors and of weights over one picture; None expects the rendering."""
-    if expected is None:
-        with torch.no_grad():
-            expected = render(gaussians, picture.cameras, options, background=background).rgb[0]
+    """(N,) sums of errors and of weights over one picture."""
     counts = torch.ones(expected.shape[:2]) if picture.mask is None else picture.mask
     error = (expected - picture.composite(background)) * counts[..., None]
     flat = torch.zeros(len(gaussians), 1, 3, requires_grad=True)

@@ -76,9 +76,11 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
     pictures = PictureLoader(capture.splits["train"], config.data)
     if isinstance(config.model, HumanModel):
         gaussians, model = human_model(config, capture, pictures)
+        colours = _colours(config, capture, gaussians, generator)
     else:
         gaussians = initial_gaussians(scene, config.init, start, stored_sh_degree(config), generator)
-        model = _model(config, capture, pictures, scene.extent, generator)
+        colours = _colours(config, capture, gaussians, generator)
+        model = _model(config, capture, pictures, colours, generator)
     background = resolved_background(config, capture)
     x, y, z = (float(value) for value in capture.world_offset)
     return Trainer(
@@ -86,7 +88,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         model=model,
         optimizer=GaussianOptimizer(gaussians, config.optim),
         densifier=_densifier(config, background, scene.extent),
-        colours=_colours(config, capture, gaussians, generator),
+        colours=colours,
         pictures=pictures,
         sampler=ViewSampler(len(pictures)),
         options=_render_options(config),
@@ -174,7 +176,7 @@ def training_times(capture: Capture) -> tuple[float, ...]:
 
 
 def _model(
-    config: Config, capture: Capture, pictures: PictureLoader, extent: float, generator: torch.Generator
+    config: Config, capture: Capture, pictures: PictureLoader, colours: Colours, generator: torch.Generator
 ) -> Model:
     """The model asked for; a static one where there are no times for anything to move in."""
     model, steps = config.model, config.train.steps
@@ -191,11 +193,12 @@ def _model(
 
     def residuals(gaussians_at: Callable[[float], Gaussians]) -> Residuals:
         shown = [pictures[i].shrunk(divisor) for i in looked_at]
-        return residuals_of(gaussians_at, shown, _render_options(config), colour)
+        return residuals_of(gaussians_at, shown, _render_options(config), colour, lambda t: colours.shader(t, None))
 
     stay = bool(cameras_in_place(capture.splits["train"]))
-    surroundings = Surroundings4D(times, cameras, extent, residuals, cameras_stay=stay)
-    return DynamicScene(model, schedule, surroundings, still, generator)
+    extent = surroundings(capture).extent
+    around = Surroundings4D(times, cameras, extent, residuals, cameras_stay=stay)
+    return DynamicScene(model, schedule, around, still, generator)
 
 
 def _colours(config: Config, capture: Capture, gaussians: Gaussians, generator: torch.Generator) -> Colours:

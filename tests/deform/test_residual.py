@@ -69,6 +69,18 @@ def scores_of(gaussians: Gaussians, pictures: list[Picture], background: Tensor)
     return found.most
 
 
+def test_colours_of_a_shader_are_expected() -> None:
+    """What a network says that the base colours do not is no motion."""
+    gaussians = balls((0.0, 0.0, 0.0), sideways(0.8))
+
+    def red(gaussians: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
+        return torch.tensor([1.0, 0.0, 0.0]).expand(len(cameras), len(gaussians), 3)
+
+    shown = picture(render(gaussians, camera(), OPTIONS, background=BLACK, shader=red).rgb[0])
+    assert (residuals_of(lambda _: gaussians, [shown], OPTIONS, BLACK, lambda _: red).most < 1e-6).all()
+    assert (scores_of(gaussians, [shown], BLACK) > 0.2).all(), "half of each channel, times the mean alpha"
+
+
 def test_what_the_pictures_show_has_no_error() -> None:
     gaussians = cloud(12)
     pictures = [picture(rendered(gaussians, view=view), view=view) for view in range(3)]
