@@ -11,7 +11,7 @@ from scenes import Scene, random_scene
 
 from dyngs.ops.native import core
 
-OPS_WITH_A_CORE = ("projection", "harmonics", "rasterization", "finite")
+OPS_WITH_A_CORE = ("projection", "harmonics", "rasterization", "finite", "offsets", "shading")
 
 
 @pytest.fixture(autouse=True)

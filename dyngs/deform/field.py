@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyngs.deform.learned import LearnedTensors
 from dyngs.gaussians import Gaussians
-from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.offsets import add_offsets_
 
 MAX_KEY_TIMES = 256
 """Longer clips want a choice of their own: memory grows with it."""
@@ -127,13 +127,7 @@ def _deformed_in_one_pass(gaussians: Gaussians, offsets: Offsets, rows: Tensor |
     given = {name: x for name, x in vars(offsets).items() if x is not None}
     changed = {"sh" if name == "colors" else name for name in given}
     copies = {n: x.contiguous().clone() if n in changed else x for n, x in gaussians.detach().tensors().items()}
-    dtype = gaussians.means.dtype
-    core.add_offsets(
-        tuple(array(x) for x in copies.values()),
-        None if rows is None else array(rows),
-        tuple(None if x is None else array(x.to(dtype)) for x in vars(offsets).values()),
-        num_threads(),
-    )
+    add_offsets_(tuple(copies.values()), rows, tuple(vars(offsets).values()))
     return Gaussians(**copies)
 
 

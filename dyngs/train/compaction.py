@@ -25,6 +25,7 @@ from dyngs.deform.model import DynamicScene
 from dyngs.deform.trained import TrainedScene
 from dyngs.static.settled import Settled
 from dyngs.train.assemble import training_cameras
+from dyngs.train.background import background_colour
 from dyngs.train.checkpoint import stored_scene
 from dyngs.train.metrics import psnr
 from dyngs.train.scene import Scene, moment_of
@@ -125,7 +126,7 @@ def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
 
 def survey_of(trainer: Trainer, scene: Scene, times: Sequence[float | None] | None = None) -> Survey:
     """All pairs of some training cameras and some times; with no times all that matters are cameras."""
-    background = torch.full((3,), 1.0 if trainer.background == "white" else 0.0)
+    background = background_colour(trainer.background)
     if times is None:
         times = [None] if scene.is_still else [scene.times[i] for i in spread(len(scene.times), MOVING_TIMES)]
     views = STILL_VIEWS if scene.is_still else MOVING_VIEWS
@@ -135,7 +136,7 @@ def survey_of(trainer: Trainer, scene: Scene, times: Sequence[float | None] | No
 
 def quality_of(trainer: Trainer, scene: Scene, pictures: Sequence[Picture], kept: Tensor | None) -> float:
     """Mean PSNR of the training pictures with only ``kept`` (N,) bool of the Gaussians drawn; None: all."""
-    background = torch.full((3,), 1.0 if trainer.background == "white" else 0.0)
+    background = background_colour(trainer.background)
     values = []
     for picture in pictures:
         now = moment_of(scene, picture.time)

@@ -22,7 +22,7 @@ from dyngs.human.predict.sitter import Sitter, sitter_of, spread_views
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.rendering import render
 from dyngs.static.rates import Rates
-from dyngs.train.background import evaluation_background
+from dyngs.train.background import background_colour, evaluation_background
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.train.evaluate import render_options
 from dyngs.train.sampler import ViewSampler
@@ -93,7 +93,10 @@ class NetworkTrainer:
         person = self.people[self.sampler.next(self.generator, lambda _: True)]
         choice = self._draw(len(person.choices))
         targets = self._targets(person, person.choices[choice])
-        background, drawing = self._background_colour(), replace(render_options(self.model), nonfinite="trust")
+        background, drawing = (
+            background_colour(self.background, self.generator),
+            replace(render_options(self.model), nonfinite="trust"),
+        )
         avatar = filled(person.sitter, person.maps(choice), self.mean, self.network, self.model.carve)
         posed = _scene(self.model, avatar).gaussians_at(avatar.gaussians, targets[0], step).gaussians
         total = torch.zeros(())
@@ -157,11 +160,6 @@ class NetworkTrainer:
 
     def _draw(self, count: int) -> int:
         return int(torch.randint(count, (1,), generator=self.generator))
-
-    def _background_colour(self) -> Tensor:
-        if self.background == "random":
-            return torch.rand(3, generator=self.generator)
-        return torch.full((3,), 1.0 if self.background == "white" else 0.0)
 
 
 def assemble_network(config: Config) -> NetworkTrainer:

@@ -23,6 +23,7 @@ from dyngs.static.densify import Densifier, EditResult
 from dyngs.static.model import Drawn
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.settled import Settled
+from dyngs.train.background import background_colour
 from dyngs.train.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.train.sampler import ViewSampler
 from dyngs.train.schedule import active_sh_degree, means_rate, picture_divisor, rates_of
@@ -117,7 +118,7 @@ class Trainer:
         divisor = picture_divisor(config.train, step)
         index = self.sampler.next(self.generator, self._wanted(step))
         picture = self.pictures[index].shrunk(divisor)
-        background = self._background_colour()
+        background = background_colour(self.background, self.generator)
         parameters = self.optimizer.parameters
         drawn = self.model.gaussians_at(parameters, picture, step)
         probe = torch.zeros(1, len(parameters), 4, requires_grad=True) if self.densifier.wants_signal(step) else None
@@ -167,7 +168,7 @@ class Trainer:
         colours, parameters = self.colours, self.optimizer.parameters.detach()
         if not isinstance(colours, ThriftyColours) or not colours.measures_after(step) or not parameters.sh_degree:
             return None
-        colour = torch.full((3,), 1.0 if self.background == "white" else 0.0)
+        colour = background_colour(self.background)
 
         def looks(views: Iterable[int]) -> Iterator[Look]:
             for picture in (self.pictures[i] for i in views):
@@ -236,11 +237,6 @@ class Trainer:
                 f"the checkpoint of step {checkpoint.info.step} lacks {missing}; was its config changed?"
             ) from None
         self.done = checkpoint.info.step
-
-    def _background_colour(self) -> Tensor:
-        if self.background == "random":
-            return torch.rand(3, generator=self.generator)
-        return torch.full((3,), 1.0 if self.background == "white" else 0.0)
 
 
 def _finite_sum(terms: dict[str, Tensor], step: int, picture: Picture) -> float:

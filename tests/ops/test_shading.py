@@ -43,6 +43,11 @@ def test_it_is_what_torch_says(seed: int, normals: bool, timed: bool, on_body: b
     torch.testing.assert_close(found, reference_inputs(seen, base))
 
 
+def test_every_isa_says_the_same(isa: str) -> None:
+    seen, base = sight(3, normals=True, timed=True, on_body=True, dtype=torch.float32), torch.full((7, 3), 0.3)
+    torch.testing.assert_close(shading_inputs(seen, base), reference_inputs(seen, base), msg=isa)
+
+
 def test_threads_change_nothing() -> None:
     seen = sight(0, normals=True, timed=True, on_body=True)
     many = replace(seen, rows=torch.randint(0, 11, (5000,), generator=torch.Generator().manual_seed(1)))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_fields import busy_config, write_tiny_capture
+from tiny_fields import busy_config
 
 from dyngs.config import (
     BudgetConfig,
@@ -23,8 +23,6 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config_io import load_resolved
-from dyngs.data.synthetic import StillOptions, write_still_capture
-from dyngs.human.synthetic import HumanOptions, write_human_capture
 from dyngs.train.assemble import assemble
 from dyngs.train.budget_count import STAGES, CountLimit, stage
 from dyngs.train.checkpoint import checkpoint_paths, load_run
@@ -36,16 +34,9 @@ PLAIN = Config(data=DataConfig(root=Path("nowhere")))
 KINDS = ("default", "mcmc", "trajectory", "human")
 
 
-@pytest.fixture(scope="module")
-def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    root = tmp_path_factory.mktemp("captures")
-    people = HumanOptions(size=32, num_frames=3, num_new=2, num_cameras=3, num_test=1)
-    write_still_capture(root / "still", StillOptions(size=16, num_train=4, num_test=1, samples=1))
-    return {
-        "still": root / "still",
-        "moving": write_tiny_capture(root / "moving"),
-        "person": write_human_capture(root / "person", people),
-    }
+@pytest.fixture
+def captures(still: Path, moving: Path, person: Path) -> dict[str, Path]:
+    return {"still": still, "moving": moving, "person": person}
 
 
 def config_of(kind: str, captures: dict[str, Path], run_dir: Path, budget: BudgetConfig) -> Config:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_fields import busy_config, write_tiny_capture
+from tiny_fields import busy_config
 
 from dyngs.config import (
     BudgetConfig,
@@ -25,9 +25,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config_io import load_resolved
-from dyngs.data.synthetic import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
-from dyngs.human.synthetic import HumanOptions, write_human_capture
 from dyngs.train.assemble import assemble
 from dyngs.train.budget_speed import (
     ACCEPTED,
@@ -75,24 +73,6 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dyngs.train.budget_speed.drawing_seconds", seconds)
     monkeypatch.setattr("dyngs.train.budget_speed.FEW", 1)
     monkeypatch.setattr(time, "perf_counter", lambda: 0.0)
-
-
-@pytest.fixture(scope="module")
-def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=16, num_train=4, num_test=1, samples=1))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tiny_capture(tmp_path_factory.mktemp("capture"))
-
-
-@pytest.fixture(scope="module")
-def person(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("capture") / "person"
-    return write_human_capture(folder, HumanOptions(size=32, num_frames=3, num_new=2, num_cameras=3, num_test=1))
 
 
 def still_config(capture: Path, run_dir: Path, strategy: DefaultStrategy | McmcStrategy | None = None) -> Config:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from moving_scene import camera
-from tiny_fields import KINDS, busy_config, write_tiny_capture
+from tiny_fields import KINDS, busy_config
 from torch import Tensor
 
 from dyngs.camera import Cameras
@@ -23,7 +23,6 @@ from dyngs.config import (
 )
 from dyngs.config_io import load_resolved
 from dyngs.data.frame_selection import spread
-from dyngs.data.synthetic import StillOptions, write_still_capture
 from dyngs.deform.model import DynamicScene
 from dyngs.deform.trained import TrainedScene
 from dyngs.static.settled import Settled
@@ -35,18 +34,6 @@ from dyngs.train.trainer import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STAGE = CompactConfig(prune=0.5, max_loss=100.0, steps=6, masks=3, mask_below=1.0)
-
-
-@pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tiny_capture(tmp_path_factory.mktemp("capture"))
-
-
-@pytest.fixture(scope="module")
-def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=16, num_train=4, num_test=1, samples=1))
-    return folder
 
 
 def moving_config(capture: Path, run_dir: Path, kind: str = "skeleton", stage: CompactConfig = STAGE) -> Config:
