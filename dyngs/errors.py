@@ -1,6 +1,12 @@
-"""The one exception type that users see as a single line."""
+"""The one exception type that users see as a single line, and the boundary at which a reader's faults become it."""
 
 from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_MAX_REASON = 160
 
 
 class DyngsError(Exception):
@@ -8,3 +14,46 @@ class DyngsError(Exception):
 
     The command line prints the message and exits with code 2; library callers catch it.
     """
+
+
+@contextmanager
+def reading(path: str | os.PathLike[str], advice: str = "copy or export it again") -> Iterator[None]:
+    """A block in which whatever goes wrong is a DyngsError that names ``path``, with the first error as its cause.
+
+    For the readers of files from others: their parsers raise more kinds of errors than anybody can list. A DyngsError
+    passes as it is. What the file has no part in belongs outside the block, because a fault of our own would be blamed
+    on the file there (``dyngs --debug`` shows the cause).
+
+    Args:
+        path: what is being read, for the message.
+        advice: what the user can do about a file that is not as it should be.
+
+    Raises:
+        DyngsError: instead of any other Exception.
+    """
+    where = os.fspath(path)
+    try:
+        yield
+    except DyngsError:
+        raise
+    except MemoryError as cause:
+        raise DyngsError(f"{where}: reading it takes more memory than there is; {advice}") from cause
+    except Exception as cause:
+        raise DyngsError(f"{where}: cannot be read ({reason(cause).removesuffix(f': {where}')}); {advice}") from cause
+
+
+def reason(error: BaseException) -> str:
+    """What ``error`` says, on one short line of printable characters; its type where it does not say much."""
+    if isinstance(error, OSError) and error.strerror:
+        where = f": {error.filename}" if error.filename is not None else ""
+        text = f"{error.strerror}{where}"
+    else:
+        text = f"{type(error).__name__}: {error}" if str(error).strip() else type(error).__name__
+    return printable(text[: 4 * _MAX_REASON], _MAX_REASON)
+
+
+def printable(text: str, length: int | None = None) -> str:
+    """``text`` on one line, what a terminal would obey or cannot show as escapes, with ``...`` beyond ``length``."""
+    line = " ".join(text.split())
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
+    return shown if length is None or len(shown) <= length else f"{shown[: length - 3]}..."

@@ -21,7 +21,7 @@ import dyngs
 from dyngs.cli import doctor, main
 from dyngs.cli.train import parse_config
 from dyngs.config_io import load_config, save_config
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
 from dyngs.export.ply import read_ply
 
 VERBS = ("demo", "train", "compact", "eval", "render", "export", "data", "bench", "doctor", "predict", "tradeoff")
@@ -96,6 +96,43 @@ def test_help_is_instant_because_torch_is_not_imported() -> None:
 def test_module_and_command_are_the_same() -> None:
     done = subprocess.run([sys.executable, "-m", "dyngs", "--version"], env=ENVIRONMENT, capture_output=True, text=True)
     assert (done.returncode, done.stdout.strip()) == (0, f"dyngs {dyngs.__version__}")
+
+
+# ---------------------------------------------------------------------------------------------------- debugging
+
+
+def fail_in_a_reader() -> None:
+    with reading("cameras.json"):
+        raise KeyError("fl_x")
+
+
+@pytest.mark.parametrize("arguments", [["--debug", "doctor"], ["doctor", "--debug"]])
+def test_debug_shows_the_cause_before_the_line(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    make_doctor(monkeypatch, fail_in_a_reader)
+    assert main(arguments) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-1].startswith("dyngs: error: cameras.json: cannot be read (KeyError: 'fl_x')")
+    assert lines.count("KeyError: 'fl_x'") == 1
+    assert sum(line.startswith("Traceback") for line in lines) == 2
+
+
+def test_without_debug_there_is_only_the_line(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    make_doctor(monkeypatch, fail_in_a_reader)
+    assert "KeyError: 'fl_x'" in error_line(capsys, "doctor")
+
+
+def test_a_line_holds_nothing_that_a_terminal_obeys(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    make_doctor(monkeypatch, raising(DyngsError("a\x1b[2J.png: no such\npicture")))
+    assert "a\\x1b[2J.png: no such picture" in error_line(capsys, "doctor")
+
+
+def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
+    code = "import sys; from dyngs.cli import main; main(['--version']); print('p\\udce9re.png')"
+    environment = ENVIRONMENT | {"PYTHONIOENCODING": "utf-8:strict"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "p\\udce9re.png")
 
 
 # ---------------------------------------------------------------------------------------------------- refusals

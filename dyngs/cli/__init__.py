@@ -4,45 +4,64 @@ Every module offers ``add_parser(commands)`` and a ``run(arguments) -> int``. Wh
 readers) is imported inside ``run``, so that ``dyngs --help`` is instant.
 
 Exit codes: 0 done; 2 bad input or usage, after one line on stderr; 130 interrupted. Anything unexpected keeps its
-traceback, because it is a bug.
+traceback, because it is a bug. With ``--debug`` the traceback of any error comes before its line.
 """
 
 from __future__ import annotations
 
 import argparse
 import errno
+import io
 import os
 import re
 import sys
+import traceback
 from collections.abc import Sequence
 from typing import NoReturn
 
 from dyngs import __version__
 from dyngs.cli import bench, compact, data, demo, doctor, evaluate, export, predict, render, tradeoff, train
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, printable
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
+_OUT_OF_MEMORY = "out of memory; use smaller pictures (data.longest_side) or a smaller cache (data.cache_mb)"
 _OVERRIDE = re.compile(r"[a-z]\w*(\.\w+)+=.*", re.DOTALL)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The exit code of the command line ``argv`` (default: the process's own arguments)."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    arguments, debug = _without_debug(list(sys.argv[1:] if argv is None else argv))
+    _show_any_name()
     try:
         code = _dispatch(arguments)
         sys.stdout.flush()
         return code
-    except DyngsError as error:
-        return _fail(str(error))
+    except (DyngsError, MemoryError) as error:
+        if debug:
+            traceback.print_exception(error)
+        return _fail(str(error) if isinstance(error, DyngsError) else _OUT_OF_MEMORY)
     except KeyboardInterrupt as interrupt:
         print(f"\ndyngs: interrupted{_after_colon(interrupt)}", file=sys.stderr)
         return EXIT_INTERRUPTED
     except OSError as error:
         _abandon_broken_stdout()
+        if debug:
+            traceback.print_exception(error)
         return _fail(_describe_os_error(error))
-    except MemoryError:
-        return _fail("out of memory; use smaller pictures (data.longest_side) or a smaller cache (data.cache_mb)")
+
+
+def _without_debug(arguments: list[str]) -> tuple[list[str], bool]:
+    """The arguments without ``--debug``, which may stand anywhere before a ``--``, and whether it was there."""
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    kept = [word for word in arguments[:end] if word != "--debug"]
+    return kept + arguments[end:], len(kept) < end
+
+
+def _show_any_name() -> None:
+    """Let stdout show names of files that are no valid text as escapes, as stderr does."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -84,6 +103,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _add_commands(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    parser.add_argument("--debug", action="store_true", help="before the line of an error, show where it comes from")
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for module in (demo, train, compact, predict, evaluate, render, export, tradeoff, data, bench, doctor):
@@ -92,7 +112,7 @@ def _add_commands(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
 
 
 def _fail(message: str) -> int:
-    print(f"dyngs: error: {' '.join(message.split())}", file=sys.stderr)
+    print(f"dyngs: error: {printable(message)}", file=sys.stderr)
     return EXIT_ERROR
 
 

@@ -1,0 +1,66 @@
+"""The boundary of the readers: every error becomes one line that names the file, and the cause is kept."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from dyngs.errors import DyngsError, printable, reading, reason
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        KeyError("w"),
+        IndexError("list index out of range"),
+        TypeError("'int' object is not iterable"),
+        AttributeError("no such"),
+        RecursionError("maximum recursion depth exceeded"),
+        RuntimeError("native code\nsays so\x1b[31m in red"),
+        OverflowError("too large"),
+        ZeroDivisionError("division by zero"),
+        UnicodeDecodeError("utf-8", b"\xe9", 0, 1, "invalid start byte"),
+        AssertionError(),
+        json.JSONDecodeError("Expecting value", "x", 0),
+        MemoryError(),
+        ValueError("x" * 100_000),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_every_error_becomes_one_line_that_names_the_file(error: Exception) -> None:
+    with (
+        pytest.raises(DyngsError, match=r"^a/cameras\.json: .*; export it again$") as caught,
+        reading("a/cameras.json", "export it again"),
+    ):
+        raise error
+    line = str(caught.value)
+    assert caught.value.__cause__ is error
+    assert line.isprintable()
+    assert len(line) < 250
+
+
+def test_a_line_of_ours_and_interrupts_pass() -> None:
+    with pytest.raises(DyngsError, match=r"^ours$"), reading("a.json"):
+        raise DyngsError("ours")
+    with pytest.raises(KeyboardInterrupt), reading("a.json"):
+        raise KeyboardInterrupt
+
+
+def test_errors_of_the_system_are_said_in_its_words(tmp_path: Path) -> None:
+    path = tmp_path / "none.bin"
+    line = re.escape(f"{path}: cannot be read (No such file or directory); copy or export it again")
+    with pytest.raises(DyngsError, match=line), reading(path):
+        path.read_bytes()
+
+
+def test_reason_of_an_error_without_words_is_its_type() -> None:
+    assert reason(AssertionError()) == "AssertionError"
+    assert reason(KeyError("w")) == "KeyError: 'w'"
+
+
+def test_printable_keeps_letters_and_escapes_what_a_terminal_obeys() -> None:
+    assert printable("Größe \x1b[2J\u202e\udce9\nnext") == "Größe \\x1b[2J\\u202e\\udce9 next"
+    assert printable("abcdefgh", 6) == "abc..."
