@@ -17,6 +17,8 @@ NEAREST, SPARSE = 0.5, 0.35
 """What is added before rounding down: to the nearest whole number, or rather to zero, which costs least."""
 ROTATION_STEP = 1 / 32
 """The coarsest for rotations: the component that is left out stays the largest."""
+FINEST_ROTATION = 2.0**-19
+"""With finer steps the components of a unit quaternion would be out of reach of the whole numbers."""
 OPACITY_STEPS = 2.0**-12, 1 / 8
 """The finest and the coarsest for opacities."""
 

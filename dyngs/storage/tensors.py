@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dyngs.storage.quantize import (
+    FINEST_ROTATION,
     LARGEST_STEP,
     NEAREST,
     OPACITY_STEPS,
@@ -134,6 +135,7 @@ def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness
         return Coding(Kind.HALF if fits else Kind.EXACT)
     kind = _KINDS.get(name, Kind.GRID)
     low, high = _LIMITS.get(kind, (SMALLEST_STEP, LARGEST_STEP))
+    low = max(low, FINEST_ROTATION) if kind is Kind.ROTATION else low  # files with finer ones are still read
     return Coding(kind, step_below(min(max(steps[group], low), high)), by_coarseness and name in _BY_COARSENESS)
 
 
@@ -166,7 +168,9 @@ def from_whole(whole: Whole, coding: Coding, dtype: torch.dtype, coarseness: np.
     if coding.kind is Kind.OPACITY:
         return torch.from_numpy(opacities_from_grid(whole.numbers, coding.step)).to(dtype)
     if coding.kind in (Kind.GRID, Kind.SPARSE):
-        values = from_grid(whole.numbers, coding.steps(coarseness, whole.numbers.ndim)).astype(np.float32)
+        steps = coding.steps(coarseness, whole.numbers.ndim)
+        # numbers that were laid out by columns are no flat array until they are copied into one
+        values = np.ascontiguousarray(from_grid(whole.numbers, steps), dtype=np.float32)
         if len(whole.far) and not 0 <= int(whole.far[:, 0].min()) <= int(whole.far[:, 0].max()) < values.size:
             raise ValueError("a value lies outside its tensor")
         values.reshape(-1)[whole.far[:, 0]] = whole.far[:, 1].astype(np.int32).view(np.float32)

@@ -8,8 +8,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dyngs.storage.coding import packed, unpacked
+from dyngs.storage.quantize import LIMIT, is_step
 from dyngs.storage.tensors import (
     COARSENESS,
+    FIXED_STEPS,
+    LARGEST_HALF,
+    MAX_COARSENESS,
+    Whole,
     Coding,
     Kind,
     checked_coarseness,
@@ -82,3 +88,102 @@ def test_a_coding_is_sound_or_refused(kind: Kind, step: float, by_coarseness: bo
 
 def test_coarseness_is_no_group() -> None:
     assert group_of(COARSENESS, torch.zeros(100, dtype=torch.uint8)) is None
+
+
+def read_again(x: torch.Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> torch.Tensor:
+    """``x`` as a file gives it back: through bytes, laid out as ``packed`` chose."""
+    whole = to_whole(x, coding, coarseness)
+    packing, data = packed(whole.numbers)
+    numbers = unpacked(packing, data, whole.numbers.shape)
+    return from_whole(Whole(numbers, whole.far), coding, x.dtype, coarseness)
+
+
+def test_far_values_are_exact_in_columns_too() -> None:
+    """Columns that repeat make ``packed`` lay the numbers out by columns."""
+    x = torch.arange(3.0).repeat(400, 1) * 100
+    x[7, 1], x[399, 2] = 3e9, -4e20
+    whole = to_whole(x, Coding(Kind.GRID, 0.5))
+    packing, data = packed(whole.numbers)
+    assert not packing.by_rows
+    numbers = unpacked(packing, data, (400, 3))
+    assert torch.equal(from_whole(Whole(numbers, whole.far), Coding(Kind.GRID, 0.5), torch.float32), x)
+
+
+NUMBERS = st.floats(-3, 3, width=32) | st.floats(width=32, allow_nan=False, allow_infinity=False)
+SHAPES = st.lists(st.integers(0, 40), min_size=1, max_size=4).filter(lambda shape: np.prod(shape) <= 20_000)
+NAMES = st.sampled_from(
+    [f"gaussians.{name}" for name in ("means", "log_scales", "sh_base", "sh_rest")]
+    + ["model.field.learned.space0", "model.filter_std", "model.masks.times", *FIXED_STEPS]
+)
+
+
+@st.composite
+def tensors_of_some_kind(draw: st.DrawFn) -> torch.Tensor:
+    """Of any shape: columns or rows that repeat, values of any size among ordinary ones."""
+    shape, pool = draw(SHAPES), np.array(draw(st.lists(NUMBERS, min_size=1, max_size=8)), dtype=np.float32)
+    generator = np.random.default_rng(draw(st.integers(0, 9)))
+    x = (
+        generator.choice(pool, shape)
+        if draw(st.booleans())
+        else np.broadcast_to(generator.choice(pool, shape[1:]), shape)
+    )
+    return torch.from_numpy(x.astype(np.float32))
+
+
+@given(tensors_of_some_kind(), NAMES, st.floats(1e-9, 1e9), st.booleans())
+@settings(deadline=None, max_examples=150)
+def test_any_tensor_comes_back_within_its_bound(x: torch.Tensor, name: str, step: float, by_coarseness: bool) -> None:
+    """Half a step (0.65 of one where zero is preferred), 11 bits where there is no step; exact where out of reach."""
+    group = group_of(name, x)
+    coding = coding_of(name, x, {} if group is None else {group: step}, by_coarseness=by_coarseness)
+    rows = np.arange(len(x)) % (MAX_COARSENESS + 1) if coding.by_coarseness else None
+    error = (read_again(x, coding, rows).double() - x.double()).abs()
+    if coding.kind is Kind.EXACT:
+        assert torch.equal(error, torch.zeros_like(error))
+    elif coding.kind is Kind.HALF:
+        assert float(x.abs().max()) <= LARGEST_HALF
+        assert bool((error <= 2.0**-11 * x.double().abs() + 2.0**-25).all())
+    else:
+        steps = torch.as_tensor(coding.steps(rows, x.ndim)).double()
+        share = 0.65 if coding.kind is Kind.SPARSE else 0.5
+        assert is_step(coding.step)
+        assert bool((error <= share * steps * (1 + 1e-12)).all())
+        assert bool((error[(x.double().abs() >= LIMIT * steps)] == 0).all())
+
+
+@given(st.sampled_from([torch.int64, torch.int32, torch.uint8, torch.bool, torch.float64, torch.float16]), st.data())
+@settings(deadline=None, max_examples=60)
+def test_any_other_tensor_comes_back_as_it_was(dtype: torch.dtype, source: st.DataObject) -> None:
+    shape = source.draw(SHAPES)
+    bits = np.random.default_rng(source.draw(st.integers(0, 9))).integers(-(2**63), 2**63, shape, dtype=np.int64)
+    bits = bits if source.draw(st.booleans()) else np.broadcast_to(bits[:1], shape).copy()
+    x = torch.from_numpy(bits)
+    x = (x.view(dtype) if dtype.itemsize == 8 else x.to(dtype)).nan_to_num()
+    coding = coding_of("model.anything", x, {})
+    assert coding.kind is Kind.EXACT
+    assert torch.equal(read_again(x, coding), x)
+
+
+@given(tensors_of_some_kind(), st.floats(1e-9, 1.0))
+@settings(deadline=None, max_examples=60)
+def test_any_rotation_and_any_opacity_comes_back(x: torch.Tensor, step: float) -> None:
+    quats = x.reshape(-1)[: x.numel() // 4 * 4].reshape(-1, 4)
+    coding = coding_of("gaussians.quats", quats, {"gaussians.quats": step})
+    unit = torch.nn.functional.normalize(read_again(quats, coding).double(), dim=1)
+    wide = torch.where(quats.any(1, keepdim=True), quats, torch.tensor([1.0, 0, 0, 0])).double()
+    wide = wide / wide.abs().amax(1, keepdim=True)
+    before, after = (_axes(q) for q in (torch.nn.functional.normalize(wide, dim=1), unit))
+    assert bool(((before - after).abs() <= 4 * coding.step + 1e-6).all())
+    coding = coding_of("gaussians.logit_opacities", x, {"gaussians.logit_opacities": step})
+    error = (read_again(x, coding).double().sigmoid() - x.double().sigmoid()).abs()
+    assert bool((error <= 0.5 * coding.step + 1e-7).all())
+
+
+def _axes(quats: torch.Tensor) -> torch.Tensor:
+    """(N, 3, 3) projectors onto the axes of unit quaternions wxyz: the same for all signs of the axes."""
+    w, x, y, z = quats.unbind(1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    turns = torch.stack(rows, dim=1).unflatten(1, (3, 3))
+    return torch.einsum("nik,njk->nkij", turns, turns).flatten(1)
