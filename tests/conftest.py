@@ -1,17 +1,41 @@
-"""Fixtures of the rasterizer's tests."""
+"""How the tests draw their examples, and fixtures of the rasterizer's tests.
+
+Examples of property tests are fixed by default (profile ``ci``): a run passes or fails whoever starts it. The profile
+``long`` draws ten times as many at random, and says how to draw a failing one again::
+
+    HYPOTHESIS_PROFILE=long pytest tests/ops --hypothesis-seed=3
+
+What it finds becomes an ``@example`` of its test.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from importlib import import_module
 
 import pytest
 import torch
+from hypothesis import settings
 from scenes import Scene, random_scene
 
 from dyngs.ops.native import core
 
 OPS_WITH_A_CORE = ("projection", "harmonics", "rasterization", "finite", "offsets", "shading")
+
+FEW, MANY = 100, 1000  # examples of a test that does not say how many
+settings.register_profile("ci", derandomize=True, max_examples=FEW)
+settings.register_profile("long", derandomize=False, max_examples=MANY, print_blob=True, deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that say how many examples they need in ``ci`` draw more by the same factor in ``long``."""
+    factor = settings.default.max_examples // FEW
+    for test in {id(item.obj): item.obj for item in items if isinstance(item, pytest.Function)}.values():
+        own = getattr(test, "_hypothesis_internal_use_settings", None)  # hypothesis has no public way to reach these
+        if factor > 1 and own is not None and own.max_examples < settings.default.max_examples:
+            test._hypothesis_internal_use_settings = settings(own, max_examples=factor * own.max_examples)
 
 
 @pytest.fixture(autouse=True)
