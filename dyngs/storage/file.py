@@ -200,11 +200,19 @@ def decoded(data: bytes) -> StoredScene:
         raise DyngsError(f"its header is wrong at {where or 'its start'}: {first['msg']}") from None
     except (ValueError, OverflowError, RuntimeError, IndexError) as error:
         raise DyngsError(f"its tensors are wrong: {str(error).splitlines()[0]}") from None
-    steps = {
-        group_of(entry.name, tensors[entry.name]) or entry.name: entry.step for entry in header.tensors if entry.step
-    }
     sizes = {entry.name: entry.size + _FAR_BYTES * entry.far for entry in header.tensors}
-    return StoredScene(header.info, full, steps, sizes, len(data))
+    return StoredScene(header.info, full, _steps(header, tensors), sizes, len(data))
+
+
+def _steps(header: _Header, tensors: Mapping[str, Tensor]) -> dict[str, float]:
+    """Those with which the tensors would be stored again as they are; 0 for what is exact though it need not be."""
+    steps: dict[str, float] = {}
+    for entry in header.tensors:
+        x = tensors[entry.name]
+        group = group_of(entry.name, x) or entry.name
+        if entry.step or (entry.kind is Kind.EXACT and coding_of(entry.name, x, {}).kind is not Kind.EXACT):
+            steps[group] = max(entry.step, steps.get(group, 0.0))
+    return steps
 
 
 def _stored(name: str, x: Tensor, coding: Coding, coarseness: np.ndarray | None) -> tuple[_Entry, bytes]:

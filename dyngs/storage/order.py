@@ -6,6 +6,8 @@ import numpy as np
 
 MORTON_BITS = 20
 """Of each coordinate; 60 bits in all."""
+INNER, OUTLYING = 0.01, 64.0
+"""Places farther out than so many sides of the box around all but these shares of the coordinates count as its edge."""
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
@@ -13,6 +15,10 @@ def morton_order(points: np.ndarray) -> np.ndarray:
     if not len(points):
         return np.zeros(0, dtype=np.int64)
     places = points.astype(np.float64)
+    inner_low, inner_high = np.quantile(places, (INNER, 1 - INNER), axis=0, method="nearest")
+    reach = OUTLYING * float((inner_high - inner_low).max())
+    if reach > 0:
+        places = places.clip(inner_low - reach, inner_high + reach)
     low = places.min(0)
     side = max(float((places.max(0) - low).max()), np.finfo(np.float64).tiny)
     cells = ((places - low) / side * (2**MORTON_BITS - 1)).astype(np.uint64)

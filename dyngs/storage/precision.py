@@ -8,7 +8,7 @@ given, the sum of bits is to be least: then every group of tensors may add error
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -26,6 +26,8 @@ CLOSE = 0.8
 FIRST_STEP = 2.0**-6
 """Of the mean size of the values."""
 WIDEST_JUMP = 32.0
+OUTLYING, USUAL_SHARE = 64.0, 0.95
+"""Values so many times as large as this share of those that are not 0 are outliers: steps are chosen without them."""
 MOST_VISIBLE = 0.9
 """Share of the Gaussians that show less than those that are stored most finely."""
 ASSUMED_STEPS = {"quats": 2**-8, "log_scales": 2**-6, "logit_opacities": 2**-10, "sh_base": 2**-7, "sh_rest": 2**-7}
@@ -39,12 +41,14 @@ class Precision:
     """Steps, and what they do.
 
     Attributes:
-        steps: of each group of tensors.
+        steps: of each group of tensors; 0: it is stored as it is.
         change: root mean square change of the pictures, grey levels of 255; None where none could be drawn.
+        allowed: what it was to be at most; None likewise.
     """
 
     steps: dict[str, float]
     change: float | None = None
+    allowed: float | None = None
 
 
 def coarseness_of(visibility: Tensor) -> Tensor:
@@ -88,74 +92,107 @@ def measured_precision(tensors: Mapping[str, Tensor], draw: Draw, max_change: fl
     """
     exact = drawable(tensors)
     coarseness = checked_coarseness(exact[COARSENESS], len(exact["gaussians.means"])) if COARSENESS in exact else None
-    wanted = [x.clamp(0, 1) for x in draw(tensors)]
+    wanted = draw(tensors)
 
-    def change(steps: Mapping[str, float]) -> float:
-        """Mean square over all values, with the groups of ``steps`` quantised."""
+    def change(steps: Mapping[str, float], names: Iterable[str] = exact) -> float:
+        """Mean square over all values, with the tensors of these names quantised."""
         rounded = dict(exact)
-        for name, x in exact.items():
-            if group_of(name, x) in steps:
-                coding = coding_of(name, x, steps, by_coarseness=coarseness is not None)
-                rounded[name] = restored(x, coding, coarseness)
-        drawn = draw(completed(rounded))
-        total = sum(float((x.clamp(0, 1) - y).double().square().sum()) for x, y in zip(drawn, wanted, strict=True))
-        return total / max(sum(x.numel() for x in wanted), 1)
+        for name in names:
+            coding = coding_of(name, exact[name], steps, by_coarseness=coarseness is not None)
+            rounded[name] = restored(exact[name], coding, coarseness)
+        return mean_square_change(wanted, draw(completed(rounded)))
 
     allowed = (max_change / GREY_LEVELS) ** 2
     groups = _groups(exact)
-    num_values = sum(sum(x.numel() for x in group) for group in groups.values())
-    steps = {}
+    num_values = sum(sum(x.numel() for x in group.values()) for group in groups.values())
+    steps, too_coarse = {}, {}
     for name, group in groups.items():
-        share = sum(x.numel() for x in group) / num_values
-        steps[name] = _largest_step(lambda step, name=name: change({name: step}), group, allowed * share)
-    return _scaled(steps, change, allowed)
+        share = sum(x.numel() for x in group.values()) / num_values
+        steps[name], is_enough = _largest_step(
+            lambda step, name=name, group=group: change({name: step}, group), list(group.values()), allowed * share
+        )
+        too_coarse |= {} if is_enough else {name: 0.0}
+    kept, found = _scaled(steps, change, allowed)
+    if not found <= allowed:
+        kept, found = _scaled(steps | too_coarse, change, allowed)
+    if not found <= allowed:
+        kept = dict.fromkeys((*groups, *exact), 0.0)
+        found = change(kept)
+    return Precision(kept, math.sqrt(found) * GREY_LEVELS, max_change)
 
 
-def _scaled(steps: dict[str, float], change: Callable[[Mapping[str, float]], float], allowed: float) -> Precision:
-    """All steps by one factor, so that together they change the pictures by what is allowed, or a little less."""
+def mean_square_change(before: Sequence[Tensor], after: Sequence[Tensor]) -> float:
+    """Over all values of pictures in [0, 1], after clamping; NaN where one of them is."""
+    total = sum(
+        float((x.clamp(0, 1) - y.clamp(0, 1)).double().square().sum()) for x, y in zip(before, after, strict=True)
+    )
+    return total / max(sum(x.numel() for x in before), 1)
+
+
+def _scaled(
+    steps: dict[str, float], change: Callable[[Mapping[str, float]], float], allowed: float
+) -> tuple[dict[str, float], float]:
+    """All steps by one factor, so that together they change the pictures by what is allowed, or a little less.
+
+    And the mean square change that they make, which is larger only where no factor that was tried is small enough.
+    """
     best = None
     tried, found, factor = steps, math.inf, 1.0
     for trial in range(2 * TRIALS):
-        tried = {name: step_below(factor * step) for name, step in steps.items()}
+        tried = {name: step and step_below(factor * step) for name, step in steps.items()}
         found = change(tried)
         if found <= allowed and (best is None or found > best[1]):
             best = (tried, found)
         if best is not None and (trial >= TRIALS or found > CLOSE * allowed):
             break
+        if math.isnan(found):
+            break
         factor *= min(max(math.sqrt(0.95 * allowed / max(found, 1e-300)), 0.5), 2.0)
-    kept, error = (tried, found) if best is None else best
-    return Precision(kept, math.sqrt(error) * GREY_LEVELS)
+    return (tried, found) if best is None else best
 
 
-def _largest_step(change: Callable[[float], float], group: Sequence[Tensor], allowed: float) -> float:
-    """The largest step tried that changes the pictures by at most ``allowed``.
+def _largest_step(change: Callable[[float], float], group: Sequence[Tensor], allowed: float) -> tuple[float, bool]:
+    """The largest step tried that changes the pictures by at most ``allowed``, else the finest; and whether it does.
 
     The first one tried where these pictures do not depend on the group at all: others may.
     """
-    size = max((float(x.abs().max()) for x in group if x.numel()), default=0.0)
+    size, mean_square = _usual_size(torch.cat([x.flatten() for x in group]))
     if size == 0:
-        return 1.0
-    count = sum(x.numel() for x in group)
-    mean_square = sum(float(x.double().square().sum()) for x in group) / count
+        return 1.0, True
     finest, coarsest = 2 * size / LIMIT, 4 * size
     step = first = min(max(FIRST_STEP * math.sqrt(mean_square), finest), coarsest)
-    best = finest
+    best = None
     for _ in range(TRIALS):
         step = step_below(min(max(step, finest), coarsest))
         found = change(step)
+        if math.isnan(found):
+            return finest, False
         if found <= allowed:
-            best = max(best, step)
+            best = max(best or 0.0, step)
             if found > CLOSE**2 * allowed or step >= coarsest / 2:
                 break
         step *= min(max(math.sqrt(0.9 * allowed / max(found, 1e-300)), 1 / WIDEST_JUMP), WIDEST_JUMP)
-    return step_below(first) if best >= coarsest / 2 else best
+    if best is None:
+        return finest, change(step_below(finest)) <= allowed
+    return step_below(first) if best >= coarsest / 2 else best, True
 
 
-def _groups(tensors: Mapping[str, Tensor]) -> dict[str, list[Tensor]]:
-    """Name of a group to its tensors."""
-    groups: dict[str, list[Tensor]] = {}
+def _usual_size(values: Tensor) -> tuple[float, float]:
+    """The largest of the values but outliers, and the mean of their squares."""
+    sizes = values.abs().double()
+    nonzero = sizes[sizes > 0]
+    if not len(nonzero):
+        return 0.0, 0.0
+    usual = nonzero.kthvalue(max(int(USUAL_SHARE * len(nonzero)), 1)).values
+    sizes = sizes[sizes <= OUTLYING * usual]
+    return float(sizes.max()), float(sizes.square().mean())
+
+
+def _groups(tensors: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
+    """Name of a group to its tensors by name."""
+    groups: dict[str, dict[str, Tensor]] = {}
     for name, x in tensors.items():
         group = group_of(name, x)
         if group is not None and x.numel():
-            groups.setdefault(group, []).append(x)
+            groups.setdefault(group, {})[name] = x
     return groups

@@ -13,6 +13,7 @@ from torch import Tensor
 from dyngs.storage.quantize import (
     FINEST_ROTATION,
     LARGEST_STEP,
+    LIMIT,
     NEAREST,
     OPACITY_STEPS,
     ROTATION_STEP,
@@ -54,6 +55,8 @@ _LIMITS = {Kind.ROTATION: (SMALLEST_STEP, ROTATION_STEP), Kind.OPACITY: OPACITY_
 FEW = 64
 """Tensors with no more values are stored as they are."""
 LARGEST_HALF = 65504.0
+MOST_FAR = 1 / 8
+"""Where a larger share of the values is out of reach of the whole numbers, all are stored as they are."""
 RELATIVE = "model.filter_std"
 """Stored in half precision: it spans orders of magnitude."""
 FIXED_STEPS = {
@@ -124,9 +127,12 @@ def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness
     Args:
         name: as in ``dyngs.storage.drawable``.
         x: its values.
-        steps: group to the largest step; a group that lacks is stored in half precision.
+        steps: group (or name, where it has none) to the largest step, 0 for none: stored as it is; a group that lacks
+            is stored in half precision.
         by_coarseness: Gaussians have a coarseness each.
     """
+    if steps.get(group_of(name, x) or name) == 0:
+        return Coding(Kind.EXACT)
     if name in FIXED_STEPS:
         return Coding(Kind.GRID, FIXED_STEPS[name])
     group = group_of(name, x)
@@ -136,7 +142,10 @@ def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness
     kind = _KINDS.get(name, Kind.GRID)
     low, high = _LIMITS.get(kind, (SMALLEST_STEP, LARGEST_STEP))
     low = max(low, FINEST_ROTATION) if kind is Kind.ROTATION else low  # files with finer ones are still read
-    return Coding(kind, step_below(min(max(steps[group], low), high)), by_coarseness and name in _BY_COARSENESS)
+    step = step_below(min(max(steps[group], low), high))
+    if kind in (Kind.GRID, Kind.SPARSE) and int((x.abs() >= LIMIT * step).sum()) > MOST_FAR * x.numel():
+        return Coding(Kind.EXACT)
+    return Coding(kind, step, by_coarseness and name in _BY_COARSENESS)
 
 
 def to_whole(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> Whole:

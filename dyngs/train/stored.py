@@ -21,8 +21,16 @@ from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.rendering import RenderOptions, contributions
 from dyngs.storage.drawable import LEARNED, drawable
-from dyngs.storage.file import SceneInfo, encoded, write_scene
-from dyngs.storage.precision import GREY_LEVELS, Precision, assumed_precision, coarseness_of, measured_precision
+from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
+from dyngs.storage.precision import (
+    GREY_LEVELS,
+    Draw,
+    Precision,
+    assumed_precision,
+    coarseness_of,
+    mean_square_change,
+    measured_precision,
+)
 from dyngs.storage.tensors import COARSENESS
 from dyngs.train.assemble import training_cameras
 from dyngs.train.background import evaluation_background
@@ -36,6 +44,8 @@ COMPARED = 6
 """Training views in which the change is measured."""
 SMALLEST_CHANGE = 0.01
 """Grey levels of 255; less is of no use."""
+MISSED = 1.05
+"""A file whose pictures change by so many times what is allowed is not written; less is rounding of the drawing."""
 LOOKED_AT = 50
 """Training views in which it is measured how much each Gaussian shows."""
 
@@ -76,13 +86,22 @@ def write_compact(run_dir: Path, out: Path, max_change: float | None = None, fie
         field_step: how many times as coarsely as that the field is rounded.
 
     Raises:
-        DyngsError: no such run, or the file cannot be written.
+        DyngsError: no such run, the pictures would change by more than ``max_change``, or the file cannot be written.
+            Nothing is written then.
     """
     config = load_resolved(run_dir)
     checkpoint = latest_checkpoint(run_dir)
-    tensors, precision = precision_of(config, checkpoint, max_change)
+    tensors, precision, draw = _precision(config, checkpoint, max_change)
     steps = {name: step * (field_step if name.startswith(LEARNED) else 1) for name, step in precision.steps.items()}
     data = encoded(SceneInfo(**asdict(checkpoint.info)), tensors, config.model, steps)
+    if draw is not None and precision.allowed is not None and field_step == 1:
+        change = GREY_LEVELS * math.sqrt(mean_square_change(draw(checkpoint.tensors), draw(decoded(data).tensors)))
+        if not change <= MISSED * precision.allowed:
+            raise DyngsError(
+                f"{run_dir}: stored in little space, pictures would change by {change:.2g} grey levels of 255, more "
+                f"than the {precision.allowed:.2g} allowed; nothing was written. Give a larger --max-change"
+            )
+        precision = replace(precision, change=change)
     write_scene(out / COMPACT_NAME, data)
     if out.resolve() != run_dir.resolve():
         save_config(config, out / RESOLVED_NAME)
@@ -93,10 +112,18 @@ def precision_of(
     config: Config, checkpoint: Checkpoint, max_change: float | None
 ) -> tuple[dict[str, Tensor], Precision]:
     """The tensors to store and how exactly: measured where the run's capture can be read."""
+    tensors, precision, _ = _precision(config, checkpoint, max_change)
+    return tensors, precision
+
+
+def _precision(
+    config: Config, checkpoint: Checkpoint, max_change: float | None
+) -> tuple[dict[str, Tensor], Precision, Draw | None]:
+    """As ``precision_of``, and what draws the pictures that were compared; None where there are none."""
     try:
         capture = read_capture(config.data)
     except DyngsError:
-        return checkpoint.tensors, assumed_precision(checkpoint.tensors)
+        return checkpoint.tensors, assumed_precision(checkpoint.tensors), None
     scene = stored_scene(checkpoint, config.model)
     options = render_options(config.model)
     visibility = _visibility(scene, _shots(config, capture, scene, LOOKED_AT), options)
@@ -118,7 +145,7 @@ def precision_of(
         truth = (pictures[i].composite(background) for i in range(len(pictures)))
         errors = [float((x.clamp(0, 1) - y).square().mean()) for x, y in zip(draw(tensors), truth, strict=True)]
         max_change = GREY_LEVELS * math.sqrt((10 ** (LOSS_DB / 10) - 1) * fmean(errors))
-    return tensors, measured_precision(tensors, draw, max(max_change, SMALLEST_CHANGE))
+    return tensors, measured_precision(tensors, draw, max(max_change, SMALLEST_CHANGE)), draw
 
 
 def num_bytes_exact(checkpoint: Checkpoint) -> int:

@@ -31,3 +31,11 @@ def test_what_moves_comes_first() -> None:
     order = storage_order(points, rows)
     assert sorted(order[:3]) == rows.tolist()
     assert sorted(order) == list(range(50))
+
+
+def test_an_outlier_does_not_put_the_others_into_one_cell() -> None:
+    points = np.random.default_rng(0).random((2000, 3))
+    with_outlier = np.concatenate([points, [[1e8, -1e8, 0]]])
+    order = morton_order(with_outlier)
+    along = points[order[order < 2000]]
+    assert np.linalg.norm(np.diff(along, axis=0), axis=1).mean() < 0.15

@@ -14,7 +14,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.rendering import render
 from dyngs.storage.drawable import completed, drawable
 from dyngs.storage.precision import assumed_precision, coarseness_of, measured_precision
-from dyngs.storage.tensors import MAX_COARSENESS, coding_of, restored
+from dyngs.storage.tensors import MAX_COARSENESS, Kind, coding_of, restored
 
 
 def tensors() -> dict[str, Tensor]:
@@ -67,3 +67,49 @@ def test_coarseness_is_half_an_octave_per_octave() -> None:
     assert coarseness_of(visibility).tolist() == [0] * 8 + [2, MAX_COARSENESS]
     assert coarseness_of(torch.zeros(0)).shape == (0,)
     assert coarseness_of(torch.zeros(3)).tolist() == [MAX_COARSENESS] * 3
+
+
+def change_after(stored: dict[str, Tensor], exact: dict[str, Tensor], steps: Mapping[str, float]) -> float:
+    """Grey levels by which rounding with ``steps`` changes the picture."""
+    rounded = {name: restored(x, coding_of(name, x, steps)) for name, x in exact.items()}
+    before, after = draw(stored)[0].clamp(0, 1), draw(completed(rounded))[0].clamp(0, 1)
+    return 255 * float((before - after).double().square().mean().sqrt())
+
+
+@pytest.mark.parametrize("name", ["means", "sh", "log_scales"])
+def test_an_outlier_does_not_decide_the_steps_of_the_others(name: str) -> None:
+    """A Gaussian far behind the camera, or of absurd colour or size there."""
+    usual, with_outlier = tensors(), tensors()
+    with_outlier["gaussians.means"][5] = torch.tensor([0.0, 0.0, -1e8])
+    usual["gaussians.means"][5] = torch.tensor([0.0, 0.0, -50.0])
+    if name != "means":
+        with_outlier[f"gaussians.{name}"][5] = -1e8
+    precision = measured_precision(with_outlier, draw, 0.5)
+    assert precision.change is not None
+    assert precision.change <= 0.5
+    assert change_after(with_outlier, drawable(with_outlier), precision.steps) == pytest.approx(precision.change)
+    stored = "sh_base" if name == "sh" else name
+    steps = measured_precision(usual, draw, 0.5).steps
+    assert (
+        steps[f"gaussians.{stored}"] / 4 <= precision.steps[f"gaussians.{stored}"] <= 4 * steps[f"gaussians.{stored}"]
+    )
+
+
+def test_what_no_step_is_fine_enough_for_is_stored_as_it_is() -> None:
+    """Half of the Gaussians are 1e9 times as far away as the others, beyond what one step can serve."""
+    far = tensors()
+    far["gaussians.means"][::2] *= 1e9
+    precision = measured_precision(far, draw, 0.01)
+    assert precision.change is not None
+    assert precision.change <= 0.01
+    means = drawable(far)["gaussians.means"]
+    assert coding_of("gaussians.means", means, precision.steps).kind is Kind.EXACT
+
+
+def test_a_picture_that_is_not_finite_is_not_within_what_is_allowed() -> None:
+    def draw_nan(state: Mapping[str, Tensor]) -> list[Tensor]:
+        return [x.fill_(torch.nan) for x in draw(state)]
+
+    change = measured_precision(tensors(), draw_nan, 1.0).change
+    assert change is not None
+    assert not change <= 1.0

@@ -12,6 +12,7 @@ from moving_scene import write_moving_run
 
 from dyngs.deform.masks import KeyMasks
 from dyngs.errors import DyngsError
+from dyngs.storage.precision import Precision
 from dyngs.train.checkpoint import latest_checkpoint, load_run, save_checkpoint
 from dyngs.train.stored import write_compact
 
@@ -42,6 +43,41 @@ def test_a_run_with_masks_is_stored_with_them(tmp_path: Path) -> None:
     write_compact(run_dir, tmp_path / "small", 0.5)
     stored = load_run(tmp_path / "small").scene
     assert [len(stored.at(time)) for time in (0.2, 0.7)] == [5, 4]
+
+
+def with_outlier(run_dir: Path, **values: float) -> None:
+    """Save the run anew with a value of its first Gaussian, behind all cameras, replaced in each named attribute."""
+    checkpoint = latest_checkpoint(run_dir)
+    tensors = {name: x.clone() for name, x in checkpoint.tensors.items()}
+    for name, value in values.items():
+        tensors[f"gaussians.{name}"][0] = value
+    save_checkpoint(run_dir, replace(checkpoint, tensors=tensors), 1.0)
+
+
+@pytest.mark.parametrize("values", [{"means": 1e8}, {"means": -3e37}, {"means": 1e6, "sh": 1e8, "log_scales": -90.0}])
+def test_an_outlier_does_not_spoil_the_others(tmp_path: Path, values: dict[str, float]) -> None:
+    run_dir = write_moving_run(tmp_path)
+    with_outlier(run_dir, **values)
+    written = write_compact(run_dir, tmp_path / "small", 0.5)
+    assert written.precision.change is not None
+    assert written.precision.change <= 0.5
+    before, after = (load_run(folder).scene.at(0.6).means for folder in (run_dir, tmp_path / "small"))
+    order = [x[:, 0].argsort() for x in (before, after)]
+    torch.testing.assert_close(after[order[1]], before[order[0]], atol=0.1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("into_run", [True, False])
+def test_a_file_that_changes_pictures_more_than_allowed_is_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, into_run: bool
+) -> None:
+    run_dir = write_moving_run(tmp_path)
+    before = sorted(run_dir.rglob("*"))
+    coarse = {f"gaussians.{name}": 0.5 for name in ("means", "log_scales", "sh_base")}
+    monkeypatch.setattr("dyngs.train.stored.measured_precision", lambda *_: Precision(coarse, 0.1, 0.5))
+    with pytest.raises(DyngsError, match=r"more than the 0.5 allowed; nothing was written. Give a larger --max-change"):
+        write_compact(run_dir, run_dir if into_run else tmp_path / "small", 0.5)
+    assert sorted(run_dir.rglob("*")) == before
+    assert not (tmp_path / "small").exists()
 
 
 def test_without_its_capture_steps_are_assumed(tmp_path: Path) -> None:
