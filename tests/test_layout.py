@@ -33,11 +33,6 @@ MANY_PARAMETERS = {
 """Functions that may take more parameters, each with its reason."""
 
 HEAVY = ("pycolmap", "trimesh", "kornia", "OpenImageIO", "skimage", "av", "rich", "tensorboard", "lpips")
-UNPICKLERS = {
-    "dyngs/data/pickles.py": "reads pickles of numbers and arrays with an unpickler that knows nothing else",
-}
-"""Files that may import pickle, each with its reason."""
-
 WITHOUT_MIRROR = {
     "test_layout.py": "about the repository, not one module",
     "test_numerics.py": "the table of docs/numerics.md",
@@ -136,7 +131,7 @@ def test_no_code_from_data() -> None:
                 names = {"pickle"} if called in ("eval", "exec", "yaml.load", "torch.load", "os.system") else set()
             else:
                 continue
-            if names & forbidden_modules and not (relative(path) in UNPICKLERS and names == {"pickle"}):
+            if names & forbidden_modules:
                 found.append(f"{relative(path)}:{node.lineno}")
     assert found == []
 

@@ -242,7 +242,7 @@ def test_damaged_sparse_matrices(part: str, value: object, tmp_path: Path) -> No
         getattr(matrix, part)[3] = value
     else:
         setattr(matrix, part, value)
-    with pytest.raises(DyngsError, match=r"cannot be read as a pickle \("):
+    with pytest.raises(DyngsError, match=r"cannot be read as a pickle \(|asks for .* entries of sparse matrices"):
         read_pickle(pickled(tmp_path, pickle.dumps({"J": matrix}, 2)))
 
 
