@@ -31,7 +31,7 @@ def test_names_of_other_versions(arrays: Arrays, module: str, name: str, known: 
 
 @pytest.mark.parametrize("name", [("os", "system"), ("numpy", "load"), ("functools", "partial"), (None, "a"), ("a", 1)])
 def test_other_names(arrays: Arrays, name: tuple[Any, Any]) -> None:
-    with pytest.raises(ValueError, match="it holds|no proper name"):
+    with pytest.raises(ValueError, match=r"it holds|no proper name"):
         arrays.named(*name)
 
 
