@@ -57,6 +57,6 @@ def _body_of(root: Path, split: Split, views: tuple[View, ...], train: BodyFrame
 
 
 def _read_body(path: Path) -> BodyFrames:
-    found = read_npz(path, ("poses", "trans", "betas"))
+    found = read_npz(path, ("poses", "trans", "betas"), ("scale",))
     frames = range(len(found["poses"]) if found["poses"].ndim else 0)
     return body_frames(path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0))

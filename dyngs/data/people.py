@@ -18,6 +18,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from dyngs.data.archives import read_arrays
 from dyngs.data.capture import Split, View
 from dyngs.data.images import read_picture
 from dyngs.errors import DyngsError
@@ -241,19 +242,15 @@ def numbers_of(where: object, value: object, shape: tuple[int, ...] | None) -> n
     return array.ravel() if shape is None else array.reshape(shape)
 
 
-def read_npz(path: Path, keys: Collection[str]) -> dict[str, np.ndarray]:
-    """The arrays of a ``.npz`` file, ``keys`` among them; Python objects are refused.
+def read_npz(path: Path, keys: Collection[str], optional: Collection[str] = ()) -> dict[str, np.ndarray]:
+    """The arrays of a ``.npz`` file: ``keys``, and of ``optional`` what is there; Python objects are refused.
 
     Raises:
-        DyngsError: the file is missing or damaged, holds objects, or lacks a key.
+        DyngsError: the file is missing or damaged, holds objects there, lacks a key, or asks for too much memory.
     """
     if not path.is_file():
         raise DyngsError(f"{path}: no such file; it should hold the body parameters {', '.join(keys)}")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            found = {name: archive[name] for name in archive.files}
-    except Exception as error:  # a damaged archive raises nearly anything
-        raise DyngsError(f"{path}: cannot be read as a .npz file ({_reason(error)}); copy it again") from None
+    found = read_arrays(path, lambda names: [name for name in (*keys, *optional) if name in names])
     for key in keys:
         entry(path, found, key)
     return found
@@ -291,10 +288,19 @@ def _levels(silhouette: Silhouette) -> Tensor:
 def _float_array(value: object) -> np.ndarray | None:
     """float64, None where these are no numbers."""
     try:
-        array = np.asarray(value)
-        return array.astype(np.float64) if array.dtype.kind in "biuf" else None
+        array = np.asarray(value) if _is_numeric(value) else None
+        return array.astype(np.float64) if array is not None and array.dtype.kind in "biuf" else None
     except (TypeError, ValueError, OverflowError):
         return None
+
+
+def _is_numeric(value: object) -> bool:
+    """Whether there are but numbers in it: NumPy would make every text among them as long as the longest."""
+    if isinstance(value, (list, tuple)):
+        return all(_is_numeric(part) for part in value)
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "biuf"
+    return isinstance(value, (int, float, np.generic)) and not isinstance(value, (str, bytes))
 
 
 def _rows(where: Path, name: str, value: object, frames: Sequence[int], width: int = 0) -> np.ndarray:

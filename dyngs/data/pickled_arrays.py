@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from dyngs.data.archives import require_text
 from dyngs.data.limits import require_at_most
 
 _MOST_ENTRIES = 1 << 24
@@ -159,8 +160,7 @@ class Arrays:
             target.levels = _levels(raw)
         else:
             raw = bytes(raw)
-            if kind == "U" and (np.frombuffer(raw, dtype.value.byteorder + "u4") > 0x10FFFF).any():
-                raise ValueError("an array of text in it holds what is no text")
+            require_text(raw, dtype.value)
         target.__setstate__((1, tuple(shape), dtype.value, bool(fortran), raw))  # type: ignore[arg-type]
 
     def _become(self, target: Array, array: np.ndarray) -> None:

@@ -5,13 +5,13 @@ Local letters: J joints, F frames, B shape parameters.
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from dyngs.data.archives import read_arrays
 from dyngs.errors import DyngsError
 from dyngs.human.body import Body
 from dyngs.human.motion import ROWS, Motion, Up
@@ -70,13 +70,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
     keys = ("poses", *_PARTS, "trans", "betas", "scale", "up_axis", "mocap_framerate", "mocap_frame_rate")
     if not path.is_file():
         raise DyngsError(f"{path}: no such file")
-    if not zipfile.is_zipfile(path):
-        raise DyngsError(f"{path}: not an .npz archive, or cut off; copy it again")
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return {key: file[key] for key in keys if key in file.files}
-    except Exception as error:  # a damaged header may raise anything that Python's parser does
-        raise DyngsError(f"{path}: a damaged .npz, or one of objects ({' '.join(str(error).split()):.80})") from None
+    return read_arrays(path, lambda names: [key for key in keys if key in names])
 
 
 def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:

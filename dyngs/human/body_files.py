@@ -6,8 +6,6 @@ Local letters: J joints, M vertices, T triangles, U UV vertices, n any number.
 from __future__ import annotations
 
 import io
-import zipfile
-import zlib
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,8 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.data.archives import read_arrays
+from dyngs.data.limits import require_at_most
 from dyngs.data.pickles import read_pickle
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading, reason
 from dyngs.human.body import Body
 
 _SMPL = ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs", "posedirs")
@@ -26,6 +26,8 @@ _UV = ("vt", "ft")
 _NAMES = {24: "smpl", 52: "smplh", 55: "smplx"}
 _NO_PARENT = 2**32 - 1
 """-1 as unsigned 32-bit, which is how SMPL files mark the root."""
+_MOST_VERTICES = 250_000
+"""SMPL-X has 10,475; of triangles four times as many are read."""
 _LARGEST = 1e10
 """No number of a body is larger, in whatever unit; one that is comes from damage."""
 
@@ -49,11 +51,20 @@ def load_body(path: Path, uv: Path | None = None) -> Body:
         raise DyngsError(f"{path}: is a folder; name the .npz or .pkl file of one body in it")
     if path.suffix.lower() not in (".npz", ".pkl"):
         raise DyngsError(f"{path}: a body file must end in .npz or .pkl")
-    arrays = _Arrays(path, _read_npz(path) if path.suffix.lower() == ".npz" else _read_pickle(path))
+    with reading(path):
+        is_npz = path.suffix.lower() == ".npz"
+        arrays = _Arrays(path, read_arrays(path, lambda names: _wanted(path, names)) if is_npz else _read_pickle(path))
+        return _body(arrays, None if uv is None else Path(uv))
+
+
+def _body(arrays: _Arrays, uv: Path | None) -> Body:
+    """The body of the arrays, with the texture coordinates of the file ``uv``, or their own where that is None."""
     parents = _parents(arrays)
     vertices = arrays.floats("v_template", (None, 3))
+    require_at_most(arrays.path, len(vertices), _MOST_VERTICES, "vertices")
     faces = arrays.indices("f", (None, 3), len(vertices), "vertices")
-    corners = _own_uv(arrays, len(faces)) if uv is None else _read_obj(Path(uv), faces, len(vertices))
+    require_at_most(arrays.path, len(faces), 4 * _MOST_VERTICES, "triangles")
+    corners = _own_uv(arrays, len(faces)) if uv is None else _read_obj(uv, faces, len(vertices))
     is_template = "weights_idx" in arrays.values
     weights, joints = (_template_skin if is_template else _smpl_skin)(arrays, vertices, len(parents))
     body = Body(
@@ -225,12 +236,16 @@ def _in_unit_square(path: Path, uv: np.ndarray) -> np.ndarray:
 
 def _read_obj(path: Path, faces: np.ndarray, num_vertices: int) -> _Corners:
     """Texture coordinates of an ``.obj`` and, for each corner of the triangles ``faces`` (T, 3), which is its own."""
+    if path.exists() and not path.is_file():
+        raise DyngsError(f"{path}: is no file; name the .obj made for this body")
     try:
-        lines = path.read_text("latin-1").split("\n")
+        lines = io.StringIO(path.read_text("latin-1"))
     except OSError as error:
-        raise DyngsError(f"{path}: cannot be read ({_reason(error)})") from None
+        raise DyngsError(f"{path}: cannot be read ({reason(error)})") from error
     count, uv, corners = 0, [], []
     for number, line in enumerate(lines, 1):
+        if count > num_vertices or len(corners) > len(faces) or len(uv) > 3 * len(faces):
+            break  # it is of another body, however long it is
         kind, *words = line.split() or [""]
         try:
             if kind == "v":
@@ -293,32 +308,6 @@ def _wanted(path: Path, present: Collection[object]) -> list[str]:
     if missing:
         raise DyngsError(f"{path}: lacks {', '.join(missing)}; give a body file of SMPL, SMPL-H or SMPL-X")
     return [*needed, *(key for key in _UV if key in present)]
-
-
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with path.open("rb") as opened, zipfile.ZipFile(opened) as archive:
-            present = {name.removesuffix(".npy"): name for name in archive.namelist()}
-            keys = _wanted(path, present)
-            return {key: _member(path, key, archive.read(present[key])) for key in keys}
-    except OSError as error:
-        raise DyngsError(f"{path}: cannot be read ({_reason(error)})") from None
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError, MemoryError) as error:
-        raise DyngsError(f"{path}: not a .npz, or a damaged one ({_reason(error)}); copy it again") from None
-
-
-def _member(path: Path, key: str, content: bytes) -> np.ndarray:
-    try:
-        return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
-    except Exception as error:  # NumPy reads the header as Python text; a damaged one raises nearly anything
-        reason = "it holds Python objects" if "allow_pickle" in str(error) else _reason(error)
-        raise DyngsError(f"{path}: '{key}' is not an array of numbers ({reason}); export it again") from None
-
-
-def _reason(error: Exception) -> str:
-    """What an exception says, in part of a line."""
-    said = error.strerror if isinstance(error, OSError) else None
-    return " ".join((said or str(error) or type(error).__name__).split())[:80]
 
 
 def _read_pickle(path: Path) -> dict[str, np.ndarray]:

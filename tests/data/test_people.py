@@ -262,11 +262,11 @@ def test_npz(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match=r"a\.npz: no such file; it should hold the body parameters poses, trans"):
         read_npz(path, ("poses", "trans"))
     np.savez(path, poses=np.zeros(3), gender="neutral")
-    assert set(read_npz(path, ("poses",))) == {"poses", "gender"}
+    assert set(read_npz(path, ("poses",), ("gender", "scale"))) == {"poses", "gender"}
     with pytest.raises(DyngsError, match="'trans' is missing"):
         read_npz(path, ("poses", "trans"))
     np.savez(path, poses=np.array([{}]))
-    with pytest.raises(DyngsError, match=r"a\.npz: cannot be read"):
+    with pytest.raises(DyngsError, match=r"a\.npz: 'poses' is not an array of numbers .*it holds Python objects"):
         read_npz(path, ("poses",))
     np.save(tmp_path / "b.npy", np.zeros(3))
     for damaged in (b"", b"PK\x03\x04", b"\x80\x04N.", (tmp_path / "b.npy").read_bytes()):

@@ -202,7 +202,7 @@ NAN = np.full((FRAMES, 3), np.nan)
         ({"poses": np.full((4, 165), "a")}, "'poses' must hold numbers, not <U1"),
         ({"poses": np.full((4, 165), 1e30)}, "'poses' holds NaN or huge"),
         ({"poses": np.zeros((4, 165), complex)}, "'poses' must hold numbers"),
-        ({"poses": np.array([{}], object)}, "a damaged .npz, or one of objects"),
+        ({"poses": np.array([{}], object)}, "'poses' is not an array of numbers .*it holds Python objects"),
         ({"trans": None}, "the key 'trans' is missing"),
         ({"trans": NAN}, "'trans' holds NaN"),
         ({"trans": np.zeros((3, 3))}, "'trans' must be 4 x 3 numbers as 'poses' has 4 frames, has 3 x 3"),
