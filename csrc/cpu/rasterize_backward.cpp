@@ -1,9 +1,14 @@
 // Backward pass of the blending, back to front (Kerbl et al. 2023). With the background as a last, opaque layer and
 // s_i = <colour_i, dL/dC>, B = what lies behind i (as the same scalar), T_i the transmittance before i:
 //   dL/dalpha_i = T_i (s_i - B),   B <- B + alpha_i (s_i - B).
-// For each Gaussian only sums over pixels are needed: of p = alpha dL/dalpha times 1, dx, dy, dx^2, dx dy, dy^2, and of
-// alpha T times dL/dC. They are taken 16 Gaussians at a time after a transpose, added up per tile entry, written to the
-// entry's own slot, and finally summed per Gaussian in slot order: no atomics, the same bytes for any thread count.
+// For each Gaussian only sums over pixels are needed: of p = alpha dL/dalpha times 1, u, v, u dx, u dy, v dy (see
+// math/projection.hpp), and of alpha T times dL/dC. They are taken 16 Gaussians at a time after a transpose, added up per
+// tile entry, written to the entry's own slot, and finally summed per Gaussian in slot order: no atomics, the same bytes
+// for any thread count.
+//
+// The centre may lie far outside the picture, 1e5 px where the splat is 1 px wide. Moments about it would be differences of
+// numbers 1e10 times larger than they are. So a tile sums moments in x, y about the point of the tile nearest to the centre,
+// a slot holds those with u and v about the point of the picture nearest to it, and only the total is moved to the centre.
 #include <array>
 #include <memory>
 
@@ -14,7 +19,9 @@
 namespace dyngs {
 namespace {
 
-enum Moment { kOne, kDx, kDy, kDxDx, kDxDy, kDyDy, kMoments };
+enum Moment { kOne, kDx, kDy, kDxDx, kDxDy, kDyDy, kMoments };  // within a tile
+enum SlotMoment { kP, kU, kV, kUDx, kUDy, kVDy };                  // in a slot
+static_assert(kVDy + 1 == kMoments);
 constexpr int kMaxFields = 48;  // moments, channels, two absolute gradients; padded to whole packets
 static_assert(kMoments + kMaxChannels + 2 <= kMaxFields);
 
@@ -26,11 +33,25 @@ struct Layout {
   int packets() const { return (fields() + kLanes - 1) / kLanes; }
 };
 
+template <class S>
+struct Point { S x, y; };
+
+// The pixel centres of a tile nearest to a point, and those of the picture.
+template <class S>
+Point<S> nearest_in_tile(const TileFrame<S>& frame, S x, S y) {
+  const S x0 = static_cast<S>(frame.x0) + S(0.5), y0 = static_cast<S>(frame.y0) + S(0.5), side = S(kTile - 1);
+  return {std::clamp(x, x0, x0 + side), std::clamp(y, y0, y0 + side)};
+}
+template <class S>
+Point<S> nearest_in_picture(const Splats<S>& s, S x, S y) {
+  return {std::clamp(x, S(0), static_cast<S>(s.width)), std::clamp(y, S(0), static_cast<S>(s.height))};
+}
+
 // Up to 16 Gaussians of one block, waiting for the transpose.
 template <class S>
 struct Batch {
   Packet<S> p[kLanes], weight[kLanes];  // row: Gaussian, lane: pixel
-  Packet<S> dx, dy;                     // lane: Gaussian; centre minus the block's first pixel centre
+  Packet<S> dx, dy;                     // lane: Gaussian; its anchor minus the block's first pixel centre
   int index[kLanes];
   int count = 0;
 };
@@ -78,7 +99,7 @@ BlockPixels<S> load_pixels(const Splats<S>& s, const TileFrame<S>& frame, int bl
 }
 
 // Sums over the block's pixels of p times the powers of the lane offsets, for 16 Gaussians (rows already transposed),
-// turned into moments about each Gaussian's centre: dx = batch.dx - lane.x.
+// turned into moments about each Gaussian's anchor in the tile: dx = batch.dx - lane.x.
 template <class S>
 void add_moments(const Packet<S> (&p)[kLanes], const Batch<S>& batch, Packet<S>* out) {
   using P = Packet<S>;
@@ -102,27 +123,30 @@ void add_moments(const Packet<S> (&p)[kLanes], const Batch<S>& batch, Packet<S>*
 
 // Sums over the block's pixels of |p d(log alpha)/d(mean)|: absolute values do not factor into moments.
 template <class S>
-void add_absolute(const Packet<S> (&p)[kLanes], const Batch<S>& batch, const Chunk<S>& chunk, Packet<S>* out) {
+void add_absolute(const Packet<S> (&p)[kLanes], const Batch<S>& batch, const Chunk<S>& chunk, S px, S py,
+                  Packet<S>* out) {
   using P = Packet<S>;
-  P u, w, v;
+  P u, w, v, first_a, first_b;
   for (int i = 0; i < kLanes; ++i) {
     const Record<S>& g = chunk.records[batch.index[i]];
     u[i] = g.u, w[i] = g.w, v[i] = g.v;
+    first_a[i] = g.u * (g.x - px) + g.w * (g.y - py), first_b[i] = g.v * (g.y - py);
   }
   P sum_x(S(0)), sum_y(S(0));
   for (int i = 0; i < kLanes; ++i) {
-    const P dx = batch.dx - P(static_cast<S>(i % kBlockSide)), dy = batch.dy - P(static_cast<S>(i / kBlockSide));
-    const P a = u * dx + w * dy;
+    const P x(static_cast<S>(i % kBlockSide)), y(static_cast<S>(i / kBlockSide));
+    const P a = first_a - u * x - w * y;
     sum_x += abs_of(p[i] * u * a);
-    sum_y += abs_of(p[i] * (w * a + v * (v * dy)));
+    sum_y += abs_of(p[i] * (w * a + v * (first_b - v * y)));
   }
   const P unscale(S(2) / S(1.4426950408889634));  // the records hold u, w, v times sqrt(log2(e) / 2)
   out[0] = sum_x * unscale;
   out[1] = sum_y * unscale;
 }
 
+// `px`, `py`: the block's first pixel centre.
 template <class S>
-void flush(const Layout& layout, const BlockPixels<S>& pixels, Scratch<S>& scratch) {
+void flush(const Layout& layout, S px, S py, const BlockPixels<S>& pixels, Scratch<S>& scratch) {
   Batch<S>& batch = scratch.batch;
   if (batch.count == 0) return;
   for (int i = batch.count; i < kLanes; ++i) {
@@ -142,7 +166,7 @@ void flush(const Layout& layout, const BlockPixels<S>& pixels, Scratch<S>& scrat
     }
     fields[kMoments + c] = even + odd;
   }
-  if (layout.absolute) add_absolute(batch.p, batch, scratch.chunk, fields + kMoments + layout.channels);
+  if (layout.absolute) add_absolute(batch.p, batch, scratch.chunk, px, py, fields + kMoments + layout.channels);
   const int packets = layout.packets();
   for (int i = layout.fields(); i < packets * kLanes; ++i) fields[i] = Packet<S>(S(0));
   for (int k = 0; k < packets; ++k) {
@@ -163,9 +187,10 @@ Packet<S> relative_stop(const BlockPixels<S>& pixels, int32_t chunk_begin) {
 }
 
 template <class S, int D>
-void block_backward(const Splats<S>& s, const Layout& layout, S px, S py, int32_t chunk_begin, int listed,
-                    BlockPixels<S>& pixels, Scratch<S>& scratch) {
+void block_backward(const Splats<S>& s, const Layout& layout, const TileFrame<S>& frame, int block, int32_t chunk_begin,
+                    int listed, BlockPixels<S>& pixels, Scratch<S>& scratch) {
   using P = Packet<S>;
+  const S px = frame.block_x[block], py = frame.block_y[block];
   const int channels = D == kDynamic ? layout.channels : D;
   const LaneOffsets<S> lane;
   const P alpha_max(s.alpha_max), one(S(1)), zero(S(0));
@@ -190,22 +215,43 @@ void block_backward(const Splats<S>& s, const Layout& layout, S px, S py, int32_
     behind += alpha * gap;
     batch.p[batch.count] = select(raw < alpha_max, weight * gap, zero);  // the clamp stops the gradient
     batch.weight[batch.count] = weight;
-    batch.dx[batch.count] = dx, batch.dy[batch.count] = dy;
+    const Point<S> anchor = nearest_in_tile(frame, g.x, g.y);
+    batch.dx[batch.count] = anchor.x - px, batch.dy[batch.count] = anchor.y - py;
     batch.index[batch.count] = i;
-    if (++batch.count == kLanes) flush(layout, pixels, scratch);
+    if (++batch.count == kLanes) flush(layout, px, py, pixels, scratch);
   }
-  flush(layout, pixels, scratch);
+  flush(layout, px, py, pixels, scratch);
   pixels.transmittance = transmittance;
   pixels.behind = behind;
 }
 
+// Moments of one entry about its anchor in the tile, turned into those of a slot.
 template <class S>
-void store_chunk(const Layout& layout, const Entries& entries, int64_t begin, const Scratch<S>& scratch, S* slots) {
+void write_moments(const Splats<S>& s, const TileFrame<S>& frame, const Record<S>& g, const S* sum, S* to) {
+  const double unscale = 1 / std::sqrt(0.5 * 1.4426950408889634);  // the records hold u, w, v times sqrt(log2(e) / 2)
+  const double u = g.u * unscale, w = g.w * unscale, v = g.v * unscale;
+  const Point<S> anchor = nearest_in_tile(frame, g.x, g.y), near = nearest_in_picture(s, g.x, g.y);
+  const double far_x = double(g.x) - anchor.x, far_y = double(g.y) - anchor.y;  // 0 where the centre is in the tile
+  const double first_u = u * far_x + w * far_y, first_v = v * far_y;
+  const double dx = sum[kDx], dy = sum[kDy];
+  const double sum_u = first_u * sum[kOne] + u * dx + w * dy, sum_v = first_v * sum[kOne] + v * dy;
+  const double x = double(near.x) - anchor.x, y = double(near.y) - anchor.y;
+  to[kP] = sum[kOne];
+  to[kU] = static_cast<S>(sum_u), to[kV] = static_cast<S>(sum_v);
+  to[kUDx] = static_cast<S>(first_u * dx + u * sum[kDxDx] + w * sum[kDxDy] + x * sum_u);
+  to[kUDy] = static_cast<S>(first_u * dy + u * sum[kDxDy] + w * sum[kDyDy] + y * sum_u);
+  to[kVDy] = static_cast<S>(first_v * dy + v * sum[kDyDy] + y * sum_v);
+}
+
+template <class S>
+void store_chunk(const Splats<S>& s, const Layout& layout, const TileFrame<S>& frame, const Entries& entries,
+                 int64_t begin, const Scratch<S>& scratch, S* slots) {
   const int fields = layout.fields(), packets = layout.packets();
   for (int i = 0; i < scratch.chunk.count; ++i) {
     S* to = slots + int64_t{entries.slots[begin + i]} * fields;
     const S* from = reinterpret_cast<const S*>(scratch.sums + i * packets);
-    for (int f = 0; f < fields; ++f) to[f] = from[f];
+    write_moments(s, frame, scratch.chunk.records[i], from, to);
+    for (int f = kMoments; f < fields; ++f) to[f] = from[f];
   }
 }
 
@@ -227,9 +273,9 @@ void tile_backward(const Splats<S>& s, const Layout& layout, const Entries& entr
     for (int b = 0; b < kBlocks; ++b) {
       if (!(frame.inside >> b & 1) || pixels[b].last <= chunk_begin) continue;
       const int listed = scratch.chunk.list_block(b, scratch.list);
-      block_backward<S, D>(s, layout, frame.block_x[b], frame.block_y[b], chunk_begin, listed, pixels[b], scratch);
+      block_backward<S, D>(s, layout, frame, b, chunk_begin, listed, pixels[b], scratch);
     }
-    store_chunk(layout, entries, at, scratch, slots);
+    store_chunk(s, layout, frame, entries, at, scratch, slots);
   }
 }
 
@@ -244,20 +290,24 @@ void all_tiles_backward(const Splats<S>& s, const Layout& layout, const Entries&
 
 // d(-(u^2 + v^2) / 2) with u = U dx + W dy, v = V dy, dx = mean - pixel, summed over pixels with weights p.
 template <class S>
-void write_gaussian(const Splats<S>& s, int64_t row, const S* sum, const Layout& layout, const SplatGrads<S>& out) {
-  const S u = s.factors[3 * row], w = s.factors[3 * row + 1], v = s.factors[3 * row + 2];
-  const S sum_u = u * sum[kDx] + w * sum[kDy];
-  const S grad_x = -u * sum_u, grad_y = -(w * sum_u + v * v * sum[kDy]);
+void write_gaussian(const Splats<S>& s, int64_t row, const double* sum, const Layout& layout, const SplatGrads<S>& out) {
+  const double u = s.factors[3 * row], w = s.factors[3 * row + 1], v = s.factors[3 * row + 2];
+  const S mean_x = s.means2d[2 * row], mean_y = s.means2d[2 * row + 1];
+  const Point<S> near = nearest_in_picture(s, mean_x, mean_y);
+  const double far_x = double(mean_x) - near.x, far_y = double(mean_y) - near.y;
+  const S grad_x = static_cast<S>(-u * sum[kU]), grad_y = static_cast<S>(-(w * sum[kU] + v * sum[kV]));
   out.means2d[2 * row] = grad_x, out.means2d[2 * row + 1] = grad_y;
-  out.factors[3 * row] = -(u * sum[kDxDx] + w * sum[kDxDy]);
-  out.factors[3 * row + 1] = -(u * sum[kDxDy] + w * sum[kDyDy]);
-  out.factors[3 * row + 2] = -v * sum[kDyDy];
-  const S opacity = s.opacities[row];
-  out.opacities[row] = opacity > S(0) ? sum[kOne] / opacity : S(0);
-  for (int c = 0; c < layout.channels; ++c) out.colors[row * layout.channels + c] = sum[kMoments + c];
+  out.factors[3 * row] = static_cast<S>(-(sum[kUDx] + far_x * sum[kU]));
+  out.factors[3 * row + 1] = static_cast<S>(-(sum[kUDy] + far_y * sum[kU]));
+  out.factors[3 * row + 2] = static_cast<S>(-(sum[kVDy] + far_y * sum[kV]));
+  const double opacity = s.opacities[row];
+  out.opacities[row] = opacity > 0 ? static_cast<S>(sum[kP] / opacity) : S(0);
+  const double* channels = sum + kMoments;
+  for (int c = 0; c < layout.channels; ++c) out.colors[row * layout.channels + c] = static_cast<S>(channels[c]);
   if (out.probe == nullptr) return;
   out.probe[4 * row] = grad_x, out.probe[4 * row + 1] = grad_y;
-  for (int k = 0; k < 2; ++k) out.probe[4 * row + 2 + k] = layout.absolute ? sum[kMoments + layout.channels + k] : S(0);
+  for (int k = 0; k < 2; ++k)
+    out.probe[4 * row + 2 + k] = layout.absolute ? static_cast<S>(channels[layout.channels + k]) : S(0);
 }
 
 template <class S>
@@ -266,7 +316,7 @@ void sum_slots(const Splats<S>& s, const Layout& layout, const Entries& entries,
   const int fields = layout.fields();
   parallel_for(s.num_views * s.num_gaussians, 1024, s.threads, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
-      S sum[kMaxFields] = {};
+      double sum[kMaxFields] = {};
       for (int64_t k = entries.slot_ranges[2 * i]; k < entries.slot_ranges[2 * i + 1]; ++k)
         for (int f = 0; f < fields; ++f) sum[f] += slots[k * fields + f];
       write_gaussian(s, i, sum, layout, out);

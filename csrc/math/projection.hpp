@@ -180,10 +180,15 @@ struct ProjectionGrad {
   R view[3][3];    // with respect to the camera's rotation, through J W only
 };
 
-// Gradient with respect to M (2x3) of the splat's shape.
+// Gradient with respect to M (2x3) of the splat's shape, and with respect to the scales of its columns.
+//
+// The slope W = -s U, s = <M_row0, M_row1> / C_yy, of a needle hardly depends on its length; but what the two rows of its
+// column say about that are large numbers of opposite sign. Their sum is 2 q_k M_1k / C_yy with q = M_row0 - s M_row1, and
+//   q_k = sum_l n_l (M_0k n_l - M_0l n_k) + eps M_0k / C_yy
+// is a sum of small numbers.
 template <class R>
 void shape_vjp(const ProjectionState<R>& st, const Splat<R>& out, const SplatGrad<R>& g, typename ScalarOf<R>::type eps,
-               R (&gm)[2][3]) {
+               R (&gm)[2][3], R (&gs)[3]) {
   using S = typename ScalarOf<R>::type;
   const auto& m0 = st.m[0];
   const auto& m1 = st.m[1];
@@ -192,44 +197,51 @@ void shape_vjp(const ProjectionState<R>& st, const Splat<R>& out, const SplatGra
   // difference of nearly equal terms that dminors / c - minors dc / c^2 is for large splats. The slope of the
   // compensation sqrt(minors / c) is unbounded at zero area, where we stop it.
   const auto has_area = st.sum_minors > R(S(1e-12)) * st.c;
-  const R slope = select(has_area, half * g.compensation / max_of(out.compensation, R(S(1e-6))), R(S(0)));
+  const R by_area = select(has_area, half * g.compensation / max_of(out.compensation, R(S(1e-6))), R(S(0)));
   const R h = st.norm0 * out.v * out.v + R(S(1)), share = R(eps) / st.c;
-  const R g_u = g.u - st.b * out.v * g.w;
-  const R g_b = -out.v * out.u * g.w;
-  R g_v = g.v - st.b * out.u * g.w;
+  const R slope = st.b * out.v, g_slope = -out.v * out.v * out.u * g.w;  // the latter by s C_yy
+  const R g_u = g.u - slope * g.w;
+  R g_v = g.v;
   const R g_c = -half * out.u * out.u * out.u * g_u;
-  const R g_minors = g_c + slope * share * h / st.c;
-  const R g_h = R(eps) * g_c - slope * share * (st.sum_minors / st.c);
+  const R g_minors = g_c + by_area * share * h / st.c;
+  const R g_h = R(eps) * g_c - by_area * share * (st.sum_minors / st.c);
   const R g_norm0 = out.v * out.v * g_h;
   g_v += two * st.norm0 * out.v * g_h;
-  R g_n[3];
+  R g_n[3], q[3];
   for (int k = 0; k < 3; ++k) {
-    gm[0][k] = two * m0[k] * g_norm0 + g_b * st.n[k];
-    g_n[k] = g_b * m0[k];
+    gm[0][k] = two * m0[k] * g_norm0;
+    g_n[k] = R(S(0));
+    q[k] = R(eps) * out.v * out.v * m0[k];
   }
   for (int k = 0; k < 3; ++k)
     for (int l = k + 1; l < 3; ++l) {
-      const R d = two * g_minors * (m0[k] * st.n[l] - m0[l] * st.n[k]);
+      const R minor = m0[k] * st.n[l] - m0[l] * st.n[k], d = two * g_minors * minor;
       gm[0][k] += d * st.n[l];
       gm[0][l] -= d * st.n[k];
       g_n[l] += d * m0[k];
       g_n[k] -= d * m0[l];
+      q[k] += st.n[l] * minor;
+      q[l] -= st.n[k] * minor;
     }
   for (int k = 0; k < 3; ++k) g_v += g_n[k] * m1[k];
   const R g_var_y = -half * out.v * out.v * out.v * g_v;
-  for (int k = 0; k < 3; ++k) gm[1][k] = g_n[k] * out.v + two * m1[k] * g_var_y;
+  for (int k = 0; k < 3; ++k) {
+    gm[1][k] = g_n[k] * out.v + two * m1[k] * g_var_y;
+    gs[k] = gm[0][k] * st.g[0][k] + gm[1][k] * st.g[1][k] + two * g_slope * q[k] * st.g[1][k];
+    gm[0][k] += g_slope * m1[k];
+    gm[1][k] += g_slope * (q[k] - slope * m1[k]);
+  }
 }
 
 template <class R, class S>
 ProjectionGrad<R> project_vjp(const Pinhole<S>& cam, const Quat<R>& unit, const Vec3<R>& scale, S eps,
                               const ProjectionState<R>& st, const Splat<R>& out, const SplatGrad<R>& g) {
-  R gm[2][3];
-  shape_vjp(st, out, g, eps, gm);
+  R gm[2][3], gs[3];
+  shape_vjp(st, out, g, eps, gm, gs);
   const R s[3] = {scale.x, scale.y, scale.z};
-  R gs[3], gg[2][3], ga[2][3];
+  R gg[2][3], ga[2][3];
   Mat3<R> g_rot;
   for (int k = 0; k < 3; ++k) {
-    gs[k] = gm[0][k] * st.g[0][k] + gm[1][k] * st.g[1][k];
     gg[0][k] = gm[0][k] * s[k];
     gg[1][k] = gm[1][k] * s[k];
   }
