@@ -60,14 +60,15 @@ void update(const Piece& piece, const int32_t* active, int64_t count, const Coef
   update_floats<masked>(piece.param, piece.grad, piece.exp_avg, piece.exp_avg_sq, piece.step, active, count, c);
 }
 
-// Exponent bits all ones: infinity or NaN.
-bool all_finite(const float* x, int64_t count) {
-  constexpr uint32_t kExponent = 0x7f800000u;
-  uint32_t bad = 0;
+// Neither NaN nor 2^63 or more of either sign: a second moment that has taken in the square of such a number is infinite or
+// nearly so, and holds its parameter for ever. Without their sign, floats sort as integers, NaN on top.
+bool all_usable(const float* x, int64_t count) {
+  constexpr int32_t kMagnitude = 0x7fffffff, kTooLarge = 0x5f000000;
+  int32_t bad = 0;
   for (int64_t i = 0; i < count; ++i) {
-    uint32_t bits;
+    int32_t bits;
     std::memcpy(&bits, x + i, sizeof bits);
-    bad |= (bits & kExponent) == kExponent;
+    bad |= (bits & kMagnitude) >= kTooLarge;
   }
   return bad == 0;
 }
@@ -118,13 +119,13 @@ Plan make_plan(const AdamState& state, const AdamRates& rates) {
   return plan;
 }
 
-// Clears active[r] of rows with a non-finite gradient; returns how many.
-int64_t drop_non_finite(const Plan& plan, Block block, bool* active) {
+// Clears active[r] of rows with a gradient that cannot be used; returns how many.
+int64_t drop_unusable(const Plan& plan, Block block, bool* active) {
   const int64_t size = plan.state.row_size;
   const float* grad = plan.state.grad + block.first_row * size;
   int64_t dropped = 0;
   for (int64_t r = 0; r < block.num_rows; ++r) {
-    if (!active[r] || all_finite(grad + r * size, size)) continue;
+    if (!active[r] || all_usable(grad + r * size, size)) continue;
     active[r] = false;
     ++dropped;
   }
@@ -166,8 +167,8 @@ int64_t update_block(const Plan& plan, Block block) {
   }
   // With long rows to choose from, only the gradients of the chosen ones should be read.
   const bool check_each = rows && size >= kLongRow;
-  const bool check = check_each || !all_finite(plan.state.grad + block.first_row * size, block.num_rows * size);
-  const int64_t skipped = check ? drop_non_finite(plan, block, active) : 0;
+  const bool check = check_each || !all_usable(plan.state.grad + block.first_row * size, block.num_rows * size);
+  const int64_t skipped = check ? drop_unusable(plan, block, active) : 0;
 
   int64_t num_active = 0;
   for (int64_t r = 0; r < block.num_rows; ++r) num_active += active[r];

@@ -24,8 +24,8 @@ struct AdamRates {
   int64_t step;  // 1 for the first update
 };
 
-// Updates the rows asked for whose gradient is finite, and leaves value and moments of all others as they are.
-// Returns the number of rows that were asked for but had a non-finite gradient.
+// Updates the rows asked for whose gradient is below 2^63 throughout, and leaves value and moments of all others as they are.
+// Returns the number of rows that were asked for but had NaN, infinity or a larger gradient.
 int64_t adam_step(const AdamState& state, const AdamRates& rates, int num_threads);
 
 // Sets seen[r] where row r of grads (num_rows, row_size) has an element other than zero; NaN counts as such.

@@ -17,11 +17,17 @@
 // As dd/dx = ds/dx = 1 and G is its own adjoint (symmetric kernel, zero padding),
 //   dSSIM/dx = G(A_d + A_s) + 2 d G(A_dd) + 2 s G(A_ss).
 //
-// Channels are interleaved: a row is 3 * width floats, and the horizontal taps lie 3 floats apart.
+// Precision. V = G(x^2) - G(x)^2 loses digits where x^2 is large beside C2: in float32 0.1% of Q at kLargestInFloat. A
+// tile with more than that anywhere, which no ordinary picture has, is computed again in float64: 0.1% are then reached at
+// 1e5, and nothing overflows. Which it is depends on the tile's pixels alone.
+//
+// Channels are interleaved: a row is 3 * width numbers, and the horizontal taps lie 3 numbers apart.
 #include "cpu/loss.hpp"
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
+#include <cstddef>
 #include <cstring>
 #include <memory>
 
@@ -31,8 +37,9 @@ namespace {
 constexpr int kChannels = 3;
 constexpr int kRadius = 5;
 constexpr int kTaps = 2 * kRadius + 1;
-constexpr float kC1 = 0.01f * 0.01f;
-constexpr float kC2 = 0.03f * 0.03f;
+constexpr double kC1 = 0.01 * 0.01;
+constexpr double kC2 = 0.03 * 0.03;
+constexpr double kLargestInFloat = 16;  // of G(d^2) + G(s^2): pictures up to 2
 
 constexpr int kBatch = 4;                        // rows filtered together: each row read serves up to four sums
 constexpr int kWindow = kBatch + 2 * kRadius;    // rows that a batch reads
@@ -42,30 +49,43 @@ constexpr int kTileRows = 96;
 constexpr int kTilePixels = 256;
 
 #if defined(__AVX512F__)
-constexpr int kFloatLanes = 16;
+constexpr int kLaneBytes = 64;
 #elif defined(__AVX__)
-constexpr int kFloatLanes = 8;
+constexpr int kLaneBytes = 32;
 #else
-constexpr int kFloatLanes = 4;
+constexpr int kLaneBytes = 16;
 #endif
-typedef float Lanes __attribute__((vector_size(kFloatLanes * sizeof(float))));
+template <class T>
+struct VectorOf {
+  typedef T type __attribute__((vector_size(kLaneBytes)));
+};
+template <class T>
+using Lanes = typename VectorOf<T>::type;
+template <class T>
+constexpr int kLanes = kLaneBytes / static_cast<int>(sizeof(T));
 
-inline Lanes load(const float* from) {
-  Lanes x;
+template <class T>
+inline Lanes<T> load(const T* from) {
+  Lanes<T> x;
   std::memcpy(&x, from, sizeof x);
   return x;
 }
-inline void store(float* to, Lanes x) { std::memcpy(to, &x, sizeof x); }
+template <class T>
+inline void store(T* to, Lanes<T> x) {
+  std::memcpy(to, &x, sizeof x);
+}
 
+template <class T>
 struct Kernel {
-  float tap[kTaps];
+  T tap[kTaps];
 };
 
-Kernel gaussian_kernel() {
+template <class T>
+Kernel<T> gaussian_kernel() {
   double value[kTaps], sum = 0;
   for (int i = 0; i < kTaps; ++i) sum += value[i] = std::exp(-(i - kRadius) * (i - kRadius) / (2 * 1.5 * 1.5));
-  Kernel kernel;
-  for (int i = 0; i < kTaps; ++i) kernel.tap[i] = static_cast<float>(value[i] / sum);
+  Kernel<T> kernel;
+  for (int i = 0; i < kTaps; ++i) kernel.tap[i] = static_cast<T>(value[i] / sum);
   return kernel;
 }
 
@@ -79,40 +99,56 @@ enum RingMap { kDifference, kSum, kWeight, kGradMean, kGradDifferenceSquare, kGr
 // Vertically blurred maps of the current batch; the adjoint pass reuses the first three.
 enum ScratchMap { kMeanD, kMeanS, kSquareD, kSquareS, kScratchMaps };
 
-// Row buffers of one thread. Float i of a row is float i of the picture's row minus 3 * (tile.col_begin - kHalo), so
-// that the tile itself starts at float kTileStart; everything outside the picture holds zeros.
+// Row buffers of one thread. Number i of a row is number i of the picture's row minus 3 * (tile.col_begin - kHalo), so
+// that the tile itself starts at number kTileStart; everything outside the picture holds zeros.
 constexpr int kTileStart = kChannels * kHalo;
 
+template <class T>
 class Workspace {
  public:
-  explicit Workspace(int64_t max_tile_pixels)
-      : stride_((kChannels * (max_tile_pixels + 2 * kHalo) + kFloatLanes - 1) / kFloatLanes * kFloatLanes + kFloatLanes),
-        floats_(new float[stride_ * kRows]()) {}
+  static int64_t size(int64_t max_tile_pixels) { return stride_for(max_tile_pixels) * kRows; }
+
+  // In memory of size(max_tile_pixels) numbers, which it clears.
+  Workspace(T* memory, int64_t max_tile_pixels) : stride_(stride_for(max_tile_pixels)), numbers_(memory) {
+    std::memset(numbers_, 0, size(max_tile_pixels) * sizeof(T));
+  }
 
   int64_t stride() const { return stride_; }
-  float* ring(int map, int64_t row) { return floats_.get() + (map * kRing + (row & (kRing - 1))) * stride_; }
-  float* scratch(int map, int index) { return floats_.get() + (kRingRows + map * kBatch + index) * stride_; }
-  float* line() { return floats_.get() + (kRows - 1) * stride_; }
+  T* ring(int map, int64_t row) { return numbers_ + (map * kRing + (row & (kRing - 1))) * stride_; }
+  T* scratch(int map, int index) { return numbers_ + (kRingRows + map * kBatch + index) * stride_; }
+  T* line() { return numbers_ + (kRows - 1) * stride_; }
 
  private:
   static constexpr int64_t kRingRows = kRingMaps * kRing;
   static constexpr int64_t kRows = kRingRows + kScratchMaps * kBatch + 1;
+  static int64_t stride_for(int64_t max_tile_pixels) {
+    return (kChannels * (max_tile_pixels + 2 * kHalo) + kLanes<T> - 1) / kLanes<T> * kLanes<T> + kLanes<T>;
+  }
   int64_t stride_;
-  std::unique_ptr<float[]> floats_;
+  T* numbers_;
 };
 
 // Everything that the steps below share for one tile.
+template <class T>
 struct Context {
   const LossInput& input;
-  const Kernel& kernel;
+  const Kernel<T>& kernel;
   Tile tile;
-  float scale;      // 1 / (channels * sum of the mask)
+  T scale;          // 1 / (channels * sum of the mask)
   float* gradient;  // nullptr: value only
-  Workspace& rows;
+  Workspace<T>& rows;
+  Lanes<T> largest = {};  // G(d^2) + G(s^2) so far, lane by lane
 
-  int64_t tile_floats() const { return kChannels * (tile.col_end - tile.col_begin); }
-  int64_t row_floats() const { return tile_floats() + 2 * kTileStart; }
+  int64_t tile_numbers() const { return kChannels * (tile.col_end - tile.col_begin); }
+  int64_t row_numbers() const { return tile_numbers() + 2 * kTileStart; }
 };
+
+template <class T>
+bool is_precise(const Context<T>& c) {
+  bool precise = true;
+  for (int k = 0; k < kLanes<T>; ++k) precise = precise && c.largest[k] <= static_cast<T>(kLargestInFloat);
+  return precise || sizeof(T) == sizeof(double);
+}
 
 struct Sums {
   double l1 = 0;
@@ -120,9 +156,9 @@ struct Sums {
 };
 
 // Sixteen independent sums, so that the compiler may vectorise without reordering a float sum.
-template <class Function>
+template <class T, class Function>
 double sum_of(int64_t count, Function value) {
-  float lane[16] = {};
+  T lane[16] = {};
   int64_t i = 0;
   for (; i + 16 <= count; i += 16)
     for (int k = 0; k < 16; ++k) lane[k] += value(i + k);
@@ -132,11 +168,12 @@ double sum_of(int64_t count, Function value) {
   return sum;
 }
 
-void load_row(Context& c, int64_t row) {
-  float* difference = c.rows.ring(kDifference, row);
-  float* sum = c.rows.ring(kSum, row);
-  float* weight = c.rows.ring(kWeight, row);
-  const size_t bytes = c.rows.stride() * sizeof(float);
+template <class T>
+void load_row(Context<T>& c, int64_t row) {
+  T* difference = c.rows.ring(kDifference, row);
+  T* sum = c.rows.ring(kSum, row);
+  T* weight = c.rows.ring(kWeight, row);
+  const size_t bytes = c.rows.stride() * sizeof(T);
   std::memset(difference, 0, bytes);
   std::memset(sum, 0, bytes);
   std::memset(weight, 0, bytes);
@@ -152,26 +189,26 @@ void load_row(Context& c, int64_t row) {
     for (int64_t p = 0; p < pixels; ++p)
       for (int k = 0; k < kChannels; ++k) weight[kChannels * p + k] = mask[p];
   } else {
-    std::fill(weight, weight + kChannels * pixels, 1.0f);
+    std::fill(weight, weight + kChannels * pixels, T(1));
   }
   const float* x = c.input.rendered + kChannels * offset;
   const float* y = c.input.target + kChannels * offset;
   for (int64_t i = 0; i < kChannels * pixels; ++i) {
-    difference[i] = weight[i] * (x[i] - y[i]);
-    sum[i] = weight[i] * (x[i] + y[i]);
+    difference[i] = weight[i] * (static_cast<T>(x[i]) - static_cast<T>(y[i]));
+    sum[i] = weight[i] * (static_cast<T>(x[i]) + static_cast<T>(y[i]));
   }
 }
 
 // Blurs the ring map around rows row .. row + kBatch - 1 down the columns, and its square too if asked for.
-template <bool with_square>
-void blur_columns(Context& c, int ring_map, int64_t row, int to, int square_to = 0) {
-  const float* from[kWindow];
+template <bool with_square, class T>
+void blur_columns(Context<T>& c, int ring_map, int64_t row, int to, int square_to = 0) {
+  const T* from[kWindow];
   for (int r = 0; r < kWindow; ++r) from[r] = c.rows.ring(ring_map, row - kRadius + r);
-  for (int64_t i = 0; i < c.row_floats(); i += kFloatLanes) {
-    Lanes sum[kBatch] = {}, square_sum[kBatch] = {};
+  for (int64_t i = 0; i < c.row_numbers(); i += kLanes<T>) {
+    Lanes<T> sum[kBatch] = {}, square_sum[kBatch] = {};
 #pragma GCC unroll 16
     for (int r = 0; r < kWindow; ++r) {
-      const Lanes x = load(from[r] + i), square = x * x;
+      const Lanes<T> x = load(from[r] + i), square = x * x;
 #pragma GCC unroll 4
       for (int b = 0; b < kBatch; ++b) {
         if (r < b || r - b >= kTaps) continue;
@@ -186,8 +223,9 @@ void blur_columns(Context& c, int ring_map, int64_t row, int to, int square_to =
   }
 }
 
-inline Lanes blur_along(const float* centre, const Kernel& kernel) {
-  Lanes sum = load(centre) * kernel.tap[kRadius];
+template <class T>
+inline Lanes<T> blur_along(const T* centre, const Kernel<T>& kernel) {
+  Lanes<T> sum = load(centre) * kernel.tap[kRadius];
 #pragma GCC unroll 8
   for (int k = 1; k <= kRadius; ++k)
     sum += (load(centre - kChannels * k) + load(centre + kChannels * k)) * kernel.tap[kRadius + k];
@@ -195,52 +233,65 @@ inline Lanes blur_along(const float* centre, const Kernel& kernel) {
 }
 
 // A variance below zero is rounding; NaN stays NaN.
-inline Lanes at_least_zero(Lanes x) { return x < 0.0f ? Lanes{} : x; }
+template <class V>
+inline V at_least_zero(V x) {
+  return x < 0 ? V{} : x;
+}
 
+template <class T>
 struct SsimTerms {
-  Lanes dissimilarity;                              // 1 - SSIM
-  Lanes grad_mean, grad_diff_square, grad_sum_square;  // A_d + A_s, A_dd, A_ss
+  Lanes<T> dissimilarity;                                 // 1 - SSIM
+  Lanes<T> grad_mean, grad_diff_square, grad_sum_square;  // A_d + A_s, A_dd, A_ss
 };
 
-inline SsimTerms ssim_terms(Lanes mean_d, Lanes mean_s, Lanes square_d, Lanes square_s) {
-  const Lanes mean_d2 = mean_d * mean_d, mean_s2 = mean_s * mean_s;
-  const Lanes var_d = at_least_zero(square_d - mean_d2), var_s = at_least_zero(square_s - mean_s2);
-  const Lanes inv_p = 1.0f / ((mean_d2 + mean_s2) * 0.5f + kC1);
-  const Lanes inv_q = 1.0f / ((var_d + var_s) * 0.5f + kC2);
-  const Lanes e = mean_d2 * inv_p, f = var_d * inv_q;
-  const Lanes l_over_q = (1.0f - e) * inv_q, c_over_p = (1.0f - f) * inv_p;
-  SsimTerms t;
+template <class T>
+inline SsimTerms<T> ssim_terms(Lanes<T> mean_d, Lanes<T> mean_s, Lanes<T> square_d, Lanes<T> square_s) {
+  constexpr T one = 1, two = 2, half = T(0.5), c1 = static_cast<T>(kC1), c2 = static_cast<T>(kC2);
+  const Lanes<T> mean_d2 = mean_d * mean_d, mean_s2 = mean_s * mean_s;
+  const Lanes<T> var_d = at_least_zero(square_d - mean_d2), var_s = at_least_zero(square_s - mean_s2);
+  const Lanes<T> inv_p = one / ((mean_d2 + mean_s2) * half + c1);
+  const Lanes<T> inv_q = one / ((var_d + var_s) * half + c2);
+  const Lanes<T> e = mean_d2 * inv_p, f = var_d * inv_q;
+  const Lanes<T> l_over_q = (one - e) * inv_q, c_over_p = (one - f) * inv_p;
+  SsimTerms<T> t;
   t.dissimilarity = e + f - e * f;
-  t.grad_sum_square = l_over_q * (f * 0.5f);
+  t.grad_sum_square = l_over_q * (f * half);
   t.grad_diff_square = t.grad_sum_square - l_over_q;
-  t.grad_mean = mean_d * (c_over_p * (e - 2.0f) - t.grad_diff_square * 2.0f) +
-                mean_s * (c_over_p * e - t.grad_sum_square * 2.0f);
+  t.grad_mean = mean_d * (c_over_p * (e - two) - t.grad_diff_square * two) +
+                mean_s * (c_over_p * e - t.grad_sum_square * two);
   return t;
 }
 
 // Finishes the blur of one row along the row, and turns the four means into SSIM and its partial derivatives.
-double ssim_row(Context& c, int64_t row, int b) {
-  const float* mean_d = c.rows.scratch(kMeanD, b);
-  const float* mean_s = c.rows.scratch(kMeanS, b);
-  const float* square_d = c.rows.scratch(kSquareD, b);
-  const float* square_s = c.rows.scratch(kSquareS, b);
-  const float* weight = c.rows.ring(kWeight, row);
-  float* dissimilarity = c.rows.line();
-  for (int64_t i = kChannels * kRadius; i < c.row_floats() - kChannels * kRadius; i += kFloatLanes) {
-    const SsimTerms t = ssim_terms(blur_along(mean_d + i, c.kernel), blur_along(mean_s + i, c.kernel),
-                                   blur_along(square_d + i, c.kernel), blur_along(square_s + i, c.kernel));
-    const Lanes w = load(weight + i);
+template <class T>
+double ssim_row(Context<T>& c, int64_t row, int b) {
+  const T* mean_d = c.rows.scratch(kMeanD, b);
+  const T* mean_s = c.rows.scratch(kMeanS, b);
+  const T* square_d = c.rows.scratch(kSquareD, b);
+  const T* square_s = c.rows.scratch(kSquareS, b);
+  const T* weight = c.rows.ring(kWeight, row);
+  T* dissimilarity = c.rows.line();
+  Lanes<T> largest = c.largest;
+  for (int64_t i = kChannels * kRadius; i < c.row_numbers() - kChannels * kRadius; i += kLanes<T>) {
+    const Lanes<T> e_d2 = blur_along(square_d + i, c.kernel), e_s2 = blur_along(square_s + i, c.kernel);
+    const Lanes<T> squares = e_d2 + e_s2;
+    largest = squares > largest ? squares : largest;
+    const SsimTerms<T> t =
+        ssim_terms<T>(blur_along(mean_d + i, c.kernel), blur_along(mean_s + i, c.kernel), e_d2, e_s2);
+    const Lanes<T> w = load(weight + i);
     store(dissimilarity + i, w * t.dissimilarity);
     store(c.rows.ring(kGradMean, row) + i, w * t.grad_mean);
     store(c.rows.ring(kGradDifferenceSquare, row) + i, w * t.grad_diff_square);
     store(c.rows.ring(kGradSumSquare, row) + i, w * t.grad_sum_square);
   }
+  c.largest = largest;
   if (row < c.tile.row_begin || row >= c.tile.row_end) return 0;
-  return sum_of(c.tile_floats(), [=](int64_t i) { return dissimilarity[kTileStart + i]; });
+  return sum_of<T>(c.tile_numbers(), [=](int64_t i) { return dissimilarity[kTileStart + i]; });
 }
 
 // SSIM and its partial derivatives on rows row .. row + kBatch - 1; needs the rows kRadius around them.
-double ssim_batch(Context& c, int64_t row) {
+template <class T>
+double ssim_batch(Context<T>& c, int64_t row) {
   blur_columns<true>(c, kDifference, row, kMeanD, kSquareD);
   blur_columns<true>(c, kSum, row, kMeanS, kSquareS);
   double dissimilarity = 0;
@@ -249,51 +300,56 @@ double ssim_batch(Context& c, int64_t row) {
       dissimilarity += ssim_row(c, row + b, b);
     } else {
       for (int map : {kGradMean, kGradDifferenceSquare, kGradSumSquare})
-        std::memset(c.rows.ring(map, row + b), 0, c.rows.stride() * sizeof(float));
+        std::memset(c.rows.ring(map, row + b), 0, c.rows.stride() * sizeof(T));
     }
   }
   return dissimilarity;
 }
 
 // NaN passes through, as 0 does.
-inline Lanes sign(Lanes x) {
-  const Lanes one = Lanes{} + 1.0f;
-  return x > 0.0f ? one : (x < 0.0f ? -one : x);
+template <class V>
+inline V sign(V x) {
+  const V one = V{} + 1;
+  return x > 0 ? one : (x < 0 ? -one : x);
 }
 
-void write_gradient_row(Context& c, int64_t row, const float* line) {
+template <class T>
+void write_gradient_row(Context<T>& c, int64_t row, const T* line) {
   float* to = c.gradient + kChannels * (row * c.input.width + c.tile.col_begin);
-  std::memcpy(to, line + kTileStart, c.tile_floats() * sizeof(float));
+  std::copy(line + kTileStart, line + kTileStart + c.tile_numbers(), to);
 }
 
-void gradient_batch(Context& c, int64_t row) {
+template <class T>
+void gradient_batch(Context<T>& c, int64_t row) {
   constexpr int kFromMean = 0, kFromDifference = 1, kFromSum = 2;
   blur_columns<false>(c, kGradMean, row, kFromMean);
   blur_columns<false>(c, kGradDifferenceSquare, row, kFromDifference);
   blur_columns<false>(c, kGradSumSquare, row, kFromSum);
-  const float l1_scale = c.scale * (1 - c.input.ssim_weight), ssim_scale = c.scale * c.input.ssim_weight;
+  const T l1_scale = c.scale * (1 - c.input.ssim_weight), ssim_scale = c.scale * c.input.ssim_weight;
   for (int b = 0; b < kBatch && row + b < c.tile.row_end; ++b) {
-    const float* difference = c.rows.ring(kDifference, row + b);
-    const float* sum = c.rows.ring(kSum, row + b);
-    const float* weight = c.rows.ring(kWeight, row + b);
-    float* line = c.rows.line();
-    for (int64_t i = kTileStart; i < c.row_floats() - kTileStart; i += kFloatLanes) {
-      const Lanes d = load(difference + i), s = load(sum + i);
-      const Lanes ssim = blur_along(c.rows.scratch(kFromMean, b) + i, c.kernel) +
-                         d * 2.0f * blur_along(c.rows.scratch(kFromDifference, b) + i, c.kernel) +
-                         s * 2.0f * blur_along(c.rows.scratch(kFromSum, b) + i, c.kernel);
+    const T* difference = c.rows.ring(kDifference, row + b);
+    const T* sum = c.rows.ring(kSum, row + b);
+    const T* weight = c.rows.ring(kWeight, row + b);
+    T* line = c.rows.line();
+    for (int64_t i = kTileStart; i < c.row_numbers() - kTileStart; i += kLanes<T>) {
+      const Lanes<T> d = load(difference + i), s = load(sum + i);
+      const Lanes<T> ssim = blur_along(c.rows.scratch(kFromMean, b) + i, c.kernel) +
+                         d * T(2) * blur_along(c.rows.scratch(kFromDifference, b) + i, c.kernel) +
+                         s * T(2) * blur_along(c.rows.scratch(kFromSum, b) + i, c.kernel);
       store(line + i, load(weight + i) * (l1_scale * sign(d) - ssim_scale * ssim));
     }
     write_gradient_row(c, row + b, line);
   }
 }
 
-double l1_row(Context& c, int64_t row) {
-  const float* difference = c.rows.ring(kDifference, row) + kTileStart;
-  return sum_of(c.tile_floats(), [=](int64_t i) { return std::fabs(difference[i]); });
+template <class T>
+double l1_row(Context<T>& c, int64_t row) {
+  const T* difference = c.rows.ring(kDifference, row) + kTileStart;
+  return sum_of<T>(c.tile_numbers(), [=](int64_t i) { return std::fabs(difference[i]); });
 }
 
-Sums ssim_tile(Context& c) {
+template <class T>
+Sums ssim_tile(Context<T>& c) {
   Sums sums;
   int64_t loaded = c.tile.row_begin - kHalo;       // rows before this one are in the ring
   int64_t ssim_done = c.tile.row_begin - kRadius;  // rows before this one have their partial derivatives in the ring
@@ -301,6 +357,7 @@ Sums ssim_tile(Context& c) {
     for (; ssim_done < row + kBatch + kRadius; ssim_done += kBatch) {
       for (; loaded < ssim_done + kBatch + kRadius; ++loaded) load_row(c, loaded);
       sums.dissimilarity += ssim_batch(c, ssim_done);
+      if (!is_precise(c)) return sums;
     }
     for (int b = 0; b < kBatch && row + b < c.tile.row_end; ++b) sums.l1 += l1_row(c, row + b);
     if (c.gradient) gradient_batch(c, row);
@@ -309,18 +366,25 @@ Sums ssim_tile(Context& c) {
 }
 
 // Without SSIM no neighbours are needed.
-Sums l1_tile(Context& c) {
+template <class T>
+Sums l1_tile(Context<T>& c) {
   Sums sums;
   for (int64_t row = c.tile.row_begin; row < c.tile.row_end; ++row) {
     load_row(c, row);
     sums.l1 += l1_row(c, row);
     if (!c.gradient) continue;
-    float* line = c.rows.line();
-    for (int64_t i = kTileStart; i < c.row_floats() - kTileStart; i += kFloatLanes)
+    T* line = c.rows.line();
+    for (int64_t i = kTileStart; i < c.row_numbers() - kTileStart; i += kLanes<T>)
       store(line + i, c.scale * load(c.rows.ring(kWeight, row) + i) * sign(load(c.rows.ring(kDifference, row) + i)));
     write_gradient_row(c, row, line);
   }
   return sums;
+}
+
+// In one precision; of no use unless is_precise(context) holds afterwards.
+template <class T>
+Sums tile_sums(Context<T>& c) {
+  return c.input.ssim_weight == 0 ? l1_tile(c) : ssim_tile(c);
 }
 
 // Cuts `length` into equal pieces of at most `most`.
@@ -336,7 +400,7 @@ double sum_of_mask(const LossInput& input) {
   double sum = 0;
   for (int64_t row = 0; row < input.height; ++row) {
     const float* mask = input.mask + row * input.width;
-    sum += sum_of(input.width, [=](int64_t i) { return mask[i]; });
+    sum += sum_of<float>(input.width, [=](int64_t i) { return mask[i]; });
   }
   return sum;
 }
@@ -344,21 +408,30 @@ double sum_of_mask(const LossInput& input) {
 }  // namespace
 
 double l1_ssim_loss(const LossInput& input, float* gradient, int num_threads) {
-  const Kernel kernel = gaussian_kernel();
+  const Kernel<float> kernel = gaussian_kernel<float>();
+  const Kernel<double> fine_kernel = gaussian_kernel<double>();
   const Pieces strips(input.height, kTileRows), columns(input.width, kTilePixels);
   const double mask_sum = sum_of_mask(input);
   const double scale = mask_sum == 0 ? 0 : 1 / (kChannels * mask_sum);
-  const int64_t num_tiles = strips.count * columns.count;
+  const int64_t num_tiles = strips.count * columns.count, widest = columns.longest();
   const std::unique_ptr<Sums[]> sums(new Sums[num_tiles]);
-#pragma omp parallel num_threads(num_threads)
-  {
-    Workspace rows(columns.longest());
-#pragma omp for schedule(dynamic)
-    for (int64_t t = 0; t < num_tiles; ++t) {
+  // Allocated here, as no exception may leave the threads; the float64 rows, hardly ever needed, stay untouched.
+  const int64_t floats = Workspace<float>::size(widest), doubles = Workspace<double>::size(widest);
+  const std::unique_ptr<float[]> float_rows(new float[num_threads * floats]);
+  const std::unique_ptr<double[]> double_rows(new double[num_threads * doubles]);
+  std::atomic<int64_t> next{0};
+#pragma omp parallel for num_threads(num_threads) schedule(static, 1)
+  for (int thread = 0; thread < num_threads; ++thread) {
+    Workspace<float> rows(float_rows.get() + thread * floats, widest);
+    for (int64_t t = next++; t < num_tiles; t = next++) {
       const int64_t strip = t / columns.count, column = t % columns.count;
       const Tile tile{strips.begin(strip), strips.begin(strip + 1), columns.begin(column), columns.begin(column + 1)};
-      Context context{input, kernel, tile, static_cast<float>(scale), gradient, rows};
-      sums[t] = input.ssim_weight == 0 ? l1_tile(context) : ssim_tile(context);
+      Context<float> context{input, kernel, tile, static_cast<float>(scale), gradient, rows};
+      sums[t] = tile_sums(context);
+      if (is_precise(context)) continue;
+      Workspace<double> fine_rows(double_rows.get() + thread * doubles, widest);
+      Context<double> again{input, fine_kernel, tile, scale, gradient, fine_rows};
+      sums[t] = tile_sums(again);
     }
   }
   Sums total;

@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "cpu/parallel.hpp"
+#include "math/projection.hpp"
 
 namespace dyngs {
 namespace {
@@ -37,8 +38,8 @@ Vec<S> times(Vec<S> v, const S* m) {
 // The column of the rotation `q` that belongs to the smallest of the scales, of equal ones the first.
 template <class S>
 Vec<S> shortest_axis(const S* q, const S* log_scales) {
-  const S length = std::max(std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]), S(1e-12));
-  const S w = q[0] / length, x = q[1] / length, y = q[2] / length, z = q[3] / length;
+  S inv_norm;  // for a gradient, which is not needed
+  const auto [w, x, y, z] = normalize(Quat<S>{q[0], q[1], q[2], q[3]}, inv_norm);
   switch (std::min_element(log_scales, log_scales + 3) - log_scales) {
     case 0: return {1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)};
     case 1: return {2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)};

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dyngs.human.polar import quats_of
+from dyngs.ops.quaternions import unit_quats
 
 _SWEEPS = 6
 """Most sweeps of Jacobi's method, which converges quadratically: nearly rigid maps need 1 or 2."""
@@ -46,7 +47,7 @@ def moved_axes(linear: Tensor, quats: Tensor, log_scales: Tensor) -> tuple[Tenso
 
 def rotations_of(quats: Tensor) -> Tensor:
     """(N, 3, 3) rotations of quaternions wxyz (N, 4) of any length; of zero the identity."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).T
+    w, x, y, z = unit_quats(quats).T
     xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
     xy, xz, yz, wx, wy, wz = 2 * x * y, 2 * x * z, 2 * y * z, 2 * w * x, 2 * w * y, 2 * w * z
     rows = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)

@@ -226,9 +226,10 @@ class _File:
         Raises:
             DyngsError: one of them is zero.
         """
-        if (np.linalg.norm(quats, axis=1) < 1e-9).any():
+        largest = np.abs(quats).max(axis=1, keepdims=True)
+        if (largest == 0).any():
             raise self.error("a rotation is a quaternion of zeros; export it again")
-        return Rotation.from_quat(quats)
+        return Rotation.from_quat(quats / largest)
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._buffers:

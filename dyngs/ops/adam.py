@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -22,10 +24,12 @@ def adam_step_(
     betas: tuple[float, float] = (0.9, 0.999),
     rows: Tensor | None = None,
 ) -> int:
-    """Number of rows left out for a non-finite gradient; updates ``param`` and its two moments in place.
+    """Number of rows left out for a gradient that cannot be used; updates ``param`` and its two moments in place.
 
     The update of Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global ``step``
-    also for rows that were left out before. Rows left out keep their value and moments unchanged.
+    also for rows that were left out before. Rows left out keep their value and moments unchanged. A gradient cannot be
+    used if it is NaN, infinite, or so large that its square is not safely finite (2^63 = 9.2e18 in float32, 2^511 in
+    float64): an infinite second moment would hold the value for ever.
 
     Args:
         param: (N, ...) contiguous parameter, seen as N rows of C numbers; a vector (N,) has rows of one number.
@@ -39,9 +43,11 @@ def adam_step_(
         rows: (N,) bool, the rows to update; None = all. Rows left out by it are not counted.
 
     Raises:
-        DyngsError: shapes or dtypes that do not fit, a parameter or moment that is not contiguous, or ``step`` < 1.
+        DyngsError: shapes or dtypes that do not fit, a parameter or moment that is not contiguous, ``step`` < 1, or
+            constants out of range.
     """
     _check(param, grad, exp_avg, exp_avg_sq, rows, step)
+    _check_constants(param.dtype, eps, betas)
     if param.numel() == 0:
         return 0
     row_size = param.numel() // len(param)
@@ -80,26 +86,36 @@ def _torch_step(
     rows: Tensor | None,
 ) -> int:
     """`adam_step_` on (N, C) arrays in plain torch, for other dtypes and devices."""
-    finite = grad.isfinite().all(dim=1)
-    wanted = torch.ones_like(finite) if rows is None else rows
-    active = (wanted & finite)[:, None]
+    too_large = 2.0 ** (math.frexp(torch.finfo(grad.dtype).max)[1] // 2 - 1)
+    usable = (grad.abs() < too_large).all(dim=1)  # NaN is not
+    wanted = torch.ones_like(usable) if rows is None else rows
+    active = (wanted & usable)[:, None]
     new_avg = exp_avg.lerp(grad, 1 - betas[0])
     new_avg_sq = (exp_avg_sq * betas[1]).addcmul(grad, grad, value=1 - betas[1])
     denominator = (new_avg_sq.sqrt() / (1 - betas[1] ** step) ** 0.5).add(eps)
     new_param = param - rates / (1 - betas[0] ** step) * new_avg / denominator
     for old, new in ((param, new_param), (exp_avg, new_avg), (exp_avg_sq, new_avg_sq)):
         old.copy_(torch.where(active, new, old))
-    return int((wanted & ~finite).sum())
+    return int((wanted & ~usable).sum())
 
 
 def _column_rates(lr: float | Tensor, row_size: int, param: Tensor) -> Tensor:
     """(C,) learning rates in the dtype and on the device of ``param``."""
     rates = torch.as_tensor(lr, dtype=param.dtype, device=param.device).detach()
+    if not bool(rates.isfinite().all()):
+        raise DyngsError("Adam: lr must be finite")
     if rates.ndim == 0:
         return rates.expand(row_size).contiguous()
     if rates.shape != (row_size,):
         raise DyngsError(f"Adam: lr must be a number or ({row_size},), one rate per column, got {tuple(rates.shape)}")
     return rates.contiguous()
+
+
+def _check_constants(dtype: torch.dtype, eps: float, betas: tuple[float, float]) -> None:
+    if not torch.finfo(dtype).tiny <= eps < math.inf:
+        raise DyngsError(f"Adam: eps must be at least {torch.finfo(dtype).tiny:.3g} and finite, got {eps}")
+    if not all(0 <= beta < 1 for beta in betas):
+        raise DyngsError(f"Adam: betas must lie in [0, 1), got {betas[0]} and {betas[1]}")
 
 
 def _check(param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rows: Tensor | None, step: int) -> None:

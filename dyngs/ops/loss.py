@@ -27,7 +27,8 @@ def l1_ssim_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mas
     L1 is the mean of ``|x - y|``; SSIM is the mean over pixels and channels of the SSIM map with an 11x11 Gaussian
     window of sigma 1.5, zero padding and data range 1, as in 3DGS. With a mask both pictures are multiplied by it, and
     both means are weighted by it: ``sum(m |x - y|) / (3 sum m)`` and ``sum(m SSIM(m x, m y)) / (3 sum m)``; a mask of
-    zeros gives a loss of 0. In float32 on the CPU only first derivatives exist.
+    zeros gives a loss of 0. In float32 on the CPU only first derivatives exist. Pictures may have any finite values:
+    where they go beyond about 2, SSIM is computed in float64.
 
     Args:
         rendered: (H, W, 3) picture x, any strides. Half precision is computed in float32.
@@ -64,7 +65,8 @@ def reference_l1_ssim(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2
 
 
 def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
-    """(H, W, 3) structural similarity of two pictures, Wang et al. 2004."""
+    """(H, W, 3) structural similarity of two pictures, Wang et al. 2004; in float64, as variances of E[x^2] cancel."""
+    dtype, x, y = x.dtype, x.double(), y.double()
     taps = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=x.dtype, device=x.device)
     taps = torch.exp(-(taps**2) / (2 * SSIM_SIGMA**2))
     column = (taps / taps.sum()).view(1, 1, -1, 1)
@@ -74,7 +76,7 @@ def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
     mean_x, mean_y, square_x, square_y, product = blurred.view(5, 3, *x.shape[:2]).permute(0, 2, 3, 1)
     luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
     variances = square_x - mean_x**2 + square_y - mean_y**2
-    return luminance * (2 * (product - mean_x * mean_y) + SSIM_C2) / (variances + SSIM_C2)
+    return (luminance * (2 * (product - mean_x * mean_y) + SSIM_C2) / (variances + SSIM_C2)).to(dtype)
 
 
 def _check(rendered: Tensor, target: Tensor, mask: Tensor | None) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.quaternions import unit_quats
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def contracted(points: Tensor) -> Tensor:
 
 def shortest_axes(quats: Tensor, log_scales: Tensor) -> Tensor:
     """(M, 3) unit vectors along the shortest axis of each Gaussian: the normal of what is flat, up to its sign."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    w, x, y, z = unit_quats(quats).unbind(-1)
     columns = (
         (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
         (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dyngs.config import DefaultStrategy
 from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.ops.quaternions import unit_quats
 
 SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
@@ -122,9 +123,10 @@ class DefaultDensifier:
             self.seen = torch.zeros(probe_grad.shape[1])
         grad = probe_grad[..., 2:] if self.options.absgrad else probe_grad[..., :2]
         x, y = grad[..., 0] * (0.5 * size[0]), grad[..., 1] * (0.5 * size[1])
-        visible = (radii > 0).all(-1)
-        self.grad_sum += torch.where(visible, torch.hypot(x, y), 0.0).sum(0)
-        self.seen += visible.sum(0)
+        length = torch.hypot(x, y)
+        counts = (radii > 0).all(-1) & length.isfinite()  # a view without a usable gradient says nothing
+        self.grad_sum += torch.where(counts, length, 0.0).sum(0)
+        self.seen += counts.sum(0)
 
     def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
         resets = step in self.schedule.resets
@@ -229,7 +231,7 @@ def _with_lowered_opacities(result: EditResult, logit_opacities: Tensor) -> Edit
 
 def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
     """(N, 3) ``vectors`` turned by ``quats`` (N, 4) wxyz of any length; a zero quaternion turns nothing."""
-    unit = torch.nn.functional.normalize(quats, dim=-1)
+    unit = unit_quats(quats)
     w, axis = unit[:, :1], unit[:, 1:]
     twice = 2 * torch.linalg.cross(axis, vectors)
     return vectors + w * twice + torch.linalg.cross(axis, twice)

@@ -54,21 +54,30 @@ def ssim(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
 
 
 def ssim_map(rendered: Tensor, truth: Tensor) -> Tensor:
-    """(H, W, 3) structural similarity per pixel and channel; see ``ssim``."""
+    """(H, W, 3) structural similarity per pixel and channel; see ``ssim``.
+
+    By way of the difference d and the sum s, whose variances do not cancel where the pictures agree or are white: with
+    P = mean_a^2 + mean_b^2 + C1 and Q = var_a + var_b + C2 it is (1 - mean_d^2 / P) (1 - var_d / Q).
+    """
     a, b = (_clamped(x).permute(2, 0, 1)[:, None] for x in (rendered, truth))
     offsets = torch.arange(_WINDOW, dtype=a.dtype, device=a.device) - _WINDOW // 2
     window = torch.exp(-offsets.square() / (2 * _SIGMA**2))
     window = window / window.sum()
 
     def blur(x: Tensor) -> Tensor:
-        rows = torch.nn.functional.conv2d(x, window.view(1, 1, 1, -1), padding=(0, _WINDOW // 2))
-        return torch.nn.functional.conv2d(rows, window.view(1, 1, -1, 1), padding=(_WINDOW // 2, 0))
+        rows = torch.nn.functional.conv2d(x, window.view(1, 1, 1, -1))
+        return torch.nn.functional.conv2d(rows, window.view(1, 1, -1, 1))
 
-    mean_a, mean_b = blur(a), blur(b)
-    var_a, var_b = blur(a * a) - mean_a.square(), blur(b * b) - mean_b.square()
-    covariance = blur(a * b) - mean_a * mean_b
-    similarity = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
-    similarity = similarity / ((mean_a.square() + mean_b.square() + _C1) * (var_a + var_b + _C2))
+    def moments(x: Tensor, outside: float) -> tuple[Tensor, Tensor]:
+        padded = torch.nn.functional.pad(x, (_WINDOW // 2,) * 4, value=outside)
+        mean = blur(padded)
+        return mean, (blur(padded * padded) - mean.square()).clamp_min(0)
+
+    mean_d, var_d = moments(a - b, 0.0)
+    mean_s, var_s = moments(a + b - 1, -1.0)  # in [-1, 1]: a quarter of the square to subtract
+    p = (mean_d.square() + (mean_s + 1).square()) / 2 + _C1
+    q = (var_d + var_s) / 2 + _C2
+    similarity = (1 - mean_d.square() / p) * (1 - var_d / q)
     return similarity[:, 0].permute(1, 2, 0)
 
 

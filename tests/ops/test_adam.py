@@ -121,6 +121,39 @@ def test_rows_with_non_finite_gradient_are_left_out_and_counted(
     assert adam_step_(*(x.clone() for x in (param, grad, exp_avg, exp_avg_sq)), lr=0.1, step=5, rows=rows) == 2
 
 
+@pytest.mark.parametrize("shape", [(50,), (701, 3), (130, 16, 3)])
+@pytest.mark.parametrize("choice", [False, True])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_gradients_too_large_to_square_are_left_out_and_counted(
+    shape: tuple[int, ...], choice: bool, sign: int
+) -> None:
+    """Their square would be an infinite second moment, which never lets the value move again."""
+    param, grad, exp_avg, exp_avg_sq = make_state(shape)
+    rows = torch.ones(shape[0], dtype=torch.bool) if choice else None
+    largest = torch.tensor(2.0**63).nextafter(torch.tensor(0.0))
+    grad.view(shape[0], -1)[[3, 7, 20, 21], 0] = sign * torch.tensor([2.0**63, 2e19, 3e38, float(largest)])
+    state = [param.clone(), exp_avg.clone(), exp_avg_sq.clone()]
+    assert adam_step_(state[0], grad, *state[1:], lr=0.1, step=5, rows=rows) == 3
+    for before, after in zip((param, exp_avg, exp_avg_sq), state, strict=True):
+        assert after.isfinite().all()
+        assert torch.equal(after[[3, 7, 20]], before[[3, 7, 20]])
+    moved = state[0].clone()
+    for step in range(6, 12):  # the row that took in the largest gradient comes back
+        assert adam_step_(state[0], torch.full_like(grad, 2.0**62), *state[1:], lr=0.1, step=step, rows=rows) == 0
+    assert not torch.equal(state[0][21], moved[21])
+    assert all(x.isfinite().all() for x in state)
+
+
+def test_gradients_too_large_to_square_in_float64() -> None:
+    param, grad, exp_avg, exp_avg_sq = make_state((50,), torch.float64)
+    grad[[3, 7]] = torch.tensor([1e154, 1e30], dtype=torch.float64)
+    before = param.clone()
+    assert adam_step_(param, grad, exp_avg, exp_avg_sq, lr=0.1, step=5) == 1
+    assert param[3] == before[3]
+    assert param[7] != before[7]
+    assert exp_avg_sq.isfinite().all()
+
+
 def test_any_number_of_threads_gives_the_same_bytes() -> None:
     param, grad, exp_avg, exp_avg_sq = make_state((9000, 16, 3))
     rows = torch.rand(9000) < 0.5
@@ -185,3 +218,12 @@ def test_arguments_that_do_not_fit() -> None:
         adam_step_(param, grad, exp_avg, exp_avg_sq, lr=0.1, step=1, rows=torch.ones(6))
     with pytest.raises(DyngsError, match="counts from 1"):
         adam_step_(param, grad, exp_avg, exp_avg_sq, lr=0.1, step=0)
+    for lr in (math.nan, torch.tensor([0.1, math.inf, 0.1])):
+        with pytest.raises(DyngsError, match="lr must be finite"):
+            adam_step_(param, grad, exp_avg, exp_avg_sq, lr=lr, step=1)
+    for eps in (0.0, -1e-8, 1e-46, math.nan):  # 1e-46 is 0 in float32, and 0 / 0 at the first gradient of 0
+        with pytest.raises(DyngsError, match="eps must"):
+            adam_step_(param, grad, exp_avg, exp_avg_sq, lr=0.1, step=1, eps=eps)
+    for betas in ((1.0, 0.9), (0.9, -0.1), (math.nan, 0.9)):
+        with pytest.raises(DyngsError, match="betas must"):
+            adam_step_(param, grad, exp_avg, exp_avg_sq, lr=0.1, step=1, betas=betas)

@@ -40,7 +40,17 @@ def test_it_is_what_torch_says(seed: int, normals: bool, timed: bool, on_body: b
     base = torch.rand(7, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
     found = shading_inputs(seen, base)
     assert found.shape == (7, num_inputs(sees_time=timed, sees_normals=normals))
+    # Numbers of at most 3 that come of some 30 roundings; 1e-5 is 84 units of float32, 1e-7 many of float64.
     torch.testing.assert_close(found, reference_inputs(seen, base))
+
+
+@pytest.mark.parametrize("scale", [1e-42, 1e-20, 1e-13, 1e20, 1e37])
+def test_rotations_may_have_any_length(scale: float) -> None:
+    seen = sight(3, normals=True, timed=False, on_body=False, dtype=torch.float32)
+    rough = replace(seen, quats=seen.quats.sign())
+    longer, base = replace(rough, quats=rough.quats * scale), torch.full((7, 3), 0.3)
+    torch.testing.assert_close(shading_inputs(longer, base), shading_inputs(rough, base))
+    torch.testing.assert_close(reference_inputs(longer, base), shading_inputs(rough, base))
 
 
 def test_every_isa_says_the_same(isa: str) -> None:

@@ -52,6 +52,16 @@ def test_signal_is_the_mean_norm_in_ndc_units_over_the_views_that_see_it() -> No
     torch.testing.assert_close(densifier.grad_sum, torch.tensor([0.05, 0.0, 0.0]))
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 3e38])
+def test_a_view_with_a_gradient_that_is_not_finite_does_not_count(bad: float) -> None:
+    densifier = _densifier(DefaultStrategy())
+    _signal(densifier, [0.1, 0.2])
+    grad = torch.tensor([[[bad, bad, 0.0, 0.0], [0.002, 0.0, 0.0, 0.0]]])
+    densifier.after_backward(2, grad, torch.ones(1, 2, 2, dtype=torch.int32), (200, 100))
+    torch.testing.assert_close(densifier.grad_sum, torch.tensor([0.1, 0.4]))
+    assert densifier.seen.tolist() == [1, 2]
+
+
 def test_absgrad_takes_the_other_two_columns() -> None:
     densifier = _densifier(DefaultStrategy(absgrad=True))
     grad = torch.tensor([[[0.0, 0.0, 3.0, 4.0]]])

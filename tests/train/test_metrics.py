@@ -54,6 +54,30 @@ def test_masks_ignore_and_weight(height, width, seed) -> None:
     assert psnr(rendered, truth, mask) == pytest.approx(min(-10 * math.log10(max(kept, 1e-10)), MAX_PSNR), rel=1e-6)
 
 
+@pytest.mark.parametrize("amplitude", [0.0, 1e-3, 0.05, 1.0])
+def test_ssim_of_white_pictures_keeps_its_digits(amplitude: float) -> None:
+    """White is where the variance of float32 squares cancels: a map off by up to 6e-4, by way of E[x^2] - E[x]^2."""
+    white = torch.ones(40, 40, 3)
+    rendered = white - amplitude * picture(40, 40)
+    found, wanted = ssim_map(rendered, white), ssim_map(rendered.double(), white.double())
+    # The sum less 1, at most 1 in square, is rounded some 16 times before half its variance is left, beside C2 = 9e-4.
+    allowed = 16 * torch.finfo(torch.float32).eps / 2 / (2 * 9e-4) * (1 - wanted) + 1e-6
+    assert bool(((found - wanted).abs() <= allowed).all())
+    assert amplitude > 0 or ssim(rendered, white) == 1
+
+
+def test_extreme_pictures_have_a_metric() -> None:
+    """Metrics are those of the picture as displayed: clamped, so that one pixel of 1e30 is one of 1."""
+    truth = picture()
+    rendered = truth.clone()
+    rendered[3, 4] = 1e30
+    clipped = truth.clone()
+    clipped[3, 4] = 1.0
+    rendered[5, 6], clipped[5, 6] = -math.inf, 0.0
+    for metric in (psnr, ssim):
+        assert metric(rendered, truth) == metric(clipped, truth)
+
+
 def test_ssim_is_that_of_skimage_inside() -> None:
     skimage = pytest.importorskip("skimage.metrics")
     a, b = picture(40, 50), noisy(picture(40, 50), 0.15)

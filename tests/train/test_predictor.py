@@ -56,6 +56,22 @@ def test_training_lowers_the_loss(folder: Path, tmp_path: Path) -> None:
     assert trainer.num_gaussians > 500
 
 
+@pytest.mark.parametrize("factor", [1e25, float("nan")])
+def test_a_gradient_too_large_to_square_leaves_the_step_out(folder: Path, tmp_path: Path, factor: float) -> None:
+    """Its length, which is to be cut, is infinite: weights and moments stay as they are, and the next step is good."""
+    trainer = assemble_network(config(folder, tmp_path))
+    trainer.step()
+    before = {name: x.clone() for name, x in trainer.network.state_dict().items()}
+    loss = factor * sum(x.sum() for x in trainer.network.parameters())
+    assert isinstance(loss, torch.Tensor)
+    trainer._update(loss, 2)
+    assert trainer.bad_gradients == 1
+    assert all(torch.equal(x, before[name]) for name, x in trainer.network.state_dict().items())
+    trainer.step()
+    assert trainer.bad_gradients == 1
+    assert not all(torch.equal(x, before[name]) for name, x in trainer.network.state_dict().items())
+
+
 def test_choices_are_as_many_as_asked_for(folder: Path, tmp_path: Path) -> None:
     trainer = assemble_network(config(folder, tmp_path, inputs=4, views=2))
     assert [len(person.choices) for person in trainer.people] == [4, 4]

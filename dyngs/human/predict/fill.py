@@ -17,6 +17,7 @@ from dyngs.human.model import Subject
 from dyngs.human.predict.maps import Maps, from_atlas, to_atlas
 from dyngs.human.predict.network import HEADS, AtlasNetwork
 from dyngs.human.predict.sitter import Sitter
+from dyngs.ops.quaternions import unit_quats
 
 _STRETCH = 1.5
 """How far logarithms of lengths may differ from those of a first Gaussian."""
@@ -105,7 +106,7 @@ def _turned(quats: Tensor, turns: Tensor) -> Tensor:
     Hamilton product q r, wxyz.
     """
     one = turns.new_tensor([1.0, 0.0, 0.0, 0.0])
-    w, *xyz = torch.nn.functional.normalize(one + turns, dim=1).unbind(1)
+    w, *xyz = unit_quats(one + turns).unbind(1)
     a, vector, other = quats[:, :1], quats[:, 1:], torch.stack(xyz, dim=1)
     real = a * w[:, None] - (vector * other).sum(1, keepdim=True)
     return torch.cat([real, a * other + w[:, None] * vector + torch.linalg.cross(vector, other, dim=1)], dim=1)

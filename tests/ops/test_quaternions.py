@@ -1,0 +1,92 @@
+"""Quaternions of any length: the same unit quaternions and gradients as the rasterizer's."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.deform.nodes import turned
+from dyngs.human.covariance import moved_axes, rotations_of
+from dyngs.ops.projection import project
+from dyngs.ops.quaternions import unit_quats
+from dyngs.ops.reference import rotation_matrices
+from dyngs.ops.shading import shortest_axes
+from dyngs.static.densify import rotate
+
+SCALES = [1e-45, 1e-38, 1e-30, 1e-20, 1e-13, 1e-6, 1.0, 1e6, 1e13, 1e20, 1e37]
+ROUNDING = 8 * torch.finfo(torch.float32).eps
+"""Of a unit quaternion: two divisions, four squares, their sum, the root; and again for what it is compared with."""
+
+
+def some_quats(seed: int = 0) -> Tensor:
+    return torch.randn(50, 4, generator=torch.Generator().manual_seed(seed))
+
+
+def exact(quats: Tensor) -> Tensor:
+    wide = quats.double()  # the squares of float32 stay within float64
+    return wide / wide.norm(dim=-1, keepdim=True)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 10**6), st.floats(-38, 37))
+def test_any_length_is_made_one(seed: int, exponent: float) -> None:
+    quats = some_quats(seed) * 10.0**exponent
+    quats = quats[quats.abs().amax(1) > 0]
+    torch.testing.assert_close(unit_quats(quats).double(), exact(quats), rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_every_user_takes_every_length(scale: float) -> None:
+    """1e20 and 1e-13 were wrong in each: their squares leave float32, or the norm was taken for 1e-12 at least."""
+    short = scale < 1e-40
+    quats = torch.tensor([[1.0, 2.0, -3.0, 4.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 1.0, 1.0, 1.0]]) * (1 if short else scale)
+    quats = quats.sign() * scale if short else quats
+    matrices = rotation_matrices(quats.double()).float()
+    vectors, log_scales = torch.randn(3, 3), torch.tensor([[0.0, -1.0, -2.0]]).repeat(3, 1)
+    close = {"rtol": 0, "atol": 8 * ROUNDING}  # entries are sums of products of two entries each
+    torch.testing.assert_close(rotations_of(quats), matrices, **close)
+    torch.testing.assert_close(rotation_matrices(quats), matrices, **close)
+    torch.testing.assert_close(shortest_axes(quats, log_scales), matrices[:, :, 2], **close)
+    moved = (matrices @ vectors[..., None])[..., 0]
+    long = {"rtol": 0, "atol": 8 * ROUNDING * float(vectors.norm(dim=1).max())}
+    torch.testing.assert_close(rotate(quats, vectors), moved, **long)
+    if scale >= 1e-6:  # the identity is added
+        offsets = quats - torch.tensor([1.0, 0.0, 0.0, 0.0])
+        again = exact(offsets + torch.tensor([1.0, 0.0, 0.0, 0.0])).float()
+        torch.testing.assert_close(turned(offsets, vectors), rotate(again, vectors), **long)
+    axes, lengths = moved_axes(torch.eye(3).expand(3, 3, 3), quats, log_scales)
+    half = rotation_matrices(axes) * lengths.exp()[:, None]
+    wanted = matrices * log_scales.exp()[:, None]
+    torch.testing.assert_close(half @ half.mT, wanted @ wanted.mT, rtol=0, atol=100 * ROUNDING)
+
+
+@pytest.mark.parametrize("scale", [1e-42, 1e-30, 1e-13, 1e-3, 1.0, 1e3, 1e20, 1e30])
+def test_gradients_are_those_of_the_kernel(scale: float) -> None:
+    """Divided by the norm, for which at least 1e-12 is taken (for the largest entry)."""
+    quats = (torch.tensor([[1.0, 0.5, -0.25, 2.0]]) * scale).requires_grad_()
+    means, scales = torch.tensor([[0.1, 0.2, 4.0]]), torch.tensor([[0.3, 0.2, 0.1]])
+    cameras = Cameras(torch.eye(4)[None], torch.tensor([[[50.0, 0, 25], [0, 50, 25], [0, 0, 1]]]), 50, 50)
+
+    def slope(given: Tensor) -> Tensor:
+        factors = project(means, given, scales, torch.ones(1), cameras).factors
+        return torch.autograd.grad((factors * torch.tensor([1.0, 2.0, 3.0])).sum(), quats)[0]
+
+    by_kernel, by_torch = slope(quats), slope(unit_quats(quats))
+    torch.testing.assert_close(by_torch, by_kernel, rtol=1e-4, atol=float(1e-4 * by_kernel.abs().max()))
+    assert bool(by_torch.isfinite().all())
+    assert scale > 1e20 or bool(by_torch.any())
+
+
+def test_zero_is_the_identity_and_what_is_not_finite_stays_so() -> None:
+    quats = torch.zeros(2, 4, requires_grad=True)
+    unit = unit_quats(quats)
+    assert unit.tolist() == [[1, 0, 0, 0]] * 2
+    unit.sum().backward()
+    assert quats.grad is not None
+    assert not quats.grad.any()
+    for bad in (float("nan"), float("inf")):
+        assert bool(unit_quats(torch.tensor([bad, 0.0, 0.0, 1.0])).isnan().any())
