@@ -41,8 +41,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(autouse=True)
 def empty_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every test runs in an empty folder, as a user would: nothing is left in the checkout, and processes that a test
-    starts import the installed package, not the sources beside them."""
+    starts import the installed package, not the sources beside them. The user's cache is another empty folder."""
     monkeypatch.chdir(tmp_path_factory.mktemp("empty"))
+    monkeypatch.setenv("DYNGS_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
 
 
 @pytest.fixture

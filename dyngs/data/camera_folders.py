@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.capture import Capture, Split, View
-from dyngs.data.frame_cache import planned_frames
+from dyngs.data.capture import Capture, Split, VideoFrame, View
+from dyngs.data.frame_cache import VideoFrames, planned_frames
 from dyngs.data.images import SUFFIXES
 from dyngs.data.intrinsics import match_size, rescale_warning
 from dyngs.data.json_object import read_json_object
@@ -35,12 +35,12 @@ class CameraSource:
     Attributes:
         name: of its folder, or of its video without the suffix.
         pictures: frame number to file; the files of a video may have to be decoded first.
-        video: what the video says about itself, None for a folder.
+        video: its frames, None for a folder.
     """
 
     name: str
     pictures: dict[int, Path]
-    video: VideoInfo | None = None
+    video: VideoFrames | None = None
 
 
 def is_camera_folders(root: Path) -> bool:
@@ -73,7 +73,7 @@ def read_camera_folders(root: Path) -> Capture:
     unknown = sorted(found.keys() - calibrated.keys())
     if unknown:
         warnings.append(f"{path.name}: no calibration for {_some(unknown)}, left out")
-    cameras = [open_camera(root, name, found[name]) for name in names]
+    cameras = [open_camera(name, found[name]) for name in names]
     own = {name: _calibration(calibrated[name], f"{path}, camera {name}") for name in names}
     views, notes = sequence_views(path, cameras, own)
     splits, more = _splits(path, fields, views)
@@ -110,15 +110,15 @@ def find_cameras(root: Path) -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
-def open_camera(root: Path, name: str, path: Path) -> CameraSource:
+def open_camera(name: str, path: Path) -> CameraSource:
     """The pictures of the camera that ``find_cameras`` found at ``path``.
 
     Raises:
         DyngsError: a picture without a number, two with the same one, or a video that cannot be opened.
     """
     if path.is_file():
-        planned = planned_frames(root, path)
-        return CameraSource(name, dict(enumerate(planned.paths)), planned.info)
+        planned = planned_frames(path)
+        return CameraSource(name, dict(enumerate(planned.paths)), planned)
     pictures: dict[int, Path] = {}
     for picture in _pictures(path):
         digits = re.findall(r"\d+", picture.stem)
@@ -151,16 +151,17 @@ def sequence_views(
         own = dict(calibrations[camera.name])
         where = f"{path}, camera {camera.name}"
         if camera.video is not None and ("w" not in own or "h" not in own):
-            own |= {"w": camera.video.width, "h": camera.video.height}
+            own |= {"w": camera.video.info.width, "h": camera.video.info.height}
         frames = []
         for number, picture in sorted(camera.pictures.items()):
             times = {"frame": number, "time": (number - numbers[0]) / span}
-            written = str(picture.relative_to(path.parent) if picture.is_relative_to(path.parent) else picture)
-            frames.append(Frame(where, {**own, **times, "file_path": written, "camera": index}, {}))
+            fields = {**own, **times, "file_path": str(picture), "camera": index}
+            video = None if camera.video is None else VideoFrame(camera.video.source, number)
+            frames.append(Frame(where, fields, {}, picture, video))
         read, notes = read_views(FrameFile(path, {}, tuple(frames)))
         views[camera.name], more = tuple(read.values()), []
         if camera.video is not None:
-            views[camera.name], more = _at_video_size(camera.name, camera.video, views[camera.name], where)
+            views[camera.name], more = _at_video_size(camera.name, camera.video.info, views[camera.name], where)
         warnings += [*notes, *more]
     return views, warnings
 
@@ -181,7 +182,9 @@ def _at_video_size(
 
 def _rate_warning(cameras: Sequence[CameraSource]) -> list[str]:
     videos = [
-        (camera.name, camera.video.fps) for camera in cameras if camera.video is not None and camera.video.fps > 0
+        (camera.name, camera.video.info.fps)
+        for camera in cameras
+        if camera.video is not None and camera.video.info.fps > 0
     ]
     odd = [(name, fps) for name, fps in videos if not math.isclose(fps, videos[0][1], rel_tol=0.01)]
     if not odd:

@@ -29,12 +29,20 @@ class Lens:
 
 
 @dataclass(frozen=True)
+class VideoFrame:
+    """A picture that comes out of a video: of this file the frame of this number, 0 being the first one."""
+
+    video: Path
+    number: int
+
+
+@dataclass(frozen=True)
 class View:
     """One picture and its camera.
 
     Attributes:
         name: unique within the capture (usually the path below the root, without extension).
-        image_path: picture file.
+        image_path: picture file; of a ``video``'s frame where it lies or will lie, see ``dyngs.data.frame_cache``.
         cam_from_world: (4, 4) float64, OpenCV axes, in the capture's rebased world (see ``Capture.world_offset``).
         intrinsics: (3, 3) float64 in pixels of the *stored* picture size.
         width, height: stored picture size in pixels.
@@ -42,6 +50,7 @@ class View:
         mask_path: white = keep, black = ignore; None without a mask.
         time: in [0, 1], or None for a still scene.
         frame: frame number of a sequence, or None.
+        video: what ``image_path`` is decoded from, None where it is a file of the capture.
     """
 
     name: str
@@ -55,6 +64,7 @@ class View:
     mask_path: Path | None = None
     time: float | None = None
     frame: int | None = None
+    video: VideoFrame | None = None
 
 
 @dataclass(frozen=True)

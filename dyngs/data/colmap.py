@@ -13,7 +13,8 @@ from dyngs.data.images import SUFFIXES, read_header
 from dyngs.data.intrinsics import match_size, pinhole_matrix, rescale_warning
 from dyngs.data.poses import checked_pose, repair_warning
 from dyngs.data.transforms import view_name
-from dyngs.errors import DyngsError
+from dyngs.data.trust import inside
+from dyngs.errors import DyngsError, reading
 
 if TYPE_CHECKING:
     import pycolmap
@@ -117,16 +118,15 @@ def _load_model(folder: Path) -> pycolmap.Reconstruction:
     for name in ("cameras", "images", "points3D", *optional):
         check_model_file(folder / f"{name}{extension}")
     model = pycolmap.Reconstruction()
-    try:
+    # pycolmap raises ValueError, IndexError and its own types for the same faults.
+    with reading(folder, "the COLMAP model is inconsistent; export it again"):
         (model.read_binary if extension == ".bin" else model.read_text)(str(folder))
-    except Exception as error:  # pycolmap raises ValueError, IndexError and its own types for the same faults
-        reason = " ".join(str(error).split())[:160]
-        raise DyngsError(f"{folder}: the COLMAP model is inconsistent ({reason}); export it again") from None
     return model
 
 
 def _stored_size(path: Path) -> tuple[int, int] | None:
     """(width, height), None where the picture is missing or damaged: the loader refuses it when it is wanted."""
+    inside(path)
     try:
         header = read_header(path)
     except DyngsError:

@@ -9,6 +9,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
+from dyngs.data.trust import inside
 from dyngs.errors import DyngsError
 
 # Number of parameters by camera model id, in COLMAP's numbering.
@@ -50,7 +51,7 @@ def check_model_file(path: Path) -> None:
     Raises:
         DyngsError: missing, truncated, trailing bytes, or text lines with too few fields.
     """
-    if not path.is_file():
+    if not inside(path).is_file():
         raise DyngsError(f"{path}: the COLMAP model lacks this file; export the whole model again")
     if path.suffix == ".txt":
         _check_text(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.errors import DyngsError
+from dyngs.data.picture_errors import picture_error
+from dyngs.data.trust import check_size
+from dyngs.errors import DyngsError, reading
 
 if TYPE_CHECKING:
     import OpenImageIO
@@ -44,10 +47,11 @@ def read_header(path: Path) -> PictureHeader:
     Raises:
         DyngsError: the file is missing or is no picture.
     """
-    source = _open(path)
-    spec = source.spec()
-    source.close()
-    return PictureHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0)
+    with _reading(path):
+        source = _open(path)
+        spec = source.spec()
+        source.close()
+        return PictureHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0)
 
 
 def read_picture(path: Path) -> Tensor:
@@ -57,19 +61,29 @@ def read_picture(path: Path) -> Tensor:
     alpha: they are clamped to [0, 1] and encoded as sRGB. Grey becomes RGB.
 
     Raises:
-        DyngsError: the file is missing, truncated or no picture.
+        DyngsError: the file is missing, truncated, no picture, or larger than ``data.max_megapixels``.
     """
+    with _reading(path):
+        return _decoded(path)
+
+
+def _reading(path: Path) -> AbstractContextManager[None]:
+    return reading(path, "the picture is damaged or of an unknown kind; copy or convert it again")
+
+
+def _decoded(path: Path) -> Tensor:
     import OpenImageIO as oiio
 
     source = _open(path)
     spec = source.spec()
+    check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
     is_linear = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
     pixels = source.read_image(oiio.FLOAT if is_linear else oiio.UINT8)
-    message = source.geterror()
+    message = picture_error(source)
     source.close()
     # Half a JPEG decodes to a picture with a grey lower half and a message.
     if pixels is None or "premature" in message.lower():
-        reason = message.strip().splitlines()[0] if message.strip() else "the data ends early"
+        reason = message or "the data ends early"
         raise DyngsError(f"{path}: the picture is truncated or damaged ({reason}); copy it again")
     pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
     alpha = pixels[..., spec.alpha_channel] if spec.alpha_channel >= 0 else None
@@ -99,9 +113,10 @@ def check_picture(path: Path) -> PictureHeader:
         DyngsError: the file is missing, truncated or no picture.
     """
     header = read_header(path)
+    check_size(path, header.width, header.height, header.channels)
     marker = _END_MARKERS.get(path.suffix.lower())
     if marker:
-        with path.open("rb") as file:
+        with _reading(path), path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
             complete = marker in file.read()
         if not complete and marker == _PNG_END:  # not decoded: libpng would add lines of its own to the error
@@ -153,7 +168,7 @@ def _open(path: Path) -> OpenImageIO.ImageInput:
     config["oiio:UnassociatedAlpha"] = 1
     source = oiio.ImageInput.open(str(path), config)
     if source is None:
-        reason = (oiio.geterror().strip() or "unknown format").splitlines()[0]
+        reason = picture_error(oiio) or "unknown format"
         raise DyngsError(f"{path}: cannot be read as a picture ({reason}); copy or convert it again")
     return source
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,13 @@ from dyngs.data.camera_folders import calibrated_fps, find_cameras
 from dyngs.data.camera_picture import draw_cameras, matrix_fault, pose_fault
 from dyngs.data.capture import Capture, View
 from dyngs.data.focus import focus_point, share_in_front
-from dyngs.data.frame_cache import is_video_frame, planned_frames
+from dyngs.data.frame_cache import planned_frames
 from dyngs.data.frame_selection import distinct_times
 from dyngs.data.images import SUFFIXES, read_header, read_picture
+from dyngs.data.json_object import read_json_object
 from dyngs.data.poses import camera_center, inverse_rigid
-from dyngs.errors import DyngsError
+from dyngs.data.trust import leaving_links, pictures_up_to, staying_within
+from dyngs.errors import DyngsError, reading, reason
 
 __all__ = ["InspectReport", "draw_cameras", "format_report", "inspect_capture", "report_on"]
 
@@ -60,11 +62,15 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
     from dyngs.data.read import read_capture
 
     options = source if isinstance(source, DataConfig) else DataConfig(root=source)  # type: ignore[call-arg]
+    links = [f"{path}: a link that leads out of the capture, to {place}" for path, place in leaving_links(options.root)]
     try:
         capture = read_capture(options, decode_videos=deep)
+        with pictures_up_to(options.max_megapixels), reading(options.root, "`dyngs --debug` shows where"):
+            report = report_on(capture, deep)
     except DyngsError as error:
-        return InspectReport(options.root, None, (), (str(error), *_loose_json_problems(options.root, str(error))))
-    return report_on(capture, deep)
+        more = (*_listed(links, str), *_loose_json_problems(options.root, str(error)))
+        return InspectReport(options.root, None, (), (str(error), *more))
+    return replace(report, problems=(*_listed(links, str), *report.problems))
 
 
 def report_on(capture: Capture, deep: bool = False) -> InspectReport:
@@ -144,7 +150,7 @@ def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
     fps = _frame_rate(capture)
     if fps:
         yield "frame rate", f"{fps:.6g} per second"
-    frames = [view.image_path for view in views if is_video_frame(view.image_path)]
+    frames = [view.image_path for view in views if view.video is not None]
     if frames:
         yield "video frames", f"{sum(path.is_file() for path in frames)} of {len(frames)} are decoded already"
 
@@ -156,13 +162,13 @@ def _frame_rate(capture: Capture) -> float | None:
         if capture.format in ("camera_folders", "llff"):
             fps = calibrated_fps(root) if capture.format == "camera_folders" else None
             videos = [path for path in find_cameras(root).values() if path.is_file()]
-            return fps or (planned_frames(root, videos[0]).info.fps if videos else None)
+            return fps or (planned_frames(videos[0]).info.fps if videos else None)
         names = dict.fromkeys(("blender", "body_json"), "transforms_train.json") | {"nerfstudio": "transforms.json"}
         fields = json.loads((root / names.get(capture.format, "")).read_text(encoding="utf-8-sig"))
         fps = fields.get("fps")
-    except (DyngsError, OSError, ValueError, AttributeError):
+    except (DyngsError, OSError, ValueError, AttributeError, RecursionError):
         return None
-    return float(fps) if isinstance(fps, (int, float)) and fps > 0 else None
+    return float(fps) if isinstance(fps, (int, float)) and 0 < fps < 1e6 else None
 
 
 def _split_problems(capture: Capture) -> list[str]:
@@ -247,7 +253,7 @@ def _picture_problems(capture: Capture, deep: bool) -> list[str]:
     unreadable, sizes, channels = [], [], Counter[int]()
     for view in _all_views(capture):
         for path in (view.image_path, view.mask_path):
-            if path is None or (is_video_frame(path) and not path.is_file()):
+            if path is None or (view.video is not None and not path.is_file()):
                 continue
             try:
                 header = read_header(path)
@@ -320,14 +326,17 @@ def _loose_json_problems(root: Path, known: str) -> list[str]:
     problems = []
     for file in sorted(root.glob("transforms*.json")) if root.is_dir() else []:
         try:
-            frames: Any = json.loads(file.read_text(encoding="utf-8")).get("frames", [])
-            entries = [(str(frame["file_path"]), np.array(frame["transform_matrix"], float)) for frame in frames]
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            with staying_within(root):
+                frames: Any = read_json_object(file).get("frames", [])
+            with reading(file):
+                entries = [(str(frame["file_path"]), np.array(frame["transform_matrix"], float)) for frame in frames]
+                names = Counter(name for name, _ in entries)
+                missing = [n for n in names if not any((root / (n + suffix)).is_file() for suffix in ("", *SUFFIXES))]
+        except DyngsError as error:
             if str(file) not in known:
-                problems.append(f"{file}: holds no frames with 'file_path' and 'transform_matrix' ({error!r})")
+                why = reason(error.__cause__ or error)
+                problems.append(f"{file}: holds no frames with 'file_path' and 'transform_matrix' ({why})")
             continue
-        names = Counter(name for name, _ in entries)
-        missing = (n for n in names if not any((root / (n + suffix)).is_file() for suffix in ("", *SUFFIXES)))
         faults = (matrix_fault(pose, f"{file}: '{name}'") for name, pose in entries)
         doubled = ((n, count) for n, count in names.items() if count > 1)
         if not entries:

@@ -6,6 +6,11 @@ import numpy as np
 
 from dyngs.errors import DyngsError
 
+MAX_SIDE = 2**20
+"""Pixels of a side of a picture; more is taken for a mistake."""
+FOCAL_RANGE = (1e-4, 1e6)
+"""Focal lengths in longer sides of the picture; others are taken for mistakes: 179.99 degrees, and 0.00006 degrees."""
+
 
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     """(3, 3) float64 camera matrix, pixels."""
@@ -28,8 +33,10 @@ def match_size(
         where: the picture, for messages.
 
     Raises:
-        DyngsError: the picture's aspect is another one, so that no rescaling is right.
+        DyngsError: the picture's aspect is another one, so that no rescaling is right; a focal length or a principal
+            point that no camera has.
     """
+    _check_plausible(intrinsics, described, where)
     if stored is None or stored == described:
         return intrinsics, described, False
     scale_x, scale_y = stored[0] / described[0], stored[1] / described[1]
@@ -42,6 +49,19 @@ def match_size(
             f"{turned}; correct the size and focal length or restore the original picture"
         )
     return scaled_intrinsics(intrinsics, scale_x, scale_y), stored, True
+
+
+def _check_plausible(intrinsics: np.ndarray, described: tuple[int, int], where: str) -> None:
+    side = max(described)
+    low, high = FOCAL_RANGE[0] * side, FOCAL_RANGE[1] * side
+    fx, fy, *center = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    if not (low <= fx <= high and low <= fy <= high):
+        raise DyngsError(
+            f"{where}: the focal length ({fx:g}, {fy:g}) px does not suit a picture of {described[0]}x{described[1]}; "
+            "correct it, or the field of view that it follows from"
+        )
+    if not all(abs(x) <= high for x in center):
+        raise DyngsError(f"{where}: the principal point ({center[0]:g}, {center[1]:g}) px lies too far out; correct it")
 
 
 def rescale_warning(where: list[str]) -> list[str]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from dyngs.errors import DyngsError
+from dyngs.data.trust import inside
+from dyngs.errors import DyngsError, reading
 
 
 def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, object]:
@@ -17,12 +18,12 @@ def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict
     Raises:
         DyngsError: unreadable, broken JSON (with line and column), or no object.
     """
-    try:
-        fields = json.loads(path.read_text(encoding="utf-8-sig"))
-    except json.JSONDecodeError as error:
-        raise DyngsError(f"{path}, line {error.lineno} column {error.colno}: broken JSON ({error.msg})") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DyngsError(f"{path}: cannot be read ({error})") from None
+    with reading(path, "it must be a JSON file; copy or export it again"):
+        try:
+            fields = json.loads(inside(path).read_text(encoding="utf-8-sig"))
+        except json.JSONDecodeError as error:
+            where = f"{path}, line {error.lineno} column {error.colno}"
+            raise DyngsError(f"{where}: broken JSON ({error.msg}); copy or export it again") from error
     if not isinstance(fields, dict):
         raise DyngsError(f"{path}: {what}")
     return fields

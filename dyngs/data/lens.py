@@ -66,7 +66,7 @@ def undistort_map(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -
         y = torch.arange(rows.start, rows.stop, dtype=torch.float64) + 0.5
         points = (torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1) - center) / focal
         found = distort(lens, points) * focal + center
-        grid[rows] = (2 * found / size - 1).float()
+        grid[rows] = (2 * found / size - 1).nan_to_num(2.0).clamp(-2, 2).float()
         inside = ((found >= 0) & (found <= size)).all(dim=-1)
         valid[rows] = inside & (points.norm(dim=-1) <= limit)
     return LensMap(grid, valid)

@@ -9,7 +9,8 @@ import numpy as np
 
 from dyngs.data.camera_folders import OPENGL_FROM_OPENCV, find_cameras, open_camera, sequence_views
 from dyngs.data.capture import Capture, Split, View
-from dyngs.errors import DyngsError
+from dyngs.data.trust import inside
+from dyngs.errors import DyngsError, reading
 
 POSES = "poses_bounds.npy"
 
@@ -41,7 +42,7 @@ def read_llff(root: Path) -> Capture:
             f"{path}: has poses of {len(rows)} cameras, but {len(names)} videos or folders of frames are there"
             f"{_ends(names)}{_gaps(names)}; {few}, or remove the rows of cameras that are not there"
         )
-    cameras = [open_camera(root, name, found[name]) for name in names]
+    cameras = [open_camera(name, found[name]) for name in names]
     calibrations = {name: _calibration(row) for name, row in zip(names, rows, strict=True)}
     views, notes = sequence_views(path, cameras, calibrations)
     numbers = [int(digits) for name in names for digits in re.findall(r"\d+$", name)]
@@ -56,12 +57,9 @@ def read_number_array(path: Path) -> np.ndarray:
     Raises:
         DyngsError: the file is missing, damaged, or holds something else than numbers.
     """
-    try:
-        with path.open("rb") as file:
-            return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
-    except Exception as error:  # NumPy reads the header as Python text; a damaged one raises nearly anything
-        reason = " ".join(str(error).split())[:100]
-        raise DyngsError(f"{path}: cannot be read as a NumPy array of numbers ({reason}); copy it again") from None
+    # NumPy reads the header as Python text; a damaged one raises nearly anything.
+    with reading(path, "it must be a NumPy array of numbers; copy it again"), inside(path).open("rb") as file:
+        return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
 
 
 def _read_rows(path: Path) -> np.ndarray:

@@ -25,6 +25,7 @@ from dyngs.data.images import (
 from dyngs.data.intrinsics import scaled_intrinsics
 from dyngs.data.lens import LensMap, is_pinhole, undistort, undistort_map
 from dyngs.data.people import PersonView, cut_out
+from dyngs.data.trust import pictures_up_to
 from dyngs.errors import DyngsError
 
 ALL_COUNTS = 1 - 1e-4
@@ -101,7 +102,7 @@ class PictureLoader:
 
         Args:
             views: one split of a capture.
-            options: downscale, longest_side, cache_mb.
+            options: downscale, longest_side, cache_mb, max_megapixels.
 
         Raises:
             DyngsError: missing pictures (count and first), damaged ones, or a size that is not the view's.
@@ -112,7 +113,8 @@ class PictureLoader:
         self._cached_bytes = 0
         self._last_map: tuple[object, LensMap] | None = None
         self._lock = Lock()
-        check_files(self._views)
+        with pictures_up_to(options.max_megapixels):
+            check_files(self._views)
 
     def __len__(self) -> int:
         return len(self._views)
@@ -163,7 +165,8 @@ class PictureLoader:
             if index in self._cache:
                 self._cache.move_to_end(index)
                 return self._cache[index]
-        decoded = self._decode(self._views[index])
+        with pictures_up_to(self._options.max_megapixels):
+            decoded = self._decode(self._views[index])
         limit = self._options.cache_mb * 1e6
         with self._lock:
             if index not in self._cache and decoded.num_bytes <= limit:

@@ -14,6 +14,7 @@ from dyngs.data.images import SUFFIXES, read_header
 from dyngs.data.json_object import read_json_object
 from dyngs.data.llff import read_number_array
 from dyngs.data.transforms import Frame, FrameFile, read_views
+from dyngs.data.trust import inside
 from dyngs.errors import DyngsError
 
 
@@ -200,6 +201,7 @@ def _camera(path: Path, scene: _Scene, pictures: _Pictures, name: str, skewed: l
 def _scaled_size(full: np.ndarray, factor: int, picture: Path) -> tuple[int, int]:
     """(width, height) of the picture; as it is stored if that is a rounding of ``full / factor``."""
     nominal = round(float(full[0]) / factor), round(float(full[1]) / factor)
+    inside(picture)
     try:
         header = read_header(picture)
     except DyngsError:

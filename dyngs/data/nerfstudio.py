@@ -8,7 +8,8 @@ import numpy as np
 
 from dyngs.data.capture import Capture, PointCloud, Split, View
 from dyngs.data.transforms import FrameFile, read_frame_file, read_views
-from dyngs.errors import DyngsError
+from dyngs.data.trust import inside
+from dyngs.errors import DyngsError, reading
 
 
 def is_nerfstudio(root: Path) -> bool:
@@ -30,7 +31,7 @@ def read_nerfstudio(root: Path) -> Capture:
     views, warnings = read_views(file)
     splits, notes = _splits(file, views)
     written = file.fields.get("ply_file_path")
-    points = read_points(root / written) if isinstance(written, str) and written else None
+    points = read_points(inside(root / written)) if isinstance(written, str) and written else None
     return Capture(root, "nerfstudio", splits, points, warnings=(*warnings, *notes))
 
 
@@ -44,16 +45,13 @@ def read_points(path: Path) -> PointCloud:
 
     if not path.is_file():
         raise DyngsError(f"{path}: no such point file; restore it or remove ply_file_path")
-    try:
+    with reading(path, "it must hold points; export it again"):
         loaded = trimesh.load(path, process=False)
         xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)  # type: ignore[union-attr]
         colours = loaded.colors if isinstance(loaded, trimesh.PointCloud) else loaded.visual.vertex_colors  # type: ignore
-    except Exception as error:  # trimesh raises whatever its parser stumbled over
-        reason = " ".join(str(error).split())[:100]
-        raise DyngsError(f"{path}: cannot be read as points ({reason}); export it again") from None
-    rgb = np.full((len(xyz), 3), 128, np.uint8)
-    if colours is not None and len(colours) == len(xyz):
-        rgb = np.ascontiguousarray(np.asarray(colours)[:, :3].astype(np.uint8))
+        rgb = np.full((len(xyz), 3), 128, np.uint8)
+        if colours is not None and len(colours) == len(xyz):
+            rgb = np.ascontiguousarray(np.asarray(colours)[:, :3].astype(np.uint8))
     return PointCloud(xyz, rgb)
 
 

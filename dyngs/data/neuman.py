@@ -25,7 +25,8 @@ from dyngs.data.people import (
 )
 from dyngs.data.pickles import read_pickle, read_pickled_array
 from dyngs.data.poses import checked_pose
-from dyngs.errors import DyngsError
+from dyngs.data.trust import inside
+from dyngs.errors import DyngsError, reading
 
 ALIGNED = "4d_humans/smpl_optimized_aligned_scale.npz"
 ALIGNMENTS = "alignments.npy"
@@ -77,13 +78,13 @@ def _aligned(root: Path, numbers: list[int]) -> BodyFrames:
 def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
     """SMPL as estimated in its own frame, brought to the world by each picture's similarity."""
     path = next((root / name for name in FITS if (root / name).is_file()), root / FITS[0])
-    fits = read_pickle(path)
+    fits = read_pickle(inside(path))
     if not isinstance(fits, dict) or len(fits) != 1:
         count = len(fits) if isinstance(fits, dict) else 0
         raise DyngsError(f"{path}: must hold the body parameters of one person, got {count}; keep one")
     fit = next(iter(fits.values()))
     poses = _per_picture(path, "pose", entry(path, fit, "pose"), len(numbers))
-    alignments = read_pickled_array(root / ALIGNMENTS)
+    alignments = read_pickled_array(inside(root / ALIGNMENTS))
     scales, turns, trans = [], [], []
     for name in names:
         where = f"{root / ALIGNMENTS}, {name}"
@@ -128,10 +129,8 @@ def _splits(root: Path, people: dict[str, PersonView]) -> tuple[dict[Split, tupl
         path = root / f"{split}_split.txt"
         if not path.is_file():
             continue
-        try:
-            listed = list(dict.fromkeys(path.read_text(encoding="utf-8").split()))
-        except (OSError, ValueError) as error:
-            raise DyngsError(f"{path}: cannot be read ({error}); it lists names of pictures, one a line") from None
+        with reading(path, "it lists names of pictures, one a line"):
+            listed = list(dict.fromkeys(inside(path).read_text(encoding="utf-8").split()))
         unposed += [name for name in listed if name not in people]
         splits[split] = tuple(people[name] for name in listed if name in people)
     if "train" not in splits:

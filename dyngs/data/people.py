@@ -21,7 +21,8 @@ from torch import Tensor
 from dyngs.data.archives import read_arrays
 from dyngs.data.capture import Split, View
 from dyngs.data.images import read_picture
-from dyngs.errors import DyngsError
+from dyngs.data.trust import check_size, inside
+from dyngs.errors import DyngsError, reading
 
 BodyKind = Literal["smpl", "smplh", "smplx"]
 
@@ -248,7 +249,7 @@ def read_npz(path: Path, keys: Collection[str], optional: Collection[str] = ()) 
     Raises:
         DyngsError: the file is missing or damaged, holds objects there, lacks a key, or asks for too much memory.
     """
-    if not path.is_file():
+    if not inside(path).is_file():
         raise DyngsError(f"{path}: no such file; it should hold the body parameters {', '.join(keys)}")
     found = read_arrays(path, lambda names: [name for name in (*keys, *optional) if name in names])
     for key in keys:
@@ -343,13 +344,16 @@ def _hdf5(path: Path, key: str, rows: int | EllipsisType | None) -> Any:
         h5py = import_module("h5py")
     except ImportError:
         raise DyngsError(f"{path}: HDF5 files need the package h5py; run pip install 'dyngs[people]'") from None
-    if not path.is_file():
+    if not inside(path).is_file():
         raise DyngsError(f"{path}: no such file; restore it")
-    try:
-        with h5py.File(path, "r") as file:
-            found = file.get(key)
-            if not isinstance(found, h5py.Dataset) or not found.shape:
-                raise DyngsError(f"{path}: the data set '{key}' is missing; export it again")
-            return found.shape if rows is None else found[rows]
-    except (OSError, ValueError, TypeError, KeyError, IndexError, RuntimeError, MemoryError) as error:
-        raise DyngsError(f"{path}: '{key}' cannot be read as HDF5 ({_reason(error)}); copy the file again") from None
+    advice = f"'{key}' must be a data set in an HDF5 file; copy the file again"
+    with reading(path, advice), h5py.File(path, "r") as file:
+        # A link inside the file may lead to another file.
+        found: Any = file.get(key) if isinstance(file.get(key, getlink=True), h5py.HardLink) else None
+        if not isinstance(found, h5py.Dataset) or not found.shape or found.external or found.is_virtual:
+            raise DyngsError(f"{path}: the data set '{key}' is missing; export it again")
+        if rows is None:
+            return found.shape
+        shape = found.shape if isinstance(rows, EllipsisType) else found.shape[1:]
+        check_size(path, max(math.prod(shape), math.prod(found.chunks or ())), max(1, found.dtype.itemsize // 4))
+        return found[rows]

@@ -24,6 +24,7 @@ from dyngs.data.people import (
 )
 from dyngs.data.pickles import read_pickle
 from dyngs.data.poses import inverse_rigid
+from dyngs.data.trust import inside
 from dyngs.data.video import VIDEO_SUFFIXES
 from dyngs.errors import DyngsError
 
@@ -47,7 +48,7 @@ def read_people_snapshot(root: Path) -> Capture:
     Raises:
         DyngsError: h5py is not installed; anything missing, broken or inconsistent; names the file.
     """
-    camera = open_camera(root, (video := _video(root)).stem, video)
+    camera = open_camera((video := _video(root)).stem, video)
     body = _body(root / POSE_FILE)
     usable = set(body.frames) & set(range(hdf5_length(root / MASK_FILE, MASKS)))
     pictures = {number: path for number, path in camera.pictures.items() if number in usable}
@@ -81,7 +82,7 @@ def _video(root: Path) -> Path:
 
 def _calibration(path: Path) -> dict[str, object]:
     """The fields of a frame in a transforms file."""
-    fields = read_pickle(path)
+    fields = read_pickle(inside(path))
     fx, fy = numbers_of(f"{path}: 'camera_f'", entry(path, fields, "camera_f"), (2,)).tolist()
     cx, cy = numbers_of(f"{path}: 'camera_c'", entry(path, fields, "camera_c"), (2,)).tolist()
     lens = numbers_of(f"{path}: 'camera_k'", entry(path, fields, "camera_k"), (5,)).tolist()

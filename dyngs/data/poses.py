@@ -6,6 +6,8 @@ import numpy as np
 
 from dyngs.errors import DyngsError
 
+LARGEST = 1e12
+"""Largest entry of a pose: farther out, doubles do not tell places apart well enough to bring them to the origin."""
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of ``R^T R - I`` that is taken for rounding and repaired."""
 
@@ -27,6 +29,8 @@ def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
         raise DyngsError(f"{where}: the pose must be a 4x4 matrix, got shape {matrix.shape}; export it again")
     if not np.isfinite(matrix).all():
         raise DyngsError(f"{where}: the pose holds NaN or infinite numbers; remove or repair this frame")
+    if np.abs(matrix).max() > LARGEST:
+        raise DyngsError(f"{where}: the pose holds numbers beyond {LARGEST:g}; use another unit or repair this frame")
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise DyngsError(f"{where}: the last row of the pose must be 0 0 0 1; is the matrix transposed?")
     rotation = matrix[:3, :3].astype(np.float64)

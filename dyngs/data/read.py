@@ -13,7 +13,7 @@ from dyngs.data.body_json import is_body_json, read_body_json
 from dyngs.data.camera_folders import CALIBRATION, is_camera_folders, read_camera_folders
 from dyngs.data.capture import Capture, PointCloud, Split, View
 from dyngs.data.colmap import MODEL_FOLDERS, is_colmap, read_colmap
-from dyngs.data.frame_cache import decode_frames, is_video_frame
+from dyngs.data.frame_cache import decode_frames
 from dyngs.data.frame_selection import select_frames
 from dyngs.data.images import read_header
 from dyngs.data.llff import POSES, is_llff, read_llff
@@ -24,10 +24,14 @@ from dyngs.data.people import PersonView
 from dyngs.data.people_snapshot import is_people_snapshot, read_people_snapshot
 from dyngs.data.rebase import rebase
 from dyngs.data.times import sequence_warnings, still_if_constant, unit_times
+from dyngs.data.trust import inside, pictures_up_to, staying_within
 from dyngs.data.zju_mocap import is_zju_mocap, read_zju_mocap
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
 
 Splits = dict[Split, tuple[View, ...]]
+
+FARTHEST = 1e18
+"""Points with larger coordinates are mistakes; their squares would not fit into float32."""
 
 _READERS = {
     "body_json": (is_body_json, read_body_json, "transforms_train.json and body_train.npz"),
@@ -64,7 +68,8 @@ def read_capture(options: DataConfig, decode_videos: bool = True) -> Capture:
     if not root.is_dir():
         problem = "is a file; give the folder that holds it" if root.is_file() else "no such folder; check data.root"
         raise DyngsError(f"{root}: {problem}")
-    found = [name for name, (is_format, _, _) in _READERS.items() if is_format(root)]
+    with reading(root, "choose another folder or change its permissions"):
+        found = [name for name, (is_format, _, _) in _READERS.items() if is_format(root)]
     if options.format == "auto" and not found:
         wanted = "; ".join(f"{name}: {files}" for name, (_, _, files) in _READERS.items())
         raise DyngsError(f"{root}: no capture found; looked for {wanted}")
@@ -72,7 +77,12 @@ def read_capture(options: DataConfig, decode_videos: bool = True) -> Capture:
         also = f"; but there is a {found[0]} capture" if found else ""
         raise DyngsError(f"{root}: no {options.format} capture, which would have {_READERS[options.format][2]}{also}")
     name = found[0] if options.format == "auto" else options.format
-    capture = _finished(_READERS[name][1](root), options, decode_videos)
+    with (
+        staying_within(root, options.follow_links),
+        pictures_up_to(options.max_megapixels),
+        reading(root, "one of its files is not as it should be (`dyngs --debug` shows where); export it again"),
+    ):
+        capture = _finished(_READERS[name][1](root), options, decode_videos)
     others = [other for other in found[1:] if other != _BUILT_ON.get(name)]
     if options.format == "auto" and others:
         note = f"read as {name}, but there is also a {others[0]} capture; data.format= chooses"
@@ -101,9 +111,11 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
     splits.setdefault("val", ())
     if new_poses is not None:
         splits["pose"] = new_poses
+    for view in (view for views in splits.values() for view in views):
+        _check_places(view)
     if decode_videos:
-        paths = [view.image_path for views in splits.values() for view in views]
-        decode_frames(capture.root, paths, options.frame_cache_mb)
+        frames = {view.image_path: view.video for views in splits.values() for view in views if view.video is not None}
+        decode_frames(capture.root, frames, options.frame_cache_mb)
     warnings = [*capture.warnings, *_check_names(capture.root, splits), *_missing_pictures(splits)]
     points, more = _finite_points(capture.points)
     capture = replace(
@@ -114,6 +126,15 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         warnings=(*warnings, *notes, *more),
     )
     return rebase(capture)
+
+
+def _check_places(view: View) -> None:
+    """Refuse pictures, masks and silhouettes that lie outside the capture."""
+    silhouette = view.silhouette if isinstance(view, PersonView) else None
+    picture = view.image_path if view.video is None else view.video.video
+    for path in (picture, view.mask_path, silhouette and silhouette.path):
+        if path is not None:
+            inside(path)
 
 
 def _check_names(root: Path, splits: Splits) -> list[str]:
@@ -129,9 +150,9 @@ def _check_names(root: Path, splits: Splits) -> list[str]:
 
 
 def _missing_pictures(splits: Splits) -> list[str]:
-    paths = [view.image_path for views in splits.values() for view in views]
-    missing = [path for path in paths if not path.is_file() and not is_video_frame(path)]
-    return [f"{len(missing)} of {len(paths)} pictures are missing, first {missing[0]}"] if missing else []
+    seen = [view for views in splits.values() for view in views]
+    missing = [view.image_path for view in seen if view.video is None and not view.image_path.is_file()]
+    return [f"{len(missing)} of {len(seen)} pictures are missing, first {missing[0]}"] if missing else []
 
 
 def _first_has_alpha(views: tuple[View, ...]) -> bool:
@@ -157,7 +178,8 @@ def _timed(root: Path, splits: Splits, frames: str | None) -> tuple[Splits, list
 def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, list[str]]:
     if points is None:
         return None, []
-    keep = np.isfinite(points.xyz).all(axis=1)
-    notes = [f"{int((~keep).sum())} points hold NaN or infinite numbers and are ignored"] if not keep.all() else []
+    keep = (np.abs(points.xyz) < FARTHEST).all(axis=1)
+    lost = int((~keep).sum())
+    notes = [f"{lost} points hold NaN, infinite or far too large numbers and are ignored"] if lost else []
     points = PointCloud(points.xyz[keep], points.rgb[keep])
     return (points if len(points.xyz) else None), notes

@@ -6,14 +6,18 @@ import os
 import shutil
 import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from dyngs.data.images import read_header
+from dyngs.data.picture_errors import any_text, picture_error
+from dyngs.data.trust import MAX_MEGAPIXELS, check_size, inside, pictures_up_to, staying_within
 from dyngs.data.video import read_frames
 from dyngs.data.write import write_image
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
 
 if TYPE_CHECKING:
     import pycolmap
@@ -36,6 +40,8 @@ class SfmOptions:
         num_frames: pictures to take from a video, evenly spaced, the sharpest around each place.
         seed: of everything random.
         num_threads: 0 = all cores; other numbers may give other last digits.
+        follow_links: photos may be links that lead out of their folder.
+        max_megapixels: larger pictures and videos are refused.
     """
 
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
@@ -49,6 +55,8 @@ class SfmOptions:
     num_frames: int = 100
     seed: int = 0
     num_threads: int = 0
+    follow_links: bool = False
+    max_megapixels: float = MAX_MEGAPIXELS
 
 
 @dataclass(frozen=True)
@@ -107,11 +115,8 @@ def estimate_poses(source: Path, out: Path, options: SfmOptions = SfmOptions()) 
     except OSError as error:
         raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
     try:
-        images, is_video = work / "images", source.is_file()
-        names = _extract_frames(source, images, options) if is_video else _gather_photos(source, images, out)
-        if len(names) < 3:
-            raise DyngsError(f"{source} has {len(names)} pictures; structure from motion needs at least 3, better 30")
-        result = _run_colmap(work, names, is_video, options, out)
+        with staying_within(source, options.follow_links or source.is_file()), pictures_up_to(options.max_megapixels):
+            result = _posed_in(work, source, options, out)
         work.chmod(0o755)
         if out.exists():
             out.rmdir()
@@ -121,6 +126,15 @@ def estimate_poses(source: Path, out: Path, options: SfmOptions = SfmOptions()) 
         raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def _posed_in(work: Path, source: Path, options: SfmOptions, out: Path) -> SfmResult:
+    """What will be at ``out``, in ``work``."""
+    images, is_video = work / "images", source.is_file()
+    names = _extract_frames(source, images, options) if is_video else _gather_photos(source, images, out)
+    if len(names) < 3:
+        raise DyngsError(f"{source} has {len(names)} pictures; structure from motion needs at least 3, better 30")
+    return _run_colmap(work, names, is_video, options, out)
 
 
 def _run_colmap(work: Path, names: list[str], is_video: bool, options: SfmOptions, out: Path) -> SfmResult:
@@ -213,19 +227,21 @@ def _mapping_options(options: SfmOptions) -> pycolmap.IncrementalPipelineOptions
 
 def _gather_photos(source: Path, images: Path, out: Path) -> list[str]:
     """Copies (hard links where possible) of all photos below ``source``; their names below ``images``, sorted."""
-    inside = out.resolve()
+    result = out.resolve()
     photos = sorted(
         path for path in source.rglob("*")
-        if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() and inside not in path.resolve().parents
+        if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() and result not in path.resolve().parents
         and not any(part.startswith(".") for part in path.relative_to(source).parts)
     )  # fmt: skip
     names = []
     for photo in photos:
+        header = read_header(inside(photo))
+        check_size(photo, header.width, header.height, header.channels)
         name = photo.relative_to(source)
         target = images / name
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
-            os.link(photo, target)
+            os.link(photo.resolve(), target)
         except OSError:
             shutil.copyfile(photo, target)
         names.append(name.as_posix())
@@ -254,13 +270,14 @@ def _same_camera(photos: list[Path]) -> bool:
 
     kinds = set()
     for photo in photos:
-        picture = oiio.ImageInput.open(str(photo))
-        if picture is None:
-            raise DyngsError(f"cannot read the picture {photo.name}: {oiio.geterror()}; remove or replace it")
-        spec = picture.spec()
-        exif = (spec.get_string_attribute("Model"), spec.get_float_attribute("Exif:FocalLength"))
-        kinds.add((spec.width, spec.height, *exif))
-        picture.close()
+        with reading(photo, "remove or replace it"):
+            picture = oiio.ImageInput.open(str(photo))
+            if picture is None:
+                raise DyngsError(f"cannot read the picture {photo.name}: {picture_error(oiio)}; remove or replace it")
+            spec = picture.spec()
+            model = any_text(partial(spec.get_string_attribute, "Model"))
+            kinds.add((spec.width, spec.height, model, spec.get_float_attribute("Exif:FocalLength")))
+            picture.close()
     return len(kinds) == 1
 
 

@@ -10,14 +10,16 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from dyngs.data.capture import Lens, View
+from dyngs.data.capture import Lens, VideoFrame, View
 from dyngs.data.images import SUFFIXES, PictureHeader, read_header
-from dyngs.data.intrinsics import match_size, pinhole_matrix, rescale_warning
+from dyngs.data.intrinsics import MAX_SIDE, match_size, pinhole_matrix, rescale_warning
 from dyngs.data.json_object import read_json_object
 from dyngs.data.poses import cam_from_opengl, checked_pose, repair_warning
+from dyngs.data.trust import inside
 from dyngs.errors import DyngsError
 
 _LARGEST = 1e300
+_LARGEST_INTEGER = 2**53
 _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
 
@@ -29,11 +31,15 @@ class Frame:
         where: file and index, for messages.
         own: the frame's fields.
         shared: the file's fields.
+        picture: the picture where ``file_path`` does not name it.
+        video: what the picture comes out of, if anything.
     """
 
     where: str
     own: dict[str, object]
     shared: dict[str, object]
+    picture: Path | None = None
+    video: VideoFrame | None = None
 
     def number(self, key: str) -> float | None:
         """The finite number at ``key``, None if absent."""
@@ -44,7 +50,7 @@ class Frame:
         value = self.own.get(key)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return None
-        return int(value) if value % 1 == 0 else None
+        return int(value) if value % 1 == 0 and abs(value) < _LARGEST_INTEGER else None
 
     def text(self, key: str) -> str | None:
         """The string at ``key``, None if absent."""
@@ -91,7 +97,7 @@ def read_frame_file(path: Path) -> FrameFile:
         if not isinstance(own, dict):
             raise DyngsError(f"{where}: must be an object with file_path and transform_matrix")
         if isinstance(own.get("file_path"), str):
-            where += f" ({own['file_path']})"
+            where += f" ({own['file_path']:.200})"
         frames.append(Frame(where, own, fields))
     return FrameFile(path, fields, tuple(frames))
 
@@ -107,7 +113,7 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
     twice = [path for path, count in Counter(paths).items() if count > 1]
     if twice:
         raise DyngsError(f"{file.path}: {twice[0]} is listed more than once; remove the duplicate frames")
-    headers = [_header(path) for path in paths]
+    headers = [_header(path) if frame.video is None else None for frame, path in zip(file.frames, paths, strict=True)]
     common = _common_size(file, paths, headers)
     notes = _Notes()
     views = {}
@@ -146,9 +152,10 @@ def _view(
         height=size[1],
         lens=_lens(frame),
         camera_id=(camera if camera is not None else frame.integer("camera_id")) or 0,
-        mask_path=_below(root, mask) if mask else None,
+        mask_path=_below(root, mask, frame.where) if mask else None,
         time=_number(frame.own.get("time"), "time", frame.where),
         frame=frame.integer("frame"),
+        video=frame.video,
     )
 
 
@@ -160,16 +167,21 @@ def _number(value: object, key: str, where: str) -> float | None:
     return float(value)
 
 
-def _below(root: Path, written: str) -> Path:
-    return Path(os.path.normpath(root / written.replace("\\", "/")))
+def _below(root: Path, written: str, where: str) -> Path:
+    path = Path(os.path.normpath(root / written.replace("\\", "/")))
+    if not path.name or path == Path(os.path.normpath(root)) or "\0" in written:
+        raise DyngsError(f"{where}: {written!r:.80} names no file; write the way to it from the capture's folder")
+    return path
 
 
 def _image_path(root: Path, frame: Frame) -> Path:
     """The picture's file; extensions are tried where none is written, PNG first."""
+    if frame.picture is not None:
+        return frame.picture
     written = frame.own.get("file_path")
     if not isinstance(written, str) or not written:
         raise DyngsError(f"{frame.where}: the key 'file_path' is missing")
-    path = _below(root, written)
+    path = _below(root, written, frame.where)
     if path.suffix.lower() in SUFFIXES or path.is_file():
         return path
     candidates = [path.with_name(path.name + ending) for suffix in SUFFIXES for ending in (suffix, suffix.upper())]
@@ -178,6 +190,7 @@ def _image_path(root: Path, frame: Frame) -> Path:
 
 def _header(path: Path) -> PictureHeader | None:
     """None where the file is missing or damaged: the loader refuses it, with its reason, when it is wanted."""
+    inside(path)
     try:
         return read_header(path)
     except DyngsError:
@@ -188,8 +201,8 @@ def _described_size(frame: Frame) -> tuple[int, int] | None:
     width, height = frame.number("w"), frame.number("h")
     if width is None or height is None:
         return None
-    if width < 1 or height < 1:
-        raise DyngsError(f"{frame.where}: w and h must be positive, got {width:g} and {height:g}")
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise DyngsError(f"{frame.where}: w and h must be from 1 to {MAX_SIDE:,}, got {width:g} and {height:g}")
     return round(width), round(height)
 
 
@@ -234,7 +247,7 @@ def _focal(source: dict[str, object], axis: str, size: int, where: str) -> float
             return None
         if not 0 < angle < math.pi:
             raise DyngsError(f"{where}: camera_angle_{axis} must lie between 0 and pi radians, got {angle:g}")
-        focal = 0.5 * size / math.tan(0.5 * angle)
+        focal = 0.5 * size / max(math.tan(0.5 * angle), 1e-300)
     if focal is not None and focal <= 0:
         raise DyngsError(f"{where}: fl_{axis} must be positive, got {focal:g}")
     return focal

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from dyngs.errors import DyngsError
+from dyngs.data.trust import check_size
+from dyngs.errors import DyngsError, reading, reason
 
 if TYPE_CHECKING:
     import av
+    from av.container import InputContainer
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
+MAX_FRAMES = 1_000_000
+"""Of one video: ten hours."""
+_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
+"""FFmpeg's names for what these suffixes stand for."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +82,6 @@ def probe_video(path: Path) -> VideoInfo:
     Raises:
         DyngsError: no such file, no video in it, or damage at its beginning.
     """
-    import av
     from av.error import FFmpegError
 
     first = next((frame for _, frame in _decoded(path)), None)
@@ -82,7 +89,7 @@ def probe_video(path: Path) -> VideoInfo:
         raise _broken(path, 0, "it holds no picture")
     height, width = _turned_rgb(first).shape[:2]
     counted = hidden = 0
-    with av.open(str(path)) as container:
+    with _reading(path), _opened(path) as container:
         stream = container.streams.video[0]
         promised, fps = stream.frames, float(stream.average_rate or 0)
         try:
@@ -91,7 +98,10 @@ def probe_video(path: Path) -> VideoInfo:
                 hidden += packet.size > 0 and packet.is_discard  # cut off by an edit list: never shown
         except FFmpegError:
             pass  # truncated: what the header promises is what there should be
-    return VideoInfo(width, height, max(promised, counted) - hidden, fps)
+    count = max(promised, counted) - hidden
+    if count > MAX_FRAMES:
+        raise DyngsError(f"{path}: the video has {count:,} frames, of which {MAX_FRAMES:,} are read at most; cut it up")
+    return VideoInfo(width, height, count, fps if math.isfinite(fps) else 0.0)
 
 
 def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterator[tuple[int, av.VideoFrame]]:
@@ -99,29 +109,54 @@ def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterato
 
     With "AUTO", which is faster, several frames are decoded at once, and damage takes those before it along.
     """
-    import av
     from av.error import FFmpegError
 
     if not path.is_file():
         raise DyngsError(f"no such video file: {path}")
     index = 0
-    try:
-        with av.open(str(path)) as container:
-            if not container.streams.video:
-                raise DyngsError(f"{path} has no video stream")
-            container.streams.video[0].thread_type = threads
-            for frame in container.decode(video=0):
-                yield index, frame
-                index += 1
-    except FFmpegError as error:
-        if index == 0:
-            raise DyngsError(f"cannot read the video {path}: {error.strerror or error}") from error
-        raise _broken(path, index, error.strerror or str(error)) from error
+    with _reading(path):
+        try:
+            with _opened(path) as container:
+                stream = container.streams.video[0]
+                stream.thread_type = threads
+                for frame in container.decode(stream):
+                    if (frame.width, frame.height) != (stream.width, stream.height):
+                        check_size(path, frame.width, frame.height)
+                    yield index, frame
+                    index += 1
+        except FFmpegError as error:
+            if index == 0:
+                raise DyngsError(f"cannot read the video {path}: {reason(error)}") from error
+            raise _broken(path, index, error.strerror or reason(error)) from error
 
 
-def _broken(path: Path, index: int, reason: str) -> DyngsError:
+@contextmanager
+def _opened(path: Path) -> Iterator[InputContainer]:
+    """The file, which must be of a kind that holds pictures itself: playlists, which name other files, are refused.
+
+    Raises:
+        DyngsError: no video in it, or one larger than ``data.max_megapixels``.
+        FFmpegError: damage.
+    """
+    import av
+
+    options = {"protocol_whitelist": "file", "format_whitelist": _CONTAINERS}
+    # Titles may be in any encoding.
+    with av.open(f"file:{path}", options=options, metadata_errors="replace") as container:
+        if not container.streams.video:
+            raise DyngsError(f"{path} has no video stream")
+        stream = container.streams.video[0]
+        check_size(path, stream.width, stream.height)
+        yield container
+
+
+def _reading(path: Path) -> AbstractContextManager[None]:
+    return reading(path, "it must be a video; copy or convert it again")
+
+
+def _broken(path: Path, index: int, why: str) -> DyngsError:
     return DyngsError(
-        f"the video {path} breaks at frame {index} ({reason}); copy it again, or choose data.frames without that part"
+        f"the video {path} breaks at frame {index} ({why}); copy it again, or choose data.frames without that part"
     )
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dyngs.data.picture_errors import picture_error
 from dyngs.errors import DyngsError
 
 
@@ -72,12 +73,12 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
     with whole_file(path) as temporary:
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:
-            oiio.geterror()  # fetched, or it would be printed when the program ends
+            picture_error(oiio)  # fetched, or it would be printed when the program ends
             raise DyngsError(f"cannot write {path}: no format has the suffix '{path.suffix}' (use .png or .exr)")
         written = output.open(str(temporary), spec) and output.write_image(np.ascontiguousarray(pixels))
-        problem = output.geterror()
+        problem = picture_error(output)
         if not (output.close() and written):
-            raise DyngsError(f"cannot write {path}: {problem or output.geterror() or 'unknown error'}")
+            raise DyngsError(f"cannot write {path}: {problem or picture_error(output) or 'unknown error'}")
 
 
 def to_uint8(pixels: np.ndarray) -> np.ndarray:

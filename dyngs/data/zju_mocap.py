@@ -25,6 +25,7 @@ from dyngs.data.people import (
 from dyngs.data.pickles import read_pickle, read_pickled_array
 from dyngs.data.poses import checked_pose, inverse_rigid
 from dyngs.data.transforms import Frame, FrameFile, read_views
+from dyngs.data.trust import inside
 from dyngs.errors import DyngsError
 
 ANNOTATIONS = "annots.npy"
@@ -98,7 +99,7 @@ def read_zju_mocap(root: Path) -> Capture:
 
 
 def _annotated_shots(path: Path) -> list[_Shot]:
-    fields = read_pickled_array(path)
+    fields = read_pickled_array(inside(path))
     cams = {key: _items(f"{path}, cams", entry(path, fields, "cams"), key) for key in ("K", "D", "R", "T")}
     counts = {key: len(values) for key, values in cams.items()}
     if len(set(counts.values())) > 1 or not counts["K"]:
@@ -150,7 +151,7 @@ def _params_per_file(root: Path, frames: Iterable[int]) -> tuple[Path, BodyFrame
             f"these or remove the frames from {ANNOTATIONS}"
         )
     paths = [folder / f"{number}.npy" for number in numbers]
-    files = [(str(path), read_pickled_array(path)) for path in paths]
+    files = [(str(path), read_pickled_array(inside(path))) for path in paths]
     poses, trans, turns = (_column(files, key, width) for key, width in (("poses", None), ("Th", 3), ("Rh", 3)))
     return folder, body_frames(folder, numbers, poses, trans, _column(files, "shapes"), turns=turns)
 
@@ -236,7 +237,7 @@ def _frame_number(path: Path, name: str) -> int:
 
 def _by_name(path: Path) -> dict[str, dict[str, object]]:
     """Picture name to what the file says about it."""
-    fields = read_pickle(path)
+    fields = read_pickle(inside(path))
     if not isinstance(fields, dict) or not fields or not all(isinstance(own, dict) for own in fields.values()):
         raise DyngsError(f"{path}: must be a dictionary from picture names to parameters; export it again")
     strange = [name for name in fields if not isinstance(name, str) or not re.fullmatch(r"[\w-]+", name)]

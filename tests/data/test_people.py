@@ -235,7 +235,7 @@ def test_silhouettes_in_hdf5(hdf5: Path) -> None:
     pixels = torch.zeros(2, 3, 3, dtype=torch.uint8)
     assert cut_out(pixels, Silhouette(hdf5, "nonzero", 3))[..., 3].tolist() == [[0, 0, 0], [0, 0, 255]]
     assert (hdf5_length(hdf5, "masks"), read_hdf5(hdf5, "masks").shape) == (5, (5, 2, 3))
-    with pytest.raises(DyngsError, match="'masks' cannot be read as HDF5"):
+    with pytest.raises(DyngsError, match="'masks' must be a data set in an HDF5 file"):
         cut_out(pixels, Silhouette(hdf5, "nonzero", 5))
 
 
@@ -246,7 +246,7 @@ def test_bad_hdf5(hdf5: Path) -> None:
     with pytest.raises(DyngsError, match="no such file"):
         read_hdf5(hdf5.with_name("n.hdf5"), "masks")
     hdf5.write_bytes(hdf5.read_bytes()[:100])
-    with pytest.raises(DyngsError, match="cannot be read as HDF5") as caught:
+    with pytest.raises(DyngsError, match="must be a data set in an HDF5 file") as caught:
         read_hdf5(hdf5, "masks")
     assert "\n" not in str(caught.value)
 

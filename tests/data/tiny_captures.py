@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -115,6 +116,11 @@ def write_video(path: Path, count: int, fps: int = 30, size: tuple[int, int] = (
             rgb = np.full((size[1], size[0], 3), level_of(i), np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
         container.mux(stream.encode(None))
+
+
+def cached() -> list[Path]:
+    """The frames of videos in the cache."""
+    return sorted(Path(os.environ["DYNGS_CACHE_DIR"]).rglob("frame_*.png"))
 
 
 def packet_places(video: Path) -> list[tuple[int, int]]:
