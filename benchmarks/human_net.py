@@ -72,7 +72,7 @@ def scored(name: str, run: Path, seconds: float) -> Row:
 def baselines(network: Path, capture: Path, out: Path, count: int) -> list[Row]:
     """The bare template, coloured without the network."""
     config, model = network_config(network)
-    mean = load_network(new_network(model, torch.Generator()), latest_checkpoint(network))
+    mean = load_network(new_network(model, torch.Generator()), latest_checkpoint(network), model.resolution)
     bare: HumanNetModel = model.model_copy(update={"heights": (min(model.heights),)})
     data = config.data.model_copy(update={"root": capture.absolute()})
     person = filmed(data, bare, template(human_options(bare)))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
-from dyngs.conventions import SH_C0
+from dyngs.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
+from dyngs.tensor_checks import require_tensor
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,21 @@ class Gaussians:
                 raise ValueError(f"{name} must be {shape}, got {tuple(getattr(self, name).shape)}")
         if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[2] != 3:
             raise ValueError(f"sh must be ({n}, K, 3), got {tuple(self.sh.shape)}")
+
+    @staticmethod
+    def stored(tensors: Mapping[str, Tensor]) -> Gaussians:
+        """Those of a file, by field name.
+
+        Raises:
+            KeyError: a tensor lacks.
+            ValueError: one is not finite float32, they do not fit together, or their harmonics are of no degree.
+        """
+        found = Gaussians(**{f.name: tensors[f.name] for f in fields(Gaussians)})
+        for name, x in found.tensors().items():
+            require_tensor(name, x, x.shape)
+        if found.sh.shape[1] not in [num_sh_terms(degree) for degree in range(MAX_SH_DEGREE + 1)]:
+            raise ValueError(f"'sh' has {found.sh.shape[1]} terms, which are those of no degree")
+        return found
 
     def __len__(self) -> int:
         return len(self.means)

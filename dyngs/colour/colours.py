@@ -16,6 +16,7 @@ from dyngs.ops.adam import adam_step_
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
 from dyngs.rendering import Shader
+from dyngs.tensor_checks import require_tensor
 
 _MILESTONES = (1 / 6, 1 / 2, 5 / 6)
 """Shares of a run after which the network's rate is divided by 3 (MEGA: 5k, 15k and 25k of 30k steps)."""
@@ -115,11 +116,14 @@ class NetworkColours(Colours):
         return state | {f"exp_avg_sq.{name}": x for name, x in self._exp_avg_sq.items()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        self.box = state["box"]
-        for name in self._learned:
-            self._learned[name] = state[name].clone().requires_grad_()
-            self._exp_avg[name] = state[f"exp_avg.{name}"].clone()
-            self._exp_avg_sq[name] = state[f"exp_avg_sq.{name}"].clone()
+        self.box = require_tensor("box", state["box"], (2, 3), None)
+        for name, x in self._learned.items():
+            value, *moments = (
+                require_tensor(f"{part}{name}", state[f"{part}{name}"], tuple(x.shape), x.dtype).clone()
+                for part in ("", "exp_avg.", "exp_avg_sq.")
+            )
+            self._learned[name] = value.requires_grad_()
+            self._exp_avg[name], self._exp_avg_sq[name] = moments
 
 
 def opacity_entropy(logits: Tensor) -> Tensor:

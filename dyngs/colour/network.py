@@ -17,8 +17,9 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.ops.perceptron import Layer, perceptron
-from dyngs.ops.shading import Sight, shading_inputs
+from dyngs.ops.shading import Sight, num_inputs, shading_inputs
 from dyngs.rendering import Shader
+from dyngs.tensor_checks import require_positive, require_tensor
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class ColourNetwork:
             self.sees_normals,
         )
         base = gaussians.base_rgb.index_select(0, rows)
-        shown = (base + perceptron(shading_inputs(sight, base), self.layers)).clamp_min(0)
+        shown = (base + perceptron(shading_inputs(sight, base), self.layers).to(dtype)).clamp_min(0)
         return shown.new_zeros(len(gaussians), 3).index_copy(0, rows, shown)
 
 
@@ -106,10 +107,16 @@ def network_of(state: Mapping[str, Tensor]) -> ColourNetwork | None:
 
     Raises:
         KeyError: the state lacks a tensor.
+        ValueError: a tensor is not as the others have it.
     """
     count = sum(name.startswith("weight") for name in state)
     if not count:
         return None
-    layers = tuple(Layer(state[f"weight{i}"], state[f"bias{i}"]) for i in range(count))
-    sees_time, sees_normals = (bool(x) for x in state["sees"])
-    return ColourNetwork(layers, state["box"], sees_time, sees_normals)
+    sees_time, sees_normals = (bool(x) for x in require_tensor("sees", state["sees"], (2,), torch.bool))
+    require_positive("box", require_tensor("box", state["box"], (2, 3), None)[1])
+    layers, width = [], num_inputs(sees_time=sees_time, sees_normals=sees_normals)
+    for i in range(count):
+        weight = require_tensor(f"weight{i}", state[f"weight{i}"], (3 if i == count - 1 else None, width), None)
+        width = len(weight)
+        layers.append(Layer(weight, require_tensor(f"bias{i}", state[f"bias{i}"], (width,), None)))
+    return ColourNetwork(tuple(layers), state["box"], sees_time, sees_normals)

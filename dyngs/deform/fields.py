@@ -13,6 +13,7 @@ from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
 from dyngs.deform.skeleton import Skeleton
 from dyngs.deform.trajectory import Trajectory
+from dyngs.tensor_checks import require_positive, require_tensor
 
 
 def new_field(options: DeformField, setup: FieldSetup, generator: torch.Generator) -> DeformationField:
@@ -38,12 +39,22 @@ def field_state(field: DeformationField, setup: FieldSetup) -> dict[str, Tensor]
 def restored_field(
     options: DeformField, state: Mapping[str, Tensor], num_moving: int
 ) -> tuple[DeformationField, FieldSetup]:
-    """The field of a checkpoint for M moving Gaussians, and its setup. Raises KeyError where something is missing."""
-    num_times, extent = state["numbers"].tolist()
-    setup = FieldSetup(state["box"][0], state["box"][1], int(num_times), num_moving, extent)
+    """The field of a checkpoint for M moving Gaussians, and its setup.
+
+    Raises:
+        KeyError: a tensor lacks.
+        ValueError: one is not as a field of these options has it.
+    """
+    num_times, extent = require_positive("numbers", require_tensor("numbers", state["numbers"], (2,), None)).tolist()
+    center, half_size = require_tensor("box", state["box"], (2, 3))
+    setup = FieldSetup(center, require_positive("box", half_size), int(num_times), num_moving, extent)
     field = new_field(options, setup, torch.Generator())
-    field.learned.load_state(part_of(state, "learned."))
-    field.buffers = part_of(state, "buffers.")
+    buffers = part_of(state, "buffers.")
+    if isinstance(field, Skeleton):
+        field.load_state(part_of(state, "learned."), buffers)
+    else:
+        field.learned.load_state(part_of(state, "learned."))
+        field.buffers = buffers
     return field, setup
 
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyngs.ops.adam import adam_step_
+from dyngs.tensor_checks import require_tensor
 
 
 class LearnedTensors:
@@ -82,12 +83,24 @@ class LearnedTensors:
         state |= {f"exp_avg.{name}": x for name, x in self._exp_avg.items()}
         return state | {f"exp_avg_sq.{name}": x for name, x in self._exp_avg_sq.items()}
 
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Take over what ``state()`` returned."""
-        for name in self._tensors:
-            self._tensors[name] = _leaf(state[name].clone())
-            self._exp_avg[name] = state[f"exp_avg.{name}"].clone()
-            self._exp_avg_sq[name] = state[f"exp_avg_sq.{name}"].clone()
+    def load_state(self, state: Mapping[str, Tensor], rows: Mapping[str, int] | None = None) -> None:
+        """Take over what ``state()`` returned.
+
+        Args:
+            state: names to values and moments.
+            rows: names of the tensors that have another number of rows than now, and what it must be.
+
+        Raises:
+            KeyError: a tensor lacks.
+            ValueError: one has another type or shape, or is not finite.
+        """
+        for name, x in self._tensors.items():
+            shape = ((rows or {}).get(name, len(x)), *x.shape[1:])
+            value, first, second = (
+                require_tensor(f"{part}{name}", state[f"{part}{name}"], shape, x.dtype).clone()
+                for part in ("", "exp_avg.", "exp_avg_sq.")
+            )
+            self._tensors[name], self._exp_avg[name], self._exp_avg_sq[name] = _leaf(value), first, second
 
 
 def _leaf(x: Tensor) -> Tensor:

@@ -59,11 +59,26 @@ class KeyMasks:
         return {"times": times, "bits": self.bits, "count": torch.tensor([self.count])}
 
     @staticmethod
-    def restored(state: Mapping[str, Tensor]) -> KeyMasks | None:
-        """What ``state()`` returned as masks; None of an empty one. Raises KeyError where something is missing."""
+    def restored(state: Mapping[str, Tensor], count: int | None = None) -> KeyMasks | None:
+        """What ``state()`` returned as masks; None of an empty one.
+
+        Args:
+            state: by name.
+            count: N; None: as the state says.
+
+        Raises:
+            KeyError: something is missing.
+            ValueError: they are not masks of so many Gaussians.
+        """
         if not state:
             return None
-        return KeyMasks(tuple(state["times"].tolist()), state["bits"], int(state["count"]))
+        times, bits = state["times"], state["bits"]
+        count = int(state["count"]) if count is None else count
+        ascends = times.ndim == 1 and len(times) > 1 and bool((times[1:] > times[:-1]).all())
+        of_all = bits.dtype == torch.uint8 and bits.shape == (times.numel(), -(-count // BITS))
+        if not (ascends and of_all and state["count"].tolist() == [count]):
+            raise ValueError("the masks are not those of the Gaussians")
+        return KeyMasks(tuple(times.tolist()), bits, count)
 
 
 def matched(rows: Tensor, active: Tensor, count: int) -> tuple[Tensor, Tensor]:

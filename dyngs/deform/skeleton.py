@@ -11,6 +11,7 @@ Local letters: S nodes, P control points.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -19,7 +20,8 @@ from dyngs.config import SkeletonField
 from dyngs.deform.decoder import head_sizes
 from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, Offsets
 from dyngs.deform.learned import LearnedTensors
-from dyngs.deform.nodes import Nodes, follow, nodes_at, spread_out, turned
+from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, spread_out, turned
+from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
 NOTHING = torch.zeros(0, 3)
 SPAN = 4
@@ -49,6 +51,25 @@ class Skeleton:
             "colors": options.lr_colors,
         }
         self.learned = LearnedTensors(tensors, {name: rates[name] for name in sizes}, options.lr_decay)
+
+    def load_state(self, learned: Mapping[str, Tensor], buffers: Mapping[str, Tensor]) -> None:
+        """Take over the state of ``learned`` and the buffers of a skeleton.
+
+        Raises:
+            KeyError: a tensor lacks.
+            ValueError: they do not fit together.
+        """
+        count, moving = len(buffers["positions"]), self.setup.num_moving
+        require_tensor("positions", buffers["positions"], (count, 3))
+        self.learned.load_state(learned, dict.fromkeys(head_sizes(self.options), count))
+        if count:
+            require_positive("radii", require_tensor("radii", buffers["radii"], (count,)))
+        for name, length in (("followed", moving), ("neighbours", count)):
+            if name in buffers:
+                require_indices(name, buffers[name], (length, None), count)
+        if "followed" in buffers and not 1 <= buffers["followed"].shape[1] <= FOLLOWED:
+            raise ValueError(f"'followed' names {buffers['followed'].shape[1]} nodes for each Gaussian")
+        self.buffers = dict(buffers)
 
     @property
     def num_points(self) -> int:

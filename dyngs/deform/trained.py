@@ -20,6 +20,7 @@ from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import Shader
 from dyngs.static.filters import fuse_filter
+from dyngs.tensor_checks import require_ascending, require_indices, require_moments, require_tensor
 
 
 @dataclass(frozen=True)
@@ -140,14 +141,19 @@ def trained_scene(gaussians: Gaussians, model_state: Mapping[str, Tensor], optio
 
     Raises:
         KeyError: the state lacks a tensor.
+        ValueError: a tensor is not as the others and the options have it.
     """
+    count = len(gaussians)
     std = model_state.get("filter_std")
-    times = tuple(model_state["times"].tolist()) if "times" in model_state else ()
+    if std is not None and bool((require_tensor("filter_std", std, (count,)) < 0).any()):
+        raise ValueError("'filter_std' holds negative numbers")
+    times = tuple(require_moments("times", model_state["times"]).tolist()) if "times" in model_state else ()
     part = part_of(model_state, "field.")
     nothing = torch.zeros(0, dtype=torch.long)
     if not part or not isinstance(options, DynamicModel):
         return TrainedScene(gaussians, nothing, None, std, times)
-    masks = KeyMasks.restored(part_of(model_state, "masks."))
-    rows = model_state.get("rows", torch.arange(len(gaussians)))
+    masks = KeyMasks.restored(part_of(model_state, "masks."), count)
+    rows = model_state.get("rows", torch.arange(count))
+    require_ascending("rows", require_indices("rows", rows, (None,), count))
     motion, _ = restored_field(options.deform, part, len(rows))
     return TrainedScene(gaussians, rows, motion, std, times, masks=masks)

@@ -164,7 +164,8 @@ class HumanScene:
         self.anchors = Anchors(**{k.removeprefix(prefix): x for k, x in state.items() if k.startswith(prefix)})
         prefix = "learned."
         self.corrections.learned.load_state(
-            {k.removeprefix(prefix): x for k, x in state.items() if k.startswith(prefix)}
+            {k.removeprefix(prefix): x for k, x in state.items() if k.startswith(prefix)},
+            dict.fromkeys(("weights", "pose_dirs"), len(self.anchors)),
         )
         self._near, self._given_weights = state.get("near"), None
 

@@ -14,6 +14,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.human.avatar import Anchors, PoseShapes, Skeleton, offsets_at_rest, posed, posing_of
 from dyngs.human.clips import Clip
 from dyngs.human.refine import Fit, corrected_clip, corrected_skeleton, corrected_weights
+from dyngs.human.stored import require_avatar, require_shapes
 from dyngs.rendering import Shader
 
 
@@ -114,7 +115,9 @@ def trained_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> AvatarS
 
     Raises:
         KeyError: the state lacks a tensor.
+        ValueError: a tensor is not as the others have it.
     """
+    require_avatar(gaussians, state)
     learned = {name: state[f"learned.{name}"] for name in ("poses", "trans", "turns", "joints", "log_scale", "weights")}
     anchors = Anchors(**{field.name: state[f"anchors.{field.name}"] for field in fields(Anchors)})
     clip = Clip(*(state[f"clip.{name}"] for name in ("times", "poses", "trans", "scale")))
@@ -140,6 +143,7 @@ def stored_shapes(state: Mapping[str, Tensor]) -> PoseShapes | None:
     """The pose blend shapes of a state, if there are any."""
     if "shapes.directions" not in state:
         return None
+    require_shapes(state["shapes.directions"], state["shapes.faces"], len(state["joints"]))
     return PoseShapes(state["shapes.directions"].float(), state["shapes.faces"].long())
 
 

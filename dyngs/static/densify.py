@@ -15,6 +15,7 @@ from torch import Tensor
 from dyngs.config import DefaultStrategy
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.ops.quaternions import unit_quats
+from dyngs.tensor_checks import require_tensor
 
 SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
@@ -153,7 +154,8 @@ class DefaultDensifier:
         return {"grad_sum": self.grad_sum, "seen": self.seen}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        self.grad_sum, self.seen = state["grad_sum"].clone(), state["seen"].clone()
+        count = len(state["seen"])
+        self.grad_sum, self.seen = (require_tensor(x, state[x], (count,)).clone() for x in ("grad_sum", "seen"))
 
     def _densify(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
         max_scale = self.options.prune_scale * self.extent if step > self.schedule.prune_scale_after else math.inf

@@ -9,6 +9,10 @@ from dyngs.config import OptimConfig
 from dyngs.gaussians import Gaussians
 from dyngs.ops.adam import adam_step_, seen_rows
 from dyngs.static.densify import EditResult
+from dyngs.tensor_checks import require_tensor
+
+PARTS = "gaussians", "exp_avg", "exp_avg_sq"
+"""Of a state: parameters and moments."""
 
 
 class GaussianOptimizer:
@@ -102,11 +106,19 @@ class GaussianOptimizer:
         return state | {f"exp_avg_sq.{name}": x for name, x in self._exp_avg_sq.items()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Take over what ``state()`` returned."""
-        names = list(self.parameters.tensors())
-        self.parameters = _as_leaves({name: state[f"gaussians.{name}"].clone() for name in names})
-        self._exp_avg = {name: state[f"exp_avg.{name}"].clone() for name in names}
-        self._exp_avg_sq = {name: state[f"exp_avg_sq.{name}"].clone() for name in names}
+        """Take over what ``state()`` returned.
+
+        Raises:
+            KeyError: a tensor lacks.
+            ValueError: one is not finite float32, or they do not fit together.
+        """
+        parts = {part: {n: state[f"{part}.{n}"].clone() for n in self.parameters.tensors()} for part in PARTS}
+        parameters = Gaussians.stored(parts["gaussians"])
+        for part in PARTS[1:]:
+            for name, x in parameters.tensors().items():
+                require_tensor(f"{part}.{name}", parts[part][name], tuple(x.shape))
+        self.parameters = _as_leaves(parameters.tensors())
+        self._exp_avg, self._exp_avg_sq = parts["exp_avg"], parts["exp_avg_sq"]
 
     def _harmonics_rates(self) -> Tensor:
         """(K * 3,) one rate per coefficient."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import DynamicModel, SceneModel, TrajectoryField
-from dyngs.deform.masks import BITS, KeyMasks
+from dyngs.deform.masks import KeyMasks
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.storage.order import storage_order
@@ -71,7 +71,7 @@ def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     base, rest = full.pop("gaussians.sh_base"), full.pop("gaussians.sh_rest")
     full["gaussians.sh"] = torch.cat([base[:, None], rest], dim=1)
     gaussians = Gaussians(**{name: full[f"gaussians.{name}"] for name in GAUSSIANS})  # they must fit together
-    _require_fitting_masks(full, len(gaussians))
+    KeyMasks.restored(_masks(full), len(gaussians))
     for name, x in tensors.items():
         if name.startswith(LEARNED):
             full |= {f"{LEARNED}{moment}.{name[len(LEARNED) :]}": torch.zeros_like(x) for moment in MOMENTS}
@@ -112,7 +112,7 @@ def in_storage_order(tensors: Mapping[str, Tensor], means: np.ndarray, model: Sc
             ordered[name] = x[of_moving]
     if "model.rows" in ordered:
         ordered["model.rows"] = torch.arange(len(rows))
-    masks = KeyMasks.restored(_masks(tensors))
+    masks = KeyMasks.restored(_masks(tensors), len(means))
     if masks is not None:
         ordered |= {f"{_MASKS}{name}": x for name, x in masks.select(order).state().items()}
     return ordered
@@ -121,18 +121,6 @@ def in_storage_order(tensors: Mapping[str, Tensor], means: np.ndarray, model: Sc
 def _masks(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The state of the masks; empty without any."""
     return {name[len(_MASKS) :]: x for name, x in tensors.items() if name.startswith(_MASKS)}
-
-
-def _require_fitting_masks(tensors: Mapping[str, Tensor], count: int) -> None:
-    """Raises ValueError for masks that are not those of ``count`` Gaussians, KeyError where a part of them lacks."""
-    state = _masks(tensors)
-    if not state:
-        return
-    times, bits = state["times"], state["bits"]
-    ascends = times.ndim == 1 and len(times) > 1 and bool((times[1:] > times[:-1]).all())
-    of_all = bits.dtype == torch.uint8 and bits.shape[1:] == (-(-count // BITS),) and state["count"].tolist() == [count]
-    if not (ascends and of_all and len(bits) == len(times)):
-        raise ValueError("the masks are not those of the Gaussians")
 
 
 def _is_needed(name: str) -> bool:

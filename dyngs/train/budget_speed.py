@@ -93,8 +93,8 @@ class SpeedLimit:
         Raises:
             DyngsError: even a few Gaussians take too long; says what is possible.
         """
-        for name, value in stored.items():
-            setattr(self, name, value.item())
+        for name in self.state().keys() & stored.keys():
+            setattr(self, name, stored[name].item())
         if not self.base:
             scene = _few(trainer)
             drawing_seconds(trainer, scene, 1)  # what is loaded at first does not count

@@ -7,9 +7,10 @@ A run folder holds ``config.yaml`` (resolved), ``checkpoints/step_0007000.safete
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,10 @@ from torch import Tensor
 from dyngs.colour.network import network_of
 from dyngs.config import Config, HumanModel, HumanNetModel, SceneModel
 from dyngs.config_io import load_resolved
+from dyngs.conventions import RasterizeMode
 from dyngs.data.write import write_text
 from dyngs.deform.trained import trained_scene
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
 from dyngs.gaussians import Gaussians
 from dyngs.human.trained import trained_avatar
 from dyngs.storage.file import read_scene
@@ -32,7 +34,10 @@ KEEP_CHECKPOINTS = 2
 COMPACT_NAME = "scene.dyngs"
 """Of the file that holds a run that is done in little space, see ``dyngs.storage``."""
 _KIND = FileKind("dyngs", "a checkpoint", 1)
-_FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
+OTHER_CONFIG = "was its config changed? Otherwise train anew"
+"""Advice where a checkpoint and its run do not fit together."""
+MAX_STEP = 2**53
+BACKGROUNDS = ("white", "black", "random")
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,13 @@ class Checkpoint:
 
     info: CheckpointInfo
     tensors: dict[str, Tensor]
+    path: Path | None = field(default=None, compare=False)
+    """Of the file that it was read from."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return f"the checkpoint of step {self.info.step}" if self.path is None else str(self.path)
 
     def part(self, prefix: str) -> dict[str, Tensor]:
         """The tensors whose names start with ``prefix.``, without it."""
@@ -116,7 +128,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
         DyngsError: a file that is missing, truncated, altered, or of another version; names an older one if there is.
     """
     header, tensors = read_tensors(path, _KIND, _instead_of(path))
-    return Checkpoint(info_of(header), tensors)
+    with reading(path, _instead_of(path).removeprefix("; ")):
+        return Checkpoint(info_of(header), tensors, path)
 
 
 def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
@@ -124,9 +137,17 @@ def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
 
     Raises:
         KeyError: something lacks.
+        ValueError, TypeError: a value is of another kind or out of range.
     """
-    x, y, z = header["world_offset"]
-    return CheckpointInfo(header["step"], header["extent"], (x, y, z), header["background"], header["rasterize_mode"])
+    step, (x, y, z) = header["step"], (float(value) for value in header["world_offset"])
+    extent, background, mode = float(header["extent"]), header["background"], header["rasterize_mode"]
+    if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step <= MAX_STEP:
+        raise ValueError(f"its step is {step!r:.60}")
+    if not all(math.isfinite(value) for value in (extent, x, y, z)) or extent < 0:
+        raise ValueError("its extent or its world_offset is no such number")
+    if background not in BACKGROUNDS or mode not in {mode.value for mode in RasterizeMode}:
+        raise ValueError(f"its background is {background!r:.60}, its rasterize_mode {mode!r:.60}")
+    return CheckpointInfo(step, extent, (x, y, z), background, mode)
 
 
 def latest_checkpoint(run_dir: Path) -> Checkpoint:
@@ -159,24 +180,27 @@ def is_compact(run_dir: Path) -> bool:
 
 def _compact_checkpoint(run_dir: Path) -> Checkpoint:
     """What drawing needs; it cannot be trained on."""
-    stored = read_scene(run_dir / COMPACT_NAME)
-    return Checkpoint(CheckpointInfo(**stored.info.model_dump()), stored.tensors)
+    path = run_dir / COMPACT_NAME
+    stored = read_scene(path)
+    with reading(path):
+        return Checkpoint(info_of(stored.info.model_dump()), stored.tensors, path)
 
 
 def stored_scene(checkpoint: Checkpoint, model: SceneModel) -> Scene:
-    """The scene of a checkpoint of ``model``."""
-    part = checkpoint.part("gaussians")
-    try:
-        gaussians = Gaussians(**{name: part[name] for name in _FIELDS})
-        state = checkpoint.part("model")
-        colour = network_of(checkpoint.part("model.colour"))
-        if isinstance(model, HumanModel):
-            return replace(trained_avatar(gaussians, state), colour=colour)
-        return replace(trained_scene(gaussians, state, model), colour=colour)
-    except KeyError as missing:
-        raise DyngsError(
-            f"the checkpoint of step {checkpoint.info.step} lacks {missing}; an earlier version wrote it: train anew"
-        ) from None
+    """The scene of a checkpoint of ``model``.
+
+    Raises:
+        DyngsError: a tensor lacks, or is not as the model or the other tensors have it; names the file.
+    """
+    with reading(checkpoint.name, OTHER_CONFIG):
+        try:
+            gaussians, state = Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
+            colour = network_of(checkpoint.part("model.colour"))
+            if isinstance(model, HumanModel):
+                return replace(trained_avatar(gaussians, state), colour=colour)
+            return replace(trained_scene(gaussians, state, model), colour=colour)
+        except KeyError as missing:
+            raise DyngsError(f"{checkpoint.name} lacks {missing}; an earlier version wrote it: train anew") from None
 
 
 def last_good(run_dir: Path) -> str:

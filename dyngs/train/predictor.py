@@ -11,7 +11,7 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig, HumanModel, HumanNetModel
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
 from dyngs.human.body import Body
 from dyngs.human.model import HumanScene
 from dyngs.human.person import template
@@ -22,8 +22,9 @@ from dyngs.human.predict.sitter import Sitter, sitter_of, spread_views
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.rendering import render
 from dyngs.static.rates import Rates
+from dyngs.tensor_checks import require_tensor
 from dyngs.train.background import background_colour, evaluation_background
-from dyngs.train.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.train.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
 from dyngs.train.evaluate import render_options
 from dyngs.train.sampler import ViewSampler
 from dyngs.train.step import StepReport
@@ -130,12 +131,16 @@ class NetworkTrainer:
         Raises:
             DyngsError: it belongs to another network.
         """
-        self.mean = load_network(self.network, checkpoint)
-        self.sampler.load_state(checkpoint.part("sampler"))
-        self.generator.set_state(checkpoint.tensors["rng"])
-        for name, parameter in self.network.named_parameters():
-            keys = ("step", "exp_avg", "exp_avg_sq")
-            self.optimizer.state[parameter] = {key: checkpoint.tensors[f"optimizer.{key}.{name}"] for key in keys}
+        self.mean = load_network(self.network, checkpoint, self.model.resolution)
+        with reading(checkpoint.name, OTHER_CONFIG):
+            self.sampler.load_state(checkpoint.part("sampler"))
+            self.generator.set_state(checkpoint.tensors["rng"])
+            for name, parameter in self.network.named_parameters():
+                shapes = {"step": (), "exp_avg": tuple(parameter.shape), "exp_avg_sq": tuple(parameter.shape)}
+                self.optimizer.state[parameter] = {
+                    key: require_tensor(name, checkpoint.tensors[f"optimizer.{key}.{name}"], shape)
+                    for key, shape in shapes.items()
+                }
         self.done = checkpoint.info.step
 
     def _targets(self, person: Filmed, inputs: list[int]) -> list[Picture]:
@@ -205,8 +210,8 @@ def new_network(model: HumanNetModel, generator: torch.Generator) -> AtlasNetwor
     return AtlasNetwork(num_channels(scaffolds), scaffolds, model.widths, generator)
 
 
-def load_network(network: AtlasNetwork, checkpoint: Checkpoint) -> Tensor:
-    """The mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes.
+def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
+    """The mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the ``resolution``.
 
     Raises:
         DyngsError: the checkpoint is of something else, or of another network.
@@ -214,11 +219,12 @@ def load_network(network: AtlasNetwork, checkpoint: Checkpoint) -> Tensor:
     weights, mean = checkpoint.part("model.network"), checkpoint.tensors.get("model.mean")
     own = network.state_dict()
     if mean is None or {k: x.shape for k, x in weights.items()} != {k: x.shape for k, x in own.items()}:
-        raise DyngsError(
-            f"the checkpoint of step {checkpoint.info.step} is not of this network; was its config changed?"
-        )
-    network.load_state_dict(weights)
-    return mean
+        raise DyngsError(f"{checkpoint.name} is not of this network; was its config changed?")
+    with reading(checkpoint.name, OTHER_CONFIG):
+        for name, x in weights.items():
+            require_tensor(name, x, tuple(x.shape), own[name].dtype)
+        network.load_state_dict(weights)
+        return require_tensor("mean", mean, (3, resolution, resolution))
 
 
 def human_options(model: HumanNetModel) -> HumanModel:

@@ -61,7 +61,7 @@ def predict_person(network_run: Path, capture: Path, out: Path, views: int | tup
         raise DyngsError(f"{out} already holds a run; give another --out")
     checkpoint = latest_checkpoint(network_run)
     network = new_network(model, torch.Generator())
-    mean = load_network(network, checkpoint)
+    mean = load_network(network, checkpoint, model.resolution)
     data = config.data.model_copy(update={"root": capture.absolute()})
     person = filmed(data, model, template(human_options(model)))
     chosen = _chosen(person.sitter, views)

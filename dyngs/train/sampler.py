@@ -7,6 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from dyngs.tensor_checks import require_indices
+
 
 class ViewSampler:
     """Every view once per epoch, in a new random order each time."""
@@ -34,4 +36,7 @@ class ViewSampler:
         return {"order": self._order, "position": torch.tensor([self._position])}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        self._order, self._position = state["order"].clone(), int(state["position"])
+        """Take over what ``state()`` returned. Raises KeyError, or ValueError for what is no order of the views."""
+        order = require_indices("order", state["order"], (None,), self.num_views)
+        position = require_indices("position", state["position"], (1,), len(order) + 1)
+        self._order, self._position = order.clone(), int(position)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -15,7 +15,7 @@ from dyngs.colour.thrift import Look, ThriftyColours, find_thrift
 from dyngs.config import Config, HumanModel, SceneModel
 from dyngs.conventions import SH_C0
 from dyngs.data.loader import Picture, PictureLoader
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.rendering import RenderOptions, render
@@ -23,8 +23,9 @@ from dyngs.static.densify import Densifier, EditResult
 from dyngs.static.model import Drawn
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.settled import Settled
+from dyngs.tensor_checks import require_tensor
 from dyngs.train.background import background_colour
-from dyngs.train.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.train.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, stored_scene
 from dyngs.train.sampler import ViewSampler
 from dyngs.train.schedule import active_sh_degree, means_rate, picture_divisor, rates_of
 
@@ -221,22 +222,29 @@ class Trainer:
         """Go back to where ``checkpoint`` was taken.
 
         Raises:
-            DyngsError: it belongs to another model or strategy.
+            DyngsError: it belongs to another model or strategy, or its tensors do not fit together.
         """
-        try:
-            self.optimizer.load_state(checkpoint.tensors)
-            self.model.load_state(checkpoint.part("model"))
-            self.colours.load_state(checkpoint.part("model.colour"))
-            if checkpoint.info.step >= self.config.train.steps:
-                self.densifier = Settled()
-            self.densifier.load_state(checkpoint.part("strategy"))
-            self.sampler.load_state(checkpoint.part("sampler"))
-            self.generator.set_state(checkpoint.tensors["rng"])
-        except KeyError as missing:
-            raise DyngsError(
-                f"the checkpoint of step {checkpoint.info.step} lacks {missing}; was its config changed?"
-            ) from None
+        stored_scene(checkpoint, self.config.model)  # what is drawn fits together
+        with reading(checkpoint.name, OTHER_CONFIG):
+            try:
+                self.optimizer.load_state(checkpoint.tensors)
+                self.model.load_state(checkpoint.part("model"))
+                self.colours.load_state(checkpoint.part("model.colour"))
+                _require_frozen(checkpoint.tensors, len(self.optimizer.parameters))
+                if checkpoint.info.step >= self.config.train.steps:
+                    self.densifier = Settled()
+                self.densifier.load_state(checkpoint.part("strategy"))
+                self.sampler.load_state(checkpoint.part("sampler"))
+                self.generator.set_state(checkpoint.tensors["rng"])
+            except KeyError as missing:
+                raise DyngsError(f"{checkpoint.name} lacks {missing}; {OTHER_CONFIG}") from None
         self.done = checkpoint.info.step
+
+
+def _require_frozen(tensors: Mapping[str, Tensor], count: int) -> None:
+    """Raises ValueError where the harmonics that stay zero are not those of so many Gaussians."""
+    if "model.colour.frozen" in tensors:
+        require_tensor("frozen", tensors["model.colour.frozen"], (count,), torch.bool)
 
 
 def _finite_sum(terms: dict[str, Tensor], step: int, picture: Picture) -> float:

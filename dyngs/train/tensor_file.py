@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from dyngs.data.write import whole_file
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reason
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ def read_tensors(path: Path, kind: FileKind, advice: str) -> tuple[dict[str, Any
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {}).get(kind.key, "null"))
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError, ValueError) as error:
-        raise DyngsError(f"{path}: cannot be read as {kind.what} ({error}){advice}") from None
+    except Exception as error:  # the library lists none of what it raises
+        raise DyngsError(f"{path}: cannot be read as {kind.what} ({reason(error)}){advice}") from error
     if not isinstance(header, dict) or "format" not in header:
         raise DyngsError(f"{path}: not {kind.what} of dyngs{advice}")
     if header["format"] != kind.version:
