@@ -94,7 +94,7 @@ def save_config(config: Config, path: Path) -> None:
     text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
     if not _ODD_LINE_BREAKS.isdisjoint(text):
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=False)  # escapes, where YAML would fold them
-    write_text(path, text)
+    write_text(path, text, durable=True)
 
 
 def find_preset(path: Path) -> Path:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +15,7 @@ from dyngs.data.synthetic import DynamicOptions, write_dynamic_capture
 from dyngs.errors import DyngsError
 from dyngs.export.run import export_ply
 from dyngs.train.evaluate import EvalReport, evaluate_run
+from dyngs.train.run_lock import LOCK_NAME, InUseError, writing
 from dyngs.train.trainer import train
 from dyngs.view.frames import OutputOptions, write_path_frames, write_split
 from dyngs.view.shots import ShotOptions, shot_of_run
@@ -74,7 +77,11 @@ def run_demo(out: Path = DEFAULT_OUT, options: DemoOptions = DemoOptions()) -> D
         DyngsError: the folder cannot be written.
     """
     start = time.perf_counter()
-    folder = unused_folder(out)
+    with _claimed_folder(out) as folder:
+        return _run_demo(folder, options, start)
+
+
+def _run_demo(folder: Path, options: DemoOptions, start: float) -> DemoResult:
     capture, run_dir, pictures = folder / "capture", folder / "run", folder / "pictures"
     print(f"[1/4] ray tracing the pictures of the demo scene into {capture}", flush=True)
     write_dynamic_capture("spin", capture, DynamicOptions(size=options.size, num_times=options.num_times, samples=3))
@@ -117,9 +124,30 @@ def unused_folder(wanted: Path) -> Path:
     """
     for number in range(1, 1001):
         folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
-        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        if _is_unused(folder):
             return folder
     raise DyngsError(f"{wanted}: so many demos lie there already; delete some or give --out another folder")
+
+
+@contextmanager
+def _claimed_folder(wanted: Path) -> Iterator[Path]:
+    """An unused folder that no other demo takes while the block lasts."""
+    with ExitStack() as stack:
+        for number in range(1, 1001):
+            folder = unused_folder(wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}"))
+            try:
+                stack.enter_context(writing(folder))
+            except InUseError:
+                continue
+            if _is_unused(folder):
+                yield folder
+                return
+    raise DyngsError(f"{wanted}: so many demos run there already; give --out another folder")
+
+
+def _is_unused(folder: Path) -> bool:
+    """Whether ``folder`` can be made, or holds at most a lock file."""
+    return not folder.exists() or (folder.is_dir() and all(path.name == LOCK_NAME for path in folder.iterdir()))
 
 
 def result_table(result: DemoResult) -> Table:

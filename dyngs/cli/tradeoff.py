@@ -66,20 +66,31 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, print, write, choose."""
-    from rich.console import Console
+    """Measure, print, write, choose; the first of several processes keeps others out of the folder."""
+    from contextlib import nullcontext
 
-    from dyngs.tradeoff.knobs import parse_settings
-    from dyngs.tradeoff.models import Models
     from dyngs.tradeoff.ranks import Ranks
-    from dyngs.tradeoff.report import write_report
-    from dyngs.tradeoff.requirements import parse_goal, parse_requirements
-    from dyngs.tradeoff.sweep import Plan, sweep
+    from dyngs.train.run_lock import writing
 
     for name, least in (("finetune", 0), ("combine", 0), ("rounds", 1), ("threads", 0)):
         if getattr(arguments, name) < least:
             raise DyngsError(f"--{name} {getattr(arguments, name)}: give a whole number from {least} on")
-    is_run, ranks = Path(arguments.target).is_dir(), Ranks.from_environment()
+    target, ranks = Path(arguments.target), Ranks.from_environment()
+    out: Path | None = arguments.out or (target / "tradeoff" if target.is_dir() else None)
+    with writing(out) if ranks.is_first and out is not None else nullcontext():
+        return _run(arguments, ranks)
+
+
+def _run(arguments: argparse.Namespace, ranks: Ranks) -> int:
+    from rich.console import Console
+
+    from dyngs.tradeoff.knobs import parse_settings
+    from dyngs.tradeoff.models import Models
+    from dyngs.tradeoff.report import write_report
+    from dyngs.tradeoff.requirements import parse_goal, parse_requirements
+    from dyngs.tradeoff.sweep import Plan, sweep
+
+    is_run = Path(arguments.target).is_dir()
     settings = parse_settings(arguments.vary, trains=arguments.train or not is_run)
     asked = parse_requirements(arguments.require) if arguments.require is not None else ()
     name = arguments.minimize or arguments.maximize or "psnr"

@@ -38,7 +38,7 @@ WHOLE_BYTES = 2**30
 _MARK_NAME = "video.json"
 _MARK = "frames that dyngs decoded from a video; the folder may be removed"
 _NUM_SAMPLES, _SAMPLE_BYTES = 256, 2**20
-_OUR_FILES = re.compile(r"\.?frame_\d{6,}(\.\d+)?\.png|\.?video(\.\d+)?\.json")
+_OUR_FILES = re.compile(r"\.?(frame_\d{6,}|video)(\.\d+-[0-9a-f]{6}\.dyngs)?\.(png|json)")
 _MAX_HELD = 256
 _held: dict[Path, BinaryIO] = {}
 """Marks that this process keeps open and locked, so that no other one removes frames that it reads."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 
 from dyngs.data.images import read_header
 from dyngs.data.picture_errors import any_text, picture_error
+from dyngs.data.temporary import temporary_folder_beside
 from dyngs.data.trust import MAX_MEGAPIXELS, check_size, inside, pictures_up_to, staying_within
 from dyngs.data.video import read_frames
 from dyngs.data.write import write_image
@@ -109,11 +109,7 @@ def estimate_poses(source: Path, out: Path, options: SfmOptions = SfmOptions()) 
         raise DyngsError(f"{out} exists already; name a new folder for the poses")
     if not source.exists():
         raise DyngsError(f"no such folder of photos or video: {source}")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    except OSError as error:
-        raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
+    work = temporary_folder_beside(out)
     try:
         with staying_within(source, options.follow_links or source.is_file()), pictures_up_to(options.max_megapixels):
             result = _posed_in(work, source, options, out)

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 
 from dyngs.data.picture_errors import picture_error
+from dyngs.data.temporary import temporary_beside
 from dyngs.errors import DyngsError
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def whole_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """A temporary path beside ``path`` that takes its place when the block ends well, and vanishes otherwise.
 
     The folder is made where it is missing; the temporary name keeps the suffix, by which writers choose the format.
+
+    Args:
+        path: of the file.
+        durable: also wait until the disk has it, so that a power cut leaves the old file or the new one, never a name
+            without its data.
 
     Raises:
         DyngsError: the folder cannot be made or the file cannot be written.
@@ -28,22 +34,38 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise DyngsError(f"cannot write {path}: {error.strerror or error}") from error
     try:
         yield temporary
+        if durable:
+            _flush_file(temporary)
         os.replace(temporary, path)
+        if durable:
+            _flush_folder(path.parent)
     except OSError as error:
         raise DyngsError(f"cannot write {path}: {error.strerror or error}") from error
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def temporary_beside(path: Path) -> Path:
-    """A hidden name of this process beside ``path``, with its suffix; the folder is made where it is missing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+def _flush_file(path: Path) -> None:
+    file = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write ``text`` as UTF-8, atomically."""
-    with whole_file(path) as temporary:
+def _flush_folder(folder: Path) -> None:
+    """Wait until the disk has the names in ``folder``, where the system can do that."""
+    with suppress(OSError):
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
+
+
+def write_text(path: Path, text: str, *, durable: bool = False) -> None:
+    """Write ``text`` as UTF-8, atomically; ``durable`` as in ``whole_file``."""
+    with whole_file(path, durable=durable) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 

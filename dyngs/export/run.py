@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from dyngs.colour.bake import with_harmonics
+from dyngs.data.temporary import temporary_folder_beside
 from dyngs.errors import DyngsError
 from dyngs.export.ply import write_ply
 from dyngs.train.checkpoint import LoadedRun, load_run
@@ -61,7 +62,7 @@ def write_moments(run: LoadedRun, folder: Path, times: Sequence[float], part: Pa
     names = frame_names(len(times))
     _require_no_others(folder, names)
     is_new = not folder.exists()
-    staging = folder / f".frames.{os.getpid()}"
+    staging = temporary_folder_beside(folder / "frames")
     try:
         for name, time in zip(names, times, strict=True):
             _write(run, scene, staging / name, time)
@@ -116,7 +117,7 @@ def _require_no_others(folder: Path, names: Sequence[str]) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise DyngsError(f"{folder}: is a file, but a sequence needs a folder")
-    others = sorted(f.name for f in folder.glob("*.ply") if f.name not in names)
+    others = sorted(f.name for f in folder.glob("[!.]*.ply") if f.name not in names)
     if others:
         raise DyngsError(
             f"{folder}: holds other .ply files ({others[0]}), which players would take for frames; give an empty folder"

@@ -118,7 +118,7 @@ class StoredScene:
 
 def write_scene(path: Path, data: bytes) -> None:
     """Write what ``encoded`` made, atomically. Raises DyngsError for a full disk and the like."""
-    with whole_file(path) as temporary:
+    with whole_file(path, durable=True) as temporary:
         temporary.write_bytes(data)
 
 

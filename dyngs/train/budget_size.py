@@ -22,11 +22,10 @@ from dyngs.storage.quantize import step_below
 from dyngs.storage.tensors import COARSENESS
 from dyngs.train.checkpoint import COMPACT_NAME, Checkpoint, stored_scene
 from dyngs.train.compaction import PROBED_VIEWS, quality_of, scores_of, survey_of
+from dyngs.train.run_folder import SMALL_FOLDER
 from dyngs.train.step import Trainer
 from dyngs.train.stored import precision_of
 
-FOLDER = "small"
-"""In the run folder; a run of its own for evaluation, pictures and export."""
 KEPT = 0.7
 """Share of the Gaussians that each further trial keeps of those of the one before."""
 FINEST_CHANGE, LARGEST_CHANGE, COARSEST = 2**0.25, 2.0, 64.0
@@ -58,7 +57,7 @@ class SizeReport:
         if self.num_kept < self.num_gaussians:
             how += [f"{self.num_kept:,} of {self.num_gaussians:,} Gaussians"]
         return (
-            f"budget.max_mb: asked {self.asked:g}, got {self.megabytes:.3g} ({FOLDER}/{COMPACT_NAME}"
+            f"budget.max_mb: asked {self.asked:g}, got {self.megabytes:.3g} ({SMALL_FOLDER}/{COMPACT_NAME}"
             f"{''.join(f', {x}' for x in how)}); {self.after - self.before:+.2f} dB on training views "
             f"({self.before:.2f} -> {self.after:.2f})"
         )
@@ -76,7 +75,8 @@ class _File:
 
 def has_file(run_dir: Path) -> bool:
     """Whether the file of a run was written already."""
-    return (run_dir / FOLDER / COMPACT_NAME).is_file()
+    folder = run_dir / SMALL_FOLDER
+    return (folder / COMPACT_NAME).is_file() and (folder / RESOLVED_NAME).is_file()
 
 
 @torch.no_grad()
@@ -126,8 +126,8 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
             chosen, share = found, share * KEPT
     if chosen is None:
         raise DyngsError(f"budget.max_mb={megabytes:g}: what is trained does not fit; the run itself is in {run_dir}")
-    write_scene(run_dir / FOLDER / COMPACT_NAME, chosen.data)
-    save_config(trainer.config, run_dir / FOLDER / RESOLVED_NAME)
+    write_scene(run_dir / SMALL_FOLDER / COMPACT_NAME, chosen.data)
+    save_config(trainer.config, run_dir / SMALL_FOLDER / RESOLVED_NAME)
     got = 1e-6 * len(chosen.data)
     return SizeReport(megabytes, got, before, chosen.psnr, len(scene), chosen.num_kept, chosen.coarser)
 

@@ -31,6 +31,7 @@ from dyngs.train.scene import Scene
 from dyngs.train.tensor_file import FileKind, read_tensors, write_tensors
 
 KEEP_CHECKPOINTS = 2
+TIMING_NAME = "timing.json"
 COMPACT_NAME = "scene.dyngs"
 """Of the file that holds a run that is done in little space, see ``dyngs.storage``."""
 _KIND = FileKind("dyngs", "a checkpoint", 1)
@@ -98,8 +99,19 @@ class LoadedRun:
 
 def checkpoint_paths(run_dir: Path) -> list[Path]:
     """The run's checkpoints, oldest first."""
-    folder = run_dir / "checkpoints"
-    return sorted(f for f in folder.glob("step_*.safetensors") if re.fullmatch(r"step_\d+", f.stem))
+    found = (run_dir / "checkpoints").glob("step_*.safetensors")
+    return sorted((f for f in found if re.fullmatch(r"step_[0-9]+", f.stem)), key=step_of)
+
+
+def remove_old_checkpoints(run_dir: Path) -> None:
+    """Remove all but the newest ``KEEP_CHECKPOINTS`` of a run."""
+    for old in checkpoint_paths(run_dir)[:-KEEP_CHECKPOINTS]:
+        old.unlink(missing_ok=True)
+
+
+def step_of(path: Path) -> int:
+    """Steps done, by the name of a checkpoint."""
+    return int(path.stem.removeprefix("step_"))
 
 
 def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float) -> Path:
@@ -114,10 +126,10 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
             field, step = name.removeprefix("gaussians.").removeprefix("model."), checkpoint.info.step
             raise DyngsError(f"{run_dir}: {field} is not finite after step {step}; not saved. {last_good(run_dir)}")
     path = run_dir / "checkpoints" / f"step_{checkpoint.info.step:07d}.safetensors"
-    write_tensors(path, _KIND, tensors, asdict(checkpoint.info), ", then `dyngs train --resume`")
+    # Its time first: a checkpoint whose time is lost by a kill between the two would go on as if it had taken none.
     _write_seconds(run_dir, checkpoint.info.step, seconds_train)
-    for old in checkpoint_paths(run_dir)[:-KEEP_CHECKPOINTS]:
-        old.unlink(missing_ok=True)
+    write_tensors(path, _KIND, tensors, asdict(checkpoint.info), ", then `dyngs train --resume`")
+    remove_old_checkpoints(run_dir)
     return path
 
 
@@ -151,11 +163,16 @@ def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
 
 
 def latest_checkpoint(run_dir: Path) -> Checkpoint:
-    """The newest checkpoint of a run. Raises DyngsError if there is none or it is damaged."""
-    paths = checkpoint_paths(run_dir)
-    if not paths:
-        raise DyngsError(f"{run_dir}: no checkpoints there; give the folder of a run that has trained")
-    return load_checkpoint(paths[-1])
+    """The newest checkpoint of a run, which may be training. Raises DyngsError if there is none or it is damaged."""
+    while True:
+        paths = checkpoint_paths(run_dir)
+        if not paths:
+            raise DyngsError(f"{run_dir}: no checkpoints there; give the folder of a run that has trained")
+        try:
+            return load_checkpoint(paths[-1])
+        except DyngsError:
+            if paths[-1].exists():
+                raise  # otherwise its run has saved twice since it was found
 
 
 def load_run(run_dir: Path) -> LoadedRun:
@@ -216,7 +233,7 @@ def seconds_at(run_dir: Path, step: int) -> float:
 
 def _read_seconds(run_dir: Path) -> dict[str, float]:
     try:
-        stored = json.loads((run_dir / "timing.json").read_text(encoding="utf-8"))
+        stored = json.loads((run_dir / TIMING_NAME).read_text(encoding="utf-8"))
         return {str(step): float(seconds) for step, seconds in stored["seconds_train"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
@@ -225,12 +242,12 @@ def _read_seconds(run_dir: Path) -> dict[str, float]:
 def _write_seconds(run_dir: Path, step: int, seconds: float) -> None:
     known = {s: value for s, value in _read_seconds(run_dir).items() if int(s) < step}
     known[str(step)] = round(seconds, 3)
-    write_text(run_dir / "timing.json", json.dumps({"seconds_train": known}) + "\n")
+    write_text(run_dir / TIMING_NAME, json.dumps({"seconds_train": known}) + "\n")
 
 
 def _instead_of(path: Path) -> str:
     """What to do about a damaged checkpoint."""
-    older = [p for p in checkpoint_paths(path.parent.parent) if p.name < path.name]
+    older = [p for p in checkpoint_paths(path.parent.parent) if step_of(p) < step_of(path)]
     if older:
         return f"; delete it to go on from the previous one, {older[-1].name}"
     return "; there is no older one, train anew"

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, median
-from tempfile import TemporaryDirectory
 
 import torch
 
@@ -21,9 +20,11 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.ops.native import kernel_threads
 from dyngs.train.background import evaluation_background
-from dyngs.train.checkpoint import LoadedRun, checkpoint_paths, latest_checkpoint, load_run
+from dyngs.train.checkpoint import TIMING_NAME, Checkpoint, LoadedRun, latest_checkpoint, load_run, save_checkpoint
 from dyngs.train.evaluate import parameter_megabytes, render_options, scene_of_split, split_views
+from dyngs.train.log import LOG_NAME
 from dyngs.train.metrics import psnr
+from dyngs.train.run_folder import new_folder, require_empty
 from dyngs.train.temporal import Drawing
 from dyngs.train.trainer import num_cores, train
 
@@ -62,9 +63,9 @@ def compact_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
         DyngsError: no such run, a folder that is taken, a wrong value, nothing to do.
         KeyboardInterrupt: after Ctrl-C; ``dyngs train --resume`` goes on.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DyngsError(f"{out}: exists already; give another --out")
-    step = latest_checkpoint(run_dir).info.step
+    require_empty(out)
+    start = latest_checkpoint(run_dir)
+    step = start.info.step
     defaults = [f"compact.{key}={value}" for key, value in CompactConfig().model_dump().items()]
     done = [f"train.steps={step}", "budget.max_minutes=null", f"run.dir={out}"]
     config = load_resolved(run_dir, [*done, *defaults, *overrides])
@@ -72,21 +73,16 @@ def compact_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
         raise DyngsError(f"{run_dir}: a network, not a scene; compact what it predicts")
     if not config.compact.is_wanted:
         raise DyngsError("nothing to do: give a share to --prune, or key times to --masks")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent, ignore_cleanup_errors=True) as folder:
-        started = Path(folder) / out.name  # becomes the run folder when it is whole
-        _copy_start(run_dir, started)
+    with new_folder(out) as started:
+        _copy_start(run_dir, start, started)
         save_config(config, started / RESOLVED_NAME)
-        started.replace(out)
     return train(config, resume_from=out)
 
 
-def _copy_start(run_dir: Path, folder: Path) -> None:
+def _copy_start(run_dir: Path, checkpoint: Checkpoint, folder: Path) -> None:
     """What a run goes on from: its last checkpoint, its time and its log."""
-    newest = checkpoint_paths(run_dir)[-1]
-    (folder / newest.parent.name).mkdir(parents=True)
-    shutil.copyfile(newest, folder / newest.parent.name / newest.name)
-    for name in ("timing.json", "log.jsonl"):
+    save_checkpoint(folder, checkpoint, 0.0)
+    for name in (TIMING_NAME, LOG_NAME):
         if (run_dir / name).is_file():
             shutil.copyfile(run_dir / name, folder / name)
 

@@ -14,6 +14,7 @@ from typing import IO, Any
 from dyngs.data.write import write_text
 from dyngs.errors import DyngsError
 
+LOG_NAME = "log.jsonl"
 PLAIN_LINES = 10
 """Lines that a run prints where there is no terminal."""
 
@@ -54,7 +55,7 @@ class RunLog:
     """
 
     def __init__(self, run_dir: Path, after_step: int, *, tensorboard: bool = False) -> None:
-        self.path = run_dir / "log.jsonl"
+        self.path = run_dir / LOG_NAME
         self._board = _open_tensorboard(run_dir, after_step) if tensorboard else None
         write_text(self.path, "".join(_lines_up_to(self.path, after_step)))
         self._file: IO[str] = self.path.open("a", encoding="utf-8")

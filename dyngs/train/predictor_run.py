@@ -18,8 +18,9 @@ from dyngs.human.predict.sitter import Sitter, named_views, spread_views
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.rates import Rates
 from dyngs.train.assemble import assemble
-from dyngs.train.checkpoint import checkpoint_paths, latest_checkpoint, save_checkpoint
+from dyngs.train.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.train.predictor import filmed, human_options, load_network, new_network
+from dyngs.train.run_folder import new_folder, require_empty
 
 _FAINT = 0.02
 """Opacity below which a predicted Gaussian is left out, as the preset for one person has it."""
@@ -54,11 +55,10 @@ def predict_person(network_run: Path, capture: Path, out: Path, views: int | tup
         views: how many of the training views to predict from, well spread; or their names.
 
     Raises:
-        DyngsError: not such a run or capture, views that are not there, or a folder that holds a run.
+        DyngsError: not such a run or capture, views that are not there, or an ``out`` that is not empty.
     """
     config, model = network_config(network_run)
-    if checkpoint_paths(out):
-        raise DyngsError(f"{out} already holds a run; give another --out")
+    require_empty(out)  # before the work
     checkpoint = latest_checkpoint(network_run)
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
@@ -108,8 +108,9 @@ def write_run(out: Path, avatar: Avatar, data: DataConfig, model: HumanNetModel,
         model=HumanScene(human, avatar.subject, Rates(config.train.steps)),
         optimizer=GaussianOptimizer(avatar.gaussians, config.optim),
     )
-    save_config(config, out / RESOLVED_NAME)
-    save_checkpoint(out, trainer.checkpoint(), seconds)
+    with new_folder(out) as started:
+        save_config(config, started / RESOLVED_NAME)
+        save_checkpoint(started, trainer.checkpoint(), seconds)
 
 
 def without_faint(avatar: Avatar) -> Avatar:

@@ -36,6 +36,7 @@ from dyngs.train.assemble import training_cameras
 from dyngs.train.background import evaluation_background
 from dyngs.train.checkpoint import COMPACT_NAME, Checkpoint, latest_checkpoint, stored_scene
 from dyngs.train.evaluate import render_options
+from dyngs.train.run_folder import folder_of_export
 from dyngs.train.scene import Scene, moment_of
 
 LOSS_DB = 0.025
@@ -80,32 +81,42 @@ def write_compact(run_dir: Path, out: Path, max_change: float | None = None, fie
 
     Args:
         run_dir: a run with a checkpoint.
-        out: a folder, made where it is missing; it may be the run's own.
+        out: a folder, made where it is missing; it may be the run's own, or hold a former export of that run.
         max_change: root mean square over all values of some training pictures, grey levels of 255. None: what lowers
             their PSNR by ``LOSS_DB``, if it is independent of the model's own errors.
         field_step: how many times as coarsely as that the field is rounded.
 
     Raises:
-        DyngsError: no such run, the pictures would change by more than ``max_change``, or the file cannot be written.
-            Nothing is written then.
+        DyngsError: no such run, ``out`` holds another one, the pictures would change by more than ``max_change``, or the
+            file cannot be written. Nothing is written then.
     """
     config = load_resolved(run_dir)
-    checkpoint = latest_checkpoint(run_dir)
-    tensors, precision, draw = _precision(config, checkpoint, max_change)
-    steps = {name: step * (field_step if name.startswith(LEARNED) else 1) for name, step in precision.steps.items()}
-    data = encoded(SceneInfo(**asdict(checkpoint.info)), tensors, config.model, steps)
-    if draw is not None and precision.allowed is not None and field_step == 1:
-        change = GREY_LEVELS * math.sqrt(mean_square_change(draw(checkpoint.tensors), draw(decoded(data).tensors)))
-        if not change <= MISSED * precision.allowed:
-            raise DyngsError(
-                f"{run_dir}: stored in little space, pictures would change by {change:.2g} grey levels of 255, more "
-                f"than the {precision.allowed:.2g} allowed; nothing was written. Give a larger --max-change"
-            )
-        precision = replace(precision, change=change)
-    write_scene(out / COMPACT_NAME, data)
-    if out.resolve() != run_dir.resolve():
-        save_config(config, out / RESOLVED_NAME)
+    with folder_of_export(out, run_dir, config) as folder:
+        checkpoint = latest_checkpoint(run_dir)
+        tensors, precision, draw = _precision(config, checkpoint, max_change)
+        steps = {name: step * (field_step if name.startswith(LEARNED) else 1) for name, step in precision.steps.items()}
+        data = encoded(SceneInfo(**asdict(checkpoint.info)), tensors, config.model, steps)
+        if draw is not None and precision.allowed is not None and field_step == 1:
+            precision = _checked(run_dir, precision, draw(checkpoint.tensors), draw(decoded(data).tensors))
+        write_scene(folder / COMPACT_NAME, data)
+        if out.resolve() != run_dir.resolve():
+            save_config(config, folder / RESOLVED_NAME)
     return CompactRun(out / COMPACT_NAME, precision, len(data), num_bytes_exact(checkpoint))
+
+
+def _checked(run_dir: Path, precision: Precision, before: Sequence[Tensor], after: Sequence[Tensor]) -> Precision:
+    """The precision with the change from the pictures ``before`` to those of the file.
+
+    Raises:
+        DyngsError: it is more than what is allowed.
+    """
+    change = GREY_LEVELS * math.sqrt(mean_square_change(before, after))
+    if precision.allowed is not None and not change <= MISSED * precision.allowed:
+        raise DyngsError(
+            f"{run_dir}: stored in little space, pictures would change by {change:.2g} grey levels of 255, more "
+            f"than the {precision.allowed:.2g} allowed; nothing was written. Give a larger --max-change"
+        )
+    return replace(precision, change=change)
 
 
 def precision_of(

@@ -49,7 +49,7 @@ def write_tensors(
     """
     full = {"format": kind.version, **header}
     full["digest"] = _digest(tensors, full)
-    with whole_file(path) as temporary:
+    with whole_file(path, durable=True) as temporary:
         try:
             # One key only: the library writes several in random order.
             save_file(dict(tensors), temporary, metadata={kind.key: json.dumps(full, sort_keys=True)})

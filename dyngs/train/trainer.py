@@ -24,14 +24,18 @@ from dyngs.train.checkpoint import (
     checkpoint_paths,
     last_good,
     latest_checkpoint,
+    remove_old_checkpoints,
     save_checkpoint,
     seconds_at,
+    step_of,
 )
 from dyngs.train.compaction import compact_
 from dyngs.train.interrupt import Interrupts
 from dyngs.train.log import LogRecord, Progress, RunLog
 from dyngs.train.metrics import psnr
 from dyngs.train.predictor import NetworkTrainer, assemble_network
+from dyngs.train.run_folder import begin, require_startable, tidy, was_only_begun
+from dyngs.train.run_lock import writing
 from dyngs.train.step import StepReport, Trainer
 
 COUNT, SPEED = "budget.count", "budget.speed"
@@ -43,24 +47,35 @@ def train(config: Config, *, resume_from: Path | None = None) -> Path:
 
     Args:
         config: everything that decides the run; on resuming, that of the run folder.
-        resume_from: a run folder to go on with, from its newest checkpoint: the result has the same bytes as if the run
-            had never stopped.
+        resume_from: a run folder to go on with, from its newest checkpoint, or from the beginning where it was stopped
+            before its first: the result has the same bytes as if the run had never stopped.
 
     Raises:
-        DyngsError: bad input, a run folder that already holds a run, a budget that cannot be kept, a loss that is not
-            finite, a full disk.
+        DyngsError: bad input, a run folder that already holds a run or that another process writes into, a budget that
+            cannot be kept, a loss that is not finite, a full disk.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how to go on.
     """
     run_dir = resume_from or config.run.dir or Path("runs") / config.run.name
+    require_possible(config)
+    if resume_from is not None and (not run_dir.is_dir() or _is_done_and_read_only(config, run_dir)):
+        latest_checkpoint(run_dir)
+        return run_dir
     keep_freed_memory()
-    with kernel_threads(config.run.threads or num_cores()):
+    with writing(run_dir) as is_sole_writer, kernel_threads(config.run.threads or num_cores()):
+        tidy(run_dir, sole_writer=is_sole_writer)
         return _train(config, run_dir, resume_from)
 
 
+def _is_done_and_read_only(config: Config, run_dir: Path) -> bool:
+    """Nothing is to be done in the run folder, and nothing can be."""
+    paths = checkpoint_paths(run_dir)
+    is_done = bool(paths) and step_of(paths[-1]) >= config.total_steps and not _owes_file(config, run_dir)
+    return is_done and not os.access(run_dir, os.W_OK)
+
+
 def _train(config: Config, run_dir: Path, resume_from: Path | None) -> Path:
-    require_possible(config)
     watch = _Stopwatch()
-    resumed = _start_of_run(run_dir, resuming=resume_from is not None)
+    resumed = _start_of_run(config, run_dir, resuming=resume_from is not None)
     if resumed is not None and resumed.info.step >= config.total_steps and not _owes_file(config, run_dir):
         return run_dir
     trainer, wanted, preparing = _assembled(config, restored=resumed is not None), None, 0.0
@@ -75,7 +90,7 @@ def _train(config: Config, run_dir: Path, resume_from: Path | None) -> Path:
             preparing = -watch.seconds
             trainer = refitted(trainer, config)
             preparing += watch.seconds
-        save_config(config, run_dir / RESOLVED_NAME)
+        begin(run_dir, config)
     with (
         RunLog(run_dir, trainer.done, tensorboard=config.train.tensorboard) as log,
         Progress(config.total_steps, trainer.done) as progress,
@@ -263,19 +278,20 @@ def _counts(trainer: Trainer | NetworkTrainer) -> tuple[int, int]:
     return count, trainer.model.num_moving(count)
 
 
-def _start_of_run(run_dir: Path, *, resuming: bool) -> Checkpoint | None:
-    """The checkpoint to go on from, or None for a new run.
+def _start_of_run(config: Config, run_dir: Path, *, resuming: bool) -> Checkpoint | None:
+    """The checkpoint to go on from, or None for a run that begins: a new one, or one stopped before its first.
 
     Raises:
-        DyngsError: resuming without a checkpoint, or a new run where there are some.
+        DyngsError: resuming where no run was begun, or a new run where something is that it would replace.
     """
-    if resuming:
-        return latest_checkpoint(run_dir)
-    if checkpoint_paths(run_dir):
-        raise DyngsError(
-            f"{run_dir} already holds a run; go on with `dyngs train --resume {run_dir}` or give another run.dir"
-        )
-    return None
+    if not resuming:
+        require_startable(run_dir, config)
+        return None
+    if was_only_begun(run_dir):
+        return None
+    checkpoint = latest_checkpoint(run_dir)
+    remove_old_checkpoints(run_dir)
+    return checkpoint
 
 
 def num_cores() -> int:

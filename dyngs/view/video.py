@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from dyngs.data.temporary import temporary_beside
 from dyngs.data.video import read_frames
-from dyngs.data.write import temporary_beside
 from dyngs.errors import DyngsError
 
 __all__ = ["VideoWriter", "read_frames"]

@@ -13,9 +13,10 @@ from dyngs.config_io import load_resolved
 from dyngs.data.synthetic import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.train.assemble import assemble
-from dyngs.train.budget_size import FOLDER, write_within
+from dyngs.train.budget_size import write_within
 from dyngs.train.checkpoint import COMPACT_NAME, checkpoint_paths, is_compact, latest_checkpoint, load_run
 from dyngs.train.compaction import quality_of
+from dyngs.train.run_folder import SMALL_FOLDER
 from dyngs.train.step import Trainer
 from dyngs.train.trainer import train
 
@@ -56,7 +57,7 @@ def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_pat
     for share in (0.8, 0.4, 0.15):
         asked = share * usual.megabytes
         report = write_within(trainer, tmp_path / str(share), asked)
-        file = tmp_path / str(share) / FOLDER / COMPACT_NAME
+        file = tmp_path / str(share) / SMALL_FOLDER / COMPACT_NAME
         assert file.stat().st_size == round(1e6 * report.megabytes) <= 1e6 * asked
         assert report.coarser > 1 or report.num_kept < 500
         assert report.before == usual.before
@@ -73,7 +74,7 @@ def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_pat
 def test_what_cannot_fit_is_said(trainer: Trainer, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match=r"budget.max_mb=0.0001: what is trained does not fit"):
         write_within(trainer, tmp_path, 0.0001)
-    assert not (tmp_path / FOLDER).exists()
+    assert not (tmp_path / SMALL_FOLDER).exists()
 
 
 def test_a_run_writes_it_and_a_finished_one_makes_it_again(
@@ -81,12 +82,12 @@ def test_a_run_writes_it_and_a_finished_one_makes_it_again(
 ) -> None:
     folder = train(config_of(still, tmp_path / "run", BudgetConfig(max_mb=0.02)))
     assert "budget.max_mb: asked 0.02, got" in capsys.readouterr().out
-    file, end = folder / FOLDER / COMPACT_NAME, checkpoint_paths(folder)[-1].read_bytes()
+    file, end = folder / SMALL_FOLDER / COMPACT_NAME, checkpoint_paths(folder)[-1].read_bytes()
     wanted = file.read_bytes()
     assert len(wanted) <= 20_000
-    assert is_compact(folder / FOLDER)
-    assert len(load_run(folder / FOLDER).scene) == len(latest_checkpoint(folder).tensors["gaussians.means"])
-    shutil.rmtree(folder / FOLDER)
+    assert is_compact(folder / SMALL_FOLDER)
+    assert len(load_run(folder / SMALL_FOLDER).scene) == len(latest_checkpoint(folder).tensors["gaussians.means"])
+    shutil.rmtree(folder / SMALL_FOLDER)
     train(load_resolved(folder), resume_from=folder)
     assert file.read_bytes() == wanted
     assert checkpoint_paths(folder)[-1].read_bytes() == end

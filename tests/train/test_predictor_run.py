@@ -72,7 +72,7 @@ def test_a_prediction_can_be_refined(made: Made, tmp_path: Path) -> None:
 
 def test_mistakes_are_told(made: Made, tmp_path: Path) -> None:
     run = made.prediction.run_dir
-    with pytest.raises(DyngsError, match="already holds a run"):
+    with pytest.raises(DyngsError, match="exists already"):
         predict_person(made.network, made.capture, run, 3)
     with pytest.raises(DyngsError, match="kind=human; a prediction needs one of human_net"):
         network_config(run)

@@ -1,0 +1,106 @@
+"""Hidden names for what is not finished yet, and the removal of those that a killed process left behind."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import re
+import shutil
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+
+from dyngs.errors import DyngsError
+
+_NAME = re.compile(r"\.(?P<stem>.+)\.(?P<pid>\d{1,10})-(?P<home>[0-9a-f]{6})\.dyngs(?P<suffix>\.[^.]*)?", re.DOTALL)
+
+
+def temporary_beside(path: Path) -> Path:
+    """A hidden name of this process beside ``path``, with its suffix; the folder is made where it is missing.
+
+    What killed processes left under such names in that folder is removed, once per folder and process.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _remove_once(str(path.parent.absolute()), os.getpid())
+    return path.with_name(f".{path.stem}.{os.getpid()}-{_home()}.dyngs{path.suffix}")
+
+
+def temporary_folder_beside(path: Path) -> Path:
+    """An empty folder under such a name, to become ``path``; one that this process left there before is replaced.
+
+    Raises:
+        DyngsError: it cannot be made.
+    """
+    try:
+        folder = temporary_beside(path)
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+    except OSError as error:
+        raise DyngsError(f"cannot write {path}: {error.strerror or error}") from error
+    return folder
+
+
+def remove_leftovers(folder: Path, only_ours: Callable[[str], bool] | None = None) -> None:
+    """Remove the temporary files and folders directly in ``folder`` whose processes have ended; never through links.
+
+    Processes are known to have ended where they ran under the same operating system as this one.
+
+    Args:
+        folder: where to look.
+        only_ours: whether a file of this name is written by nobody else at present, so that what was to become it goes
+            whoever began it.
+    """
+    try:
+        entries = list(os.scandir(folder))
+    except OSError:
+        return
+    for entry in entries:
+        match = _NAME.fullmatch(entry.name)
+        if match is None or entry.is_symlink():
+            continue
+        wanted = match["stem"] + (match["suffix"] or "")
+        ended = match["home"] == _home() and not _is_alive(int(match["pid"]))
+        if ended or (only_ours is not None and only_ours(wanted)):
+            remove_quietly(Path(entry.path))
+
+
+def remove_quietly(path: Path) -> None:
+    """Remove a regular file, or a folder that is no link, with what it holds; whatever cannot be removed stays."""
+    if path.is_symlink():
+        return
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    elif path.is_file():
+        try:
+            path.unlink()
+        except OSError:
+            return
+
+
+@lru_cache(maxsize=4096)
+def _remove_once(folder: str, pid: int) -> None:  # pid: a forked process looks for itself
+    remove_leftovers(Path(folder))
+
+
+@lru_cache(maxsize=1)
+def _home() -> str:
+    """Which processes share their numbers with this one: a name for the machine, and its container if there is one."""
+    try:
+        namespace = os.readlink("/proc/self/ns/pid")
+    except OSError:  # not on Linux
+        namespace = ""
+    return hashlib.sha256(f"{platform.node()} {namespace}".encode()).hexdigest()[:6]
+
+
+def _is_alive(pid: int) -> bool:
+    """Whether a process of this number exists; where that cannot be asked, as if it did."""
+    if os.name != "posix":  # os.kill would end it there
+        return True
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # somebody else's
+        return True
+    return True

@@ -1,0 +1,160 @@
+"""One writer at a time in a run folder: a lock that the system frees when its process ends, however it ends."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import platform
+import stat
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from dyngs.errors import DyngsError
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+LOCK_NAME = "run.lock"
+"""There while a process writes into the folder, and after one was killed, which does no harm."""
+
+_HELD = (errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK)
+_WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
+_FAR = 2**30
+"""Windows keeps others from reading the byte that is locked, so it is one that the file does not have."""
+
+
+class InUseError(DyngsError):
+    """Another process writes into the folder."""
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[bool]:
+    """Whether it is certain that no other process writes into ``folder`` while the block lasts: false without locks.
+
+    The folder is made where it is missing, and removed where nothing came of it. The lock holds for as long as the
+    process lives; the file ``run.lock`` says who it is. A file system that has no locks (some network file systems) is
+    told of in a line on stderr.
+
+    Raises:
+        InUseError: another process writes there.
+        DyngsError: nobody can.
+    """
+    made = _made(folder)
+    try:
+        file, locks = _locked(folder)
+        try:
+            yield locks
+        finally:
+            _freed(folder / LOCK_NAME, file)
+    finally:
+        for path in made:
+            with suppress(OSError):
+                path.rmdir()  # only succeeds if nothing came of it
+
+
+def _made(folder: Path) -> list[Path]:
+    """The folders that had to be made, innermost first."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise DyngsError(f"{folder}: is not a folder; give another one") from None
+    except OSError as error:
+        raise DyngsError(f"cannot write {folder}: {error.strerror or error}") from error
+    return missing
+
+
+def _locked(folder: Path) -> tuple[int, bool]:
+    """The open lock file of a folder, and whether it is locked.
+
+    Raises:
+        DyngsError: another process has it.
+    """
+    path = folder / LOCK_NAME
+    while True:
+        file = _opened(path)
+        try:
+            _lock(file)
+            if not _is_the_same(file, path):  # its last owner removed it after we had opened it
+                os.close(file)
+                continue
+            _sign(file)
+            return file, True
+        except OSError as error:
+            if error.errno in _WITHOUT_LOCKS:
+                print(
+                    f"dyngs: warning: {folder}: this file system has no locks ({error.strerror}); "
+                    "see to it that no two commands write into that folder at once",
+                    file=sys.stderr,
+                )
+                return file, False
+            os.close(file)
+            if error.errno not in _HELD:
+                raise DyngsError(f"cannot lock {path}: {error.strerror or error}") from error
+            raise InUseError(f"{folder}: {_owner(path)}; wait until it has ended, or give another folder") from None
+
+
+def _opened(path: Path) -> int:
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    try:
+        file = os.open(path, flags, 0o644)
+    except OSError as error:
+        link = "; it is a link, remove it" if path.is_symlink() else ""
+        raise DyngsError(f"cannot write {path}: {error.strerror or error}{link}") from error
+    if not stat.S_ISREG(os.fstat(file).st_mode):
+        os.close(file)
+        raise DyngsError(f"cannot write {path}: not a file; remove it")
+    return file
+
+
+def _lock(file: int) -> None:
+    if sys.platform == "win32":
+        os.lseek(file, _FAR, os.SEEK_SET)
+        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
+    else:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _freed(path: Path, file: int) -> None:
+    """Remove and close the lock file; others that wait to lock it notice that it is gone."""
+    with suppress(OSError):
+        if sys.platform != "win32" and _is_the_same(file, path):
+            path.unlink()
+    with suppress(OSError):
+        os.close(file)
+    if sys.platform == "win32":
+        with suppress(OSError):
+            path.unlink()  # fails if somebody has it by now
+
+
+def _is_the_same(file: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
+def _sign(file: int) -> None:
+    """Write who has the lock, for the message to others; without room on the disk nobody is told."""
+    owner = {"pid": os.getpid(), "host": platform.node(), "since": time.strftime("%Y-%m-%d %H:%M:%S")}
+    with suppress(OSError):
+        os.ftruncate(file, 0)
+        os.lseek(file, 0, os.SEEK_SET)
+        os.write(file, (json.dumps(owner) + "\n").encode())
+
+
+def _owner(path: Path) -> str:
+    """Who writes there, as far as the lock file says."""
+    try:
+        with path.open("rb") as file:
+            known = json.loads(file.read(4096))
+        pid, host, since = int(known["pid"]), str(known["host"]), str(known["since"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "another process is writing there"
+    return f"process {pid} on {host} has been writing there since {since}"
