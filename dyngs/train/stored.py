@@ -87,8 +87,8 @@ def write_compact(run_dir: Path, out: Path, max_change: float | None = None, fie
         field_step: how many times as coarsely as that the field is rounded.
 
     Raises:
-        DyngsError: no such run, ``out`` holds another one, the pictures would change by more than ``max_change``, or the
-            file cannot be written. Nothing is written then.
+        DyngsError: no such run, ``out`` holds another one, the pictures would change by more than ``max_change``, or
+            the file cannot be written. Nothing is written then.
     """
     config = load_resolved(run_dir)
     with folder_of_export(out, run_dir, config) as folder:
