@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
+    from dyngs.config import DataConfig
     from dyngs.human.motion import Motion
 
 SYNTHETIC_SCENES = ("still", "spin", "wave", "merge", "room", "human")
@@ -32,6 +33,7 @@ def _add_inspect(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         description="Report views, sizes, intrinsics, times, points, masks, and everything suspicious.",
     )
     parser.add_argument("path", type=Path, metavar="PATH", help="capture folder")
+    parser.add_argument("overrides", nargs="*", metavar="data.key=value", help="such as data.follow_links=true")
     formats = ("auto", "blender", "nerfstudio", "colmap", "nerfies", "llff", "camera_folders")
     people = ("body_json", "zju_mocap", "people_snapshot", "neuman")
     parser.add_argument("--format", choices=(*formats, *people), default="auto")
@@ -51,6 +53,7 @@ def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
     parser.add_argument("--frames", type=int, default=100, metavar="N", help="taken from a video (default 100)")
     parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
+    parser.add_argument("overrides", nargs="*", metavar="data.key=value", help="data.follow_links, data.max_megapixels")
     parser.set_defaults(run=run_sfm)
 
 
@@ -94,10 +97,11 @@ def _add_synth(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Print the report on a capture, and draw it if asked to."""
-    from dyngs.config import DataConfig
     from dyngs.data.inspect import format_report, inspect_capture
 
-    report = inspect_capture(DataConfig(root=arguments.path, format=arguments.format), arguments.deep)
+    given = {"root": arguments.path, "format": arguments.format}
+    options = _keys_of_data(arguments.overrides).model_copy(update=given)
+    report = inspect_capture(options, arguments.deep)
     if report.capture is None:
         for problem in report.problems[1:]:
             print(f"also: {problem}")
@@ -111,11 +115,30 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _keys_of_data(overrides: list[str]) -> DataConfig:
+    """What ``data.key=value`` say; the root is none."""
+    from dyngs.config_io import load_config
+
+    other = [
+        word for word in overrides if not word.startswith("data.") or word.startswith(("data.root=", "data.format="))
+    ]
+    if other:
+        raise DyngsError(f"{other[0]!r}: give keys of data here, such as data.follow_links=true")
+    return load_config(None, ["data.root=.", *overrides]).data
+
+
 def run_sfm(arguments: argparse.Namespace) -> int:
     """Estimate poses and say how to train on them."""
     from dyngs.data.sfm import SfmOptions, estimate_poses
 
-    options = SfmOptions(matching=arguments.matching, num_frames=arguments.frames, num_threads=arguments.threads)
+    limits = _keys_of_data(arguments.overrides)
+    options = SfmOptions(
+        matching=arguments.matching,
+        num_frames=arguments.frames,
+        num_threads=arguments.threads,
+        follow_links=limits.follow_links,
+        max_megapixels=limits.max_megapixels,
+    )
     result = estimate_poses(arguments.images, arguments.out, options)
     print(result.summary())
     print(f"next: dyngs data inspect {result.root} --picture cameras.png")

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.data.picture_errors import picture_error
-from dyngs.data.trust import check_size
+from dyngs.data.trust import check_size, max_decoded_mb
 from dyngs.errors import DyngsError, reading
 
 if TYPE_CHECKING:
@@ -164,6 +164,8 @@ def _open(path: Path) -> OpenImageIO.ImageInput:
 
     if not path.is_file():
         raise DyngsError(f"{path}: no such picture; restore it or remove it from the capture")
+    # Some of its readers allocate the picture when they open the file.
+    oiio.attribute("limits:imagesize_MB", max_decoded_mb())
     config = oiio.ImageSpec()
     config["oiio:UnassociatedAlpha"] = 1
     source = oiio.ImageInput.open(str(path), config)

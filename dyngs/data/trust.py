@@ -97,6 +97,11 @@ def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
         )
 
 
+def max_decoded_mb() -> int:
+    """What a picture of the largest size takes in 2^20 bytes, with four channels of floats."""
+    return max(1, round(_max_megapixels.get() * 16e6 / 2**20))
+
+
 def leaving_links(root: Path) -> list[tuple[Path, str]]:
     """Links below ``root`` (its first 100,000 entries) that lead out of it, and where to; no link is followed."""
     real = os.path.realpath(root)

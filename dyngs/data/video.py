@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 MAX_FRAMES = 1_000_000
 """Of one video: ten hours."""
-_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
-"""FFmpeg's names for what these suffixes stand for."""
+_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,m4v,flv,ogg,asf,dv,mxf,h264,hevc"
+"""FFmpeg's names for files that hold pictures themselves, whatever their suffix says."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterato
                     index += 1
         except FFmpegError as error:
             if index == 0:
-                raise DyngsError(f"cannot read the video {path}: {reason(error)}") from error
+                raise DyngsError(f"cannot read the video {path}: {error.strerror or reason(error)}") from error
             raise _broken(path, index, error.strerror or reason(error)) from error
 
 
