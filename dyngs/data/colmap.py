@@ -65,7 +65,8 @@ def read_colmap(root: Path) -> Capture:
     model = _load_model(folder)
     if not (root / "images").is_dir():
         raise DyngsError(f"{root / 'images'}: no such folder; put the model's pictures there")
-    posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    with reading(folder, "names of images must be UTF-8; rename the pictures and export the model again"):
+        posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     masks = _find_masks(root / "masks")
     repaired: dict[str, float] = {}
     rescaled: list[str] = []

@@ -36,7 +36,7 @@ def read_nerfstudio(root: Path) -> Capture:
 
 
 def read_points(path: Path) -> PointCloud:
-    """Points of a mesh or point file (through trimesh), grey where it has no colours.
+    """Points of a ``.ply`` file (through trimesh), grey where it has no colours.
 
     Raises:
         DyngsError: missing or unreadable.
@@ -45,8 +45,9 @@ def read_points(path: Path) -> PointCloud:
 
     if not path.is_file():
         raise DyngsError(f"{path}: no such point file; restore it or remove ply_file_path")
-    with reading(path, "it must hold points; export it again"):
-        loaded = trimesh.load(path, process=False)
+    # Out of an open file, because textures that it names would be looked for beside one with a path.
+    with reading(path, "it must be a .ply file of points; export it again"), path.open("rb") as file:
+        loaded = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
         xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)  # type: ignore[union-attr]
         colours = loaded.colors if isinstance(loaded, trimesh.PointCloud) else loaded.visual.vertex_colors  # type: ignore
         rgb = np.full((len(xyz), 3), 128, np.uint8)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from dyngs.data.images import (
     straight_uint8,
     target_size,
 )
+from dyngs.data.trust import pictures_up_to
 from dyngs.errors import DyngsError
 
 
@@ -146,3 +149,89 @@ def test_colour_of_transparent_pixels_does_not_bleed() -> None:
 )
 def test_target_size(size: tuple[int, int], downscale: float, longest: int | None, wanted: tuple[int, int]) -> None:
     assert target_size(*size, downscale, longest) == wanted
+
+
+# ---------------------------------------------------------------------------------------------------- damaged and huge
+
+
+def mutated(data: bytes, seed: int) -> bytes:
+    """``data`` with some bytes changed, removed or inserted, most of them near the beginning."""
+    rng, changed = np.random.default_rng(seed), bytearray(data)
+    for _ in range(rng.choice([1, 2, 4, 16])):
+        at = int(rng.integers(min(len(changed), rng.choice([64, 200, len(changed)]))))
+        kind = rng.random()
+        if kind < 0.6:
+            changed[at] = rng.integers(256)
+        elif kind < 0.8:
+            changed[at : at + 4] = bytes([255, 255, 255, 127])
+        elif kind < 0.9 and len(changed) > 100:
+            del changed[at : at + 20]
+        else:
+            changed[at:at] = bytes(rng.integers(128, 256, 8, dtype=np.uint8))
+    return bytes(changed)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".exr", ".tif", ".webp", ".bmp"])
+def test_damaged_pictures_are_read_or_refused_in_one_line(tmp_path: Path, suffix: str) -> None:
+    """One in fifty ended in a traceback, because OpenImageIO quotes bytes that are no text."""
+    pixels = random_pixels(20, 24, 3)
+    write_picture(tmp_path / f"a{suffix}", pixels.astype(np.float32) / 255 if suffix == ".exr" else pixels)
+    data = (tmp_path / f"a{suffix}").read_bytes()
+    path = tmp_path / f"m{suffix}"
+    lines = []
+    for seed in range(200):
+        path.write_bytes(mutated(data, seed))
+        for read in (read_header, check_picture, read_mask):
+            try:
+                read(path)
+            except DyngsError as error:
+                lines.append(str(error))
+    assert len(lines) > 50
+    assert [line for line in lines if not line.isprintable() or str(path) not in line] == []
+
+
+def test_texts_that_are_not_utf_8_are_shown_with_escapes(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    write_picture(path, random_pixels(4, 4, 3).astype(np.float32))
+    path.write_bytes(path.read_bytes().replace(b"channels\0chlist\0", b"channels\xe4chlist\0"))
+    with pytest.raises(DyngsError, match=r"a\.exr: cannot be read as a picture \(.*copy or convert it again"):
+        read_header(path)
+
+
+def write_empty_png(path: Path, side: int) -> None:
+    """A real grey picture, black throughout."""
+    data = zlib.compress(bytes((1 + side // 8) * side), 6)
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)), (b"IDAT", data), (b"IEND", b"")]
+    chunks = [struct.pack(">I", len(d)) + kind + d + struct.pack(">I", zlib.crc32(kind + d)) for kind, d in parts]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+
+
+def test_a_small_file_with_a_huge_picture_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+    """It took 2.7 GB."""
+    resource = pytest.importorskip("resource")
+    path = tmp_path / "a.png"
+    write_empty_png(path, 20_000)
+    assert path.stat().st_size < 400_000
+    assert read_header(path).width == 20_000
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for read in (read_picture, read_mask, check_picture):
+        with pytest.raises(DyngsError, match=r"20000x20000 .*max_megapixels is 100; shrink .*or raise"):
+            read(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000
+
+
+def test_the_limit_can_be_raised_and_lowered(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.png", random_pixels(100, 100, 3))
+    with (
+        pictures_up_to(0.005),
+        pytest.raises(DyngsError, match=r"0\.01 megapixels, but .* is 0\.005"),
+    ):
+        read_picture(tmp_path / "a.png")
+    with pictures_up_to(0.01):
+        assert read_picture(tmp_path / "a.png").shape == (100, 100, 3)
+
+
+def test_many_channels_count_as_many_pictures(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.exr", np.zeros((100, 100, 40), np.float32))
+    with pictures_up_to(0.05), pytest.raises(DyngsError, match=r"of 40 channels are 0\.1 megapixels"):
+        read_picture(tmp_path / "a.exr")

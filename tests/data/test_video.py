@@ -5,10 +5,13 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from tiny_captures import level_of, packet_places, truncate_video, write_video
 
+from dyngs.data import video as video_module
+from dyngs.data.trust import pictures_up_to
 from dyngs.data.video import VideoInfo, probe_video, read_frames, read_numbered_frames
 from dyngs.errors import DyngsError
 
@@ -79,3 +82,55 @@ def test_no_video_at_all(video: Path) -> None:
     truncate_video(empty, 0)
     with pytest.raises(DyngsError, match=r"empty\.mp4"):
         probe_video(empty)
+
+
+def test_a_title_in_latin_1(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        container.metadata["title"] = "Café"
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 16, 12, "yuv420p"
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((12, 16, 3), np.uint8), format="rgb24")))
+        container.mux(stream.encode(None))
+    path.write_bytes(path.read_bytes().replace("Café".encode(), b"Caf\xe9 "))
+    assert b"Caf\xe9 " in path.read_bytes()
+    assert probe_video(path).num_frames == 3
+    assert len(list(read_frames(path))) == 3
+
+
+@pytest.mark.parametrize(
+    "content", ["ffconcat version 1.0\nfile cam00.mp4\n", "#EXTM3U\n#EXTINF:1,\n{video}\n#EXT-X-ENDLIST\n"]
+)
+def test_playlists_which_name_other_files_are_no_videos(video: Path, content: str) -> None:
+    path = video.with_name("list.mp4")
+    path.write_text(content.format(video=video))
+    with pytest.raises(DyngsError, match=r"cannot read the video .*list\.mp4"):
+        probe_video(path)
+
+
+def test_large_videos_are_refused_before_they_are_decoded(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (
+        pictures_up_to(0.0005),
+        pytest.raises(DyngsError, match=r"32x24 .*data\.max_megapixels is 0\.0005"),
+    ):
+        probe_video(video)
+    monkeypatch.setattr(video_module, "MAX_FRAMES", 8)
+    with pytest.raises(DyngsError, match=r"cam00\.mp4: the video has 9 frames, of which 8 are read at most; cut it up"):
+        probe_video(video)
+
+
+def test_mutated_videos_are_read_or_refused_in_one_line(video: Path) -> None:
+    data, path = video.read_bytes(), video.with_name("mutated.mp4")
+    lines = []
+    for seed in range(150):
+        rng, changed = np.random.default_rng(seed), bytearray(data)
+        for _ in range(rng.choice([1, 4, 16])):
+            changed[int(rng.integers(rng.choice([200, 1000, len(data)])))] = rng.integers(256)
+        path.write_bytes(changed)
+        try:
+            for _ in read_numbered_frames(path, range(min(probe_video(path).num_frames, 20))):
+                pass
+        except DyngsError as error:
+            lines.append(str(error))
+    assert all(line.isprintable() for line in lines)
