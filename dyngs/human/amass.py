@@ -12,9 +12,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dyngs.data.archives import read_arrays
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
 from dyngs.human.body import Body
-from dyngs.human.motion import ROWS, Motion, Up
+from dyngs.human.motion import ROWS, Motion, Up, require_moderate, require_rate
 from dyngs.human.retarget import on_floor
 
 _MODELS = {72: "smpl", 156: "smplh", 165: "smplx"}
@@ -41,7 +41,11 @@ def read_amass(path: Path, body: Body, up: Up = "auto") -> Motion:
     Raises:
         DyngsError: names the file and what is missing or wrong.
     """
-    arrays = _arrays(path)
+    with reading(path):
+        return _motion(path, _arrays(path), body, up)
+
+
+def _motion(path: Path, arrays: dict[str, np.ndarray], body: Body, up: Up) -> Motion:
     poses, width = _poses(path, arrays)
     frames = len(poses)
     trans = _numbers(path, arrays, "trans")
@@ -83,6 +87,7 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
         flat = _joined_parts(path, arrays)
     if not len(flat):
         raise DyngsError(f"{path}: has no frames")
+    require_moderate(path, len(flat), 55)
     rows = list(ROWS[flat.shape[1] // 3])
     poses = np.zeros((len(flat), 55, 3))
     poses[:, rows] = flat.reshape(len(flat), -1, 3)[:, : len(rows)]
@@ -122,7 +127,7 @@ def _fps(path: Path, arrays: dict[str, np.ndarray]) -> float:
     rate = _numbers(path, arrays, key)
     if rate.size != 1 or not rate.item() > 0:
         raise DyngsError(f"{path}: '{key}' must be one positive number")
-    return rate.item()
+    return require_rate(path, rate.item())
 
 
 def _scale(path: Path, arrays: dict[str, np.ndarray], frames: int) -> np.ndarray:

@@ -5,17 +5,26 @@ Local letters: S joints of the file, F frames, C channels of all joints together
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.errors import DyngsError
-from dyngs.human.retarget import SourceMotion, require_moderate
+from dyngs.data.limits import require_at_most
+from dyngs.errors import DyngsError, reading
+from dyngs.human.motion import chunks, require_moderate, require_rate
+from dyngs.human.retarget import SourceMotion
 
 _END_SITE = -1
+_MOST_JOINTS = 4096
+_LONGEST_NAME = 200
+_CHARACTERS = 1 << 16
+"""Of the part MOTION that are parsed at once."""
+_GAP = re.compile(r"\s")
 _CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz")
 
 
@@ -23,7 +32,7 @@ _CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis 
 class _Joint:
     name: str
     parent: int  # -1 for the root
-    offset: np.ndarray | None = None
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     channels: list[str] = field(default_factory=list)  # "zrotation" and the like, in the order of the file
 
 
@@ -36,19 +45,26 @@ def read_bvh(path: Path) -> SourceMotion:
     Raises:
         DyngsError: names the file and what is wrong with it.
     """
-    hierarchy, rows = _halves(path)
-    joints = _joints(path, hierarchy)
-    values, fps = _values(path, rows, sum(len(joint.channels) for joint in joints))
-    require_moderate(path, len(values), len(joints))
+    with reading(path):
+        hierarchy, rows = _halves(path)
+        joints = _joints(path, hierarchy)
+        values, fps = _values(path, rows, joints)
+        rotations = np.empty((len(values), len(joints), 3, 3))
+        positions = np.empty((len(values), len(joints), 3))
+        rest = np.zeros((len(joints), 3))
+        for part in chunks(len(values)):
+            rest = _place(joints, values[part], rotations[part], positions[part])
+        names = tuple(joint.name for joint in joints)
+        return SourceMotion(path, names, rest, rotations, positions, fps, world_is_y_up=False)
+
+
+def _place(joints: Sequence[_Joint], values: np.ndarray, rotations: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """(S, 3) the joints at rest; fills rotations (F, S, 3, 3) and positions (F, S, 3) of frames with values (F, C)."""
     rest = np.zeros((len(joints), 3))
-    rotations = np.empty((len(values), len(joints), 3, 3))
-    positions = np.empty((len(values), len(joints), 3))
     column = 0
     for i, joint in enumerate(joints):
         own = values[:, column : column + len(joint.channels)]
         column += len(joint.channels)
-        if joint.offset is None:
-            raise DyngsError(f"{path}: the joint '{joint.name}' has no OFFSET; export it again")
         position, rotation = _local_motion(joint.offset, joint.channels, own)
         if joint.parent >= 0:
             above = rotations[:, joint.parent]
@@ -56,17 +72,18 @@ def read_bvh(path: Path) -> SourceMotion:
             position = positions[:, joint.parent] + (above @ position[..., None])[..., 0]
             rotation = above @ rotation
         positions[:, i], rotations[:, i] = position, rotation
-    names = tuple(joint.name for joint in joints)
-    return SourceMotion(path, names, rest, rotations, positions, fps, world_is_y_up=False)
+    return rest
 
 
 def _halves(path: Path) -> tuple[str, str]:
     """What stands before and after the line ``MOTION``."""
+    if path.exists() and not path.is_file():
+        raise DyngsError(f"{path}: is no file; name a .bvh")
     try:
         text = path.read_bytes().decode("utf-8-sig", errors="replace")
     except OSError as error:
-        raise DyngsError(f"{path}: cannot be read ({error.strerror})") from None
-    halves = re.split(r"(?im)^\s*MOTION\s*$", text, maxsplit=1)
+        raise DyngsError(f"{path}: cannot be read ({error.strerror})") from error
+    halves = re.split(r"(?im)^[^\S\n]*MOTION[^\S\n]*$", text, maxsplit=1)
     if not text.lstrip()[:9].upper() == "HIERARCHY":
         raise DyngsError(f"{path}: not a BVH file: it does not begin with HIERARCHY")
     if len(halves) < 2:
@@ -77,6 +94,7 @@ def _halves(path: Path) -> tuple[str, str]:
 def _joints(path: Path, hierarchy: str) -> list[_Joint]:
     """The joints, parents first."""
     joints: list[_Joint] = []
+    lacking: set[int] = set()  # an OFFSET
     blocks: list[int] = []  # the joints whose braces are open, _END_SITE among them
     announced: int | None = None  # what the next brace opens
     for line in hierarchy.replace("{", "\n{\n").replace("}", "\n}\n").splitlines():
@@ -93,7 +111,9 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
             announced = None
         elif (starts_root or starts_joint) and len(words) > 1:
             announced = len(joints)
-            joints.append(_Joint(" ".join(words[1:]), -1 if inside is None else inside))
+            require_at_most(path, announced + 1, _MOST_JOINTS, "joints")
+            lacking.add(announced)
+            joints.append(_Joint(" ".join(words[1:])[:_LONGEST_NAME], -1 if inside is None else inside))
         elif word == "END" and inside is not None and inside >= 0:
             announced = _END_SITE
         elif word == "}" and blocks:
@@ -102,12 +122,15 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
             continue
         elif word == "OFFSET" and inside is not None:
             joints[inside].offset = _offset(path, joints[inside].name, words[1:])
+            lacking.discard(inside)
         elif word == "CHANNELS" and inside is not None and inside >= 0:
             joints[inside].channels = _channels(path, joints[inside].name, words[1:])
         else:
             raise DyngsError(f"{path}: HIERARCHY: did not expect '{line.strip():.60}'; export it again")
     if not joints or blocks or announced is not None:
         raise DyngsError(f"{path}: HIERARCHY is cut off or has no ROOT; export it again")
+    if lacking:
+        raise DyngsError(f"{path}: the joint '{joints[min(lacking)].name}' has no OFFSET; export it again")
     return joints
 
 
@@ -125,20 +148,37 @@ def _channels(path: Path, name: str, words: list[str]) -> list[str]:
     return channels
 
 
-def _values(path: Path, rows: str, channels: int) -> tuple[np.ndarray, float]:
+def _values(path: Path, rows: str, joints: Sequence[_Joint]) -> tuple[np.ndarray, float]:
     """(F, C) numbers of the frames, and frames per second."""
     header = re.match(r"\s*Frames\s*:\s*(\d{1,9})\s+Frame\s+Time\s*:\s*(\S+)", rows, re.IGNORECASE)
     if header is None:
         raise DyngsError(f"{path}: MOTION must begin with 'Frames: ' and 'Frame Time: '; export it again")
-    frames, seconds = int(header[1]), _numbers(path, [header[2]]).item()
+    frames, channels = int(header[1]), sum(len(joint.channels) for joint in joints)
+    seconds = _numbers(path, [header[2]]).item()
     if not frames or not channels or not seconds > 0:
         raise DyngsError(f"{path}: needs at least one frame, one channel and a positive Frame Time")
-    values = _numbers(path, rows[header.end() :].split())
-    if len(values) != frames * channels:
-        raise DyngsError(
-            f"{path}: says {frames} frames of {channels} numbers but holds {len(values)} numbers; it may be cut off"
-        )
-    return values.reshape(frames, channels), 1.0 / seconds
+    fps = require_rate(path, 1.0 / seconds if seconds > 1e-300 else math.inf)
+    if frames * channels > (len(rows) - header.end() + 1) // 2:  # each has a digit and a gap
+        count = sum(1 for _ in re.finditer(r"\S+", rows[header.end() :]))
+        raise _cut_off(path, frames, channels, count)
+    require_moderate(path, frames, len(joints))
+    values = np.empty(frames * channels)
+    count, start = 0, header.end()
+    while start < len(rows):
+        gap = _GAP.search(rows, start + _CHARACTERS)
+        end = len(rows) if gap is None else gap.start()
+        part = _numbers(path, rows[start:end].split())
+        values[count : count + len(part)] = part[: max(len(values) - count, 0)]
+        count, start = count + len(part), end
+    if count != len(values):
+        raise _cut_off(path, frames, channels, count)
+    return values.reshape(frames, channels), fps
+
+
+def _cut_off(path: Path, frames: int, channels: int, count: int) -> DyngsError:
+    return DyngsError(
+        f"{path}: says {frames} frames of {channels} numbers but holds {count} numbers; it may be cut off"
+    )
 
 
 def _numbers(path: Path, words: list[str]) -> np.ndarray:

@@ -9,25 +9,36 @@ import base64
 import binascii
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
 from scipy.spatial.transform import Rotation
 
-from dyngs.errors import DyngsError
-from dyngs.human.motion import sample_times
-from dyngs.human.retarget import SourceMotion, require_moderate
+from dyngs.data.limits import require_at_most
+from dyngs.errors import DyngsError, reading
+from dyngs.human.motion import chunks, require_moderate, sample_times
+from dyngs.human.retarget import SourceMotion
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
 
+_MOST_PARTS = 1 << 16
+"""Nodes, accessors, channels and the like."""
+_MOST_JOINTS = 4096
+_MOST_KEYS = 1 << 25
+"""Numbers of all curves together: 100 joints that turn, move and stretch in 30,000 keys."""
+
 _Number = Annotated[FiniteFloat, Field(ge=-1e9, le=1e9)]
 _Three = Annotated[tuple[_Number, ...], Field(min_length=3, max_length=3)]
 _Four = Annotated[tuple[_Number, ...], Field(min_length=4, max_length=4)]
 _Sixteen = Annotated[tuple[_Number, ...], Field(min_length=16, max_length=16)]
+
+
+_T = TypeVar("_T")
+_Parts = Annotated[tuple[_T, ...], Field(max_length=_MOST_PARTS)]
 
 
 class _Part(BaseModel):
@@ -60,7 +71,7 @@ class _Accessor(_Part):
 
 class _Node(_Part):
     name: str = ""
-    children: tuple[NonNegativeInt, ...] = ()
+    children: _Parts[NonNegativeInt] = ()
     matrix: _Sixteen | None = None
     translation: _Three = (0.0, 0.0, 0.0)
     rotation: _Four = (0.0, 0.0, 0.0, 1.0)
@@ -68,7 +79,7 @@ class _Node(_Part):
 
 
 class _Skin(_Part):
-    joints: Annotated[tuple[NonNegativeInt, ...], Field(min_length=1)]
+    joints: Annotated[tuple[NonNegativeInt, ...], Field(min_length=1, max_length=_MOST_JOINTS)]
     inverseBindMatrices: NonNegativeInt | None = None
 
 
@@ -89,8 +100,8 @@ class _Sampler(_Part):
 
 
 class _Animation(_Part):
-    channels: tuple[_Channel, ...]
-    samplers: tuple[_Sampler, ...]
+    channels: _Parts[_Channel]
+    samplers: _Parts[_Sampler]
     name: str = ""
 
 
@@ -100,12 +111,12 @@ class _Asset(_Part):
 
 class _Document(_Part):
     asset: _Asset
-    nodes: tuple[_Node, ...] = ()
-    skins: tuple[_Skin, ...] = ()
-    animations: tuple[_Animation, ...] = ()
-    accessors: tuple[_Accessor, ...] = ()
-    bufferViews: tuple[_View, ...] = ()
-    buffers: tuple[_Buffer, ...] = ()
+    nodes: _Parts[_Node] = ()
+    skins: _Parts[_Skin] = ()
+    animations: _Parts[_Animation] = ()
+    accessors: _Parts[_Accessor] = ()
+    bufferViews: _Parts[_View] = ()
+    buffers: _Parts[_Buffer] = ()
 
 
 @dataclass(frozen=True)
@@ -139,17 +150,25 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> SourceM
         DyngsError: no skin, no such animation, anything broken or not supported (sparse accessors, meshopt compression,
             mirrored nodes); names the file.
     """
-    file = _File(path)
+    with reading(path):
+        return _motion(_File(path), fps, clip)
+
+
+def _motion(file: _File, fps: float, clip: str | None) -> SourceMotion:
     joints = max((skin.joints for skin in file.document.skins), key=len, default=())
     if not joints:
-        raise DyngsError(f"{path}: has no skin, hence no skeleton; export it with its skinned mesh")
+        raise file.error("has no skin, hence no skeleton; export it with its skinned mesh")
     chain = _with_ancestors(file, joints)
     curves = _curves(file, _chosen(file, chain, clip), chain)
     start, end = min(c.times[0] for c in curves.values()), max(c.times[-1] for c in curves.values())
-    require_moderate(path, float((end - start) * fps), len(chain))
+    require_moderate(file.path, float((end - start) * fps), len(chain))
     times = start + sample_times(end - start, 1.0, fps)
-    moving = _placed(file, chain, curves, times)
-    positions = np.stack([moving[node].positions for node in joints], axis=1)
+    rotations = np.empty((len(times), len(joints), 3, 3))
+    positions = np.empty((len(times), len(joints), 3))
+    for part in chunks(len(times)):
+        moving = _placed(file, chain, curves, times[part])
+        for i, node in enumerate(joints):
+            rotations[part, i], positions[part, i] = moving[node].rotations, moving[node].positions
     if not (np.abs(positions) < 1e9).all():
         raise file.error("its joints go beyond all bounds; export it again")
     bind = next(skin.inverseBindMatrices for skin in file.document.skins if skin.joints == joints)
@@ -159,11 +178,13 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> SourceM
         rest_from_joint = np.stack([still[node].rotations[0] for node in joints])
     else:
         rest, rest_from_joint = _bind_pose(file, bind, len(joints))
+    for part in chunks(len(times)):
+        rotations[part] = rotations[part] @ rest_from_joint.swapaxes(1, 2)
     return SourceMotion(
-        path,
+        file.path,
         tuple(file.document.nodes[node].name for node in joints),
         rest,
-        np.stack([moving[node].rotations for node in joints], axis=1) @ rest_from_joint.swapaxes(1, 2),
+        rotations,
         positions,
         fps,
         world_is_y_up=True,
@@ -182,7 +203,9 @@ class _File:
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"])) or "JSON"
             raise self.error(f"{where}: {first['msg']:.100}; export it again") from None
-        self._buffers: dict[int, bytes] = {}
+        self._buffers: dict[str | None, bytes] = {}
+        self._read: dict[int, np.ndarray] = {}
+        self._keys = 0
 
     def error(self, problem: str) -> DyngsError:
         """What to raise: one line that names the file."""
@@ -207,17 +230,22 @@ class _File:
         view = document.bufferViews[accessor.bufferView]
         if any("compression" in name for name in view.extensions):
             raise self.error(f"accessor {index} is compressed; export it without compression")
-        data = self._buffer(view.buffer)[view.byteOffset : view.byteOffset + view.byteLength]
+        data = memoryview(self._buffer(view.buffer))[view.byteOffset : view.byteOffset + view.byteLength]
         dtype, width = np.dtype(_TYPES[accessor.componentType]), _WIDTHS[kind]
         stride = view.byteStride or width * dtype.itemsize
         needed = accessor.byteOffset + stride * (accessor.count - 1) + width * dtype.itemsize
         if len(data) < view.byteLength or len(data) < needed:
             raise self.error(f"accessor {index} lies outside its buffer; the file is cut off or broken")
+        self._keys += accessor.count * width
+        require_at_most(self.path, self._keys, _MOST_KEYS, "numbers of keys")
+        if index in self._read:
+            return self._read[index]
         shape, strides = (accessor.count, width), (stride, dtype.itemsize)
         with np.errstate(invalid="ignore"):  # of NaN, which is refused below
             values = np.ndarray(shape, dtype, data, accessor.byteOffset, strides).astype(np.float64)
         if not (np.abs(values) < 1e9).all():
             raise self.error(f"accessor {index} holds NaN or huge numbers; export it again")
+        self._read[index] = values
         return values
 
     def rotations(self, quats: np.ndarray) -> Rotation:
@@ -232,12 +260,12 @@ class _File:
         return Rotation.from_quat(quats / largest)
 
     def _buffer(self, index: int) -> bytes:
-        if index not in self._buffers:
-            if index >= len(self.document.buffers):
-                raise self.error(f"buffer {index} is missing; export it again")
-            uri = self.document.buffers[index].uri
-            self._buffers[index] = self._attached if uri is None else self._fetched(uri)
-        return self._buffers[index]
+        if index >= len(self.document.buffers):
+            raise self.error(f"buffer {index} is missing; export it again")
+        uri = self.document.buffers[index].uri
+        if uri not in self._buffers:
+            self._buffers[uri] = self._attached if uri is None else self._fetched(uri)
+        return self._buffers[uri]
 
     def _fetched(self, uri: str) -> bytes:
         """The bytes of a data URI, or of a file in the same folder or below."""
@@ -250,18 +278,23 @@ class _File:
         parts = PurePosixPath(name).parts
         if not parts or ".." in parts or PurePosixPath(name).is_absolute() or set(name) & {":", "\\", "\0"}:
             raise self.error(f"its buffer {name[:60]!r} is not a file beside it; export it as .glb")
+        beside = self.path.parent / name
+        if beside.exists() and not beside.is_file():
+            raise self.error(f"its buffer {name[:60]!r} is no file; export it as .glb")
         try:
-            return (self.path.parent / name).read_bytes()
+            return beside.read_bytes()
         except OSError as error:
-            raise self.error(f"its buffer {name[:60]!r} cannot be read ({error.strerror})") from None
+            raise self.error(f"its buffer {name[:60]!r} cannot be read ({error.strerror})") from error
 
 
 def _chunks(path: Path) -> tuple[bytes, bytes]:
     """The JSON and the binary chunk of a ``.glb``; a ``.gltf`` is all JSON."""
+    if path.exists() and not path.is_file():
+        raise DyngsError(f"{path}: is no file; name a .glb or a .gltf")
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise DyngsError(f"{path}: cannot be read ({error.strerror})") from None
+        raise DyngsError(f"{path}: cannot be read ({error.strerror})") from error
     if content[:4] != b"glTF":
         return content.removeprefix(b"\xef\xbb\xbf"), b""
     found: dict[bytes, bytes] = {}

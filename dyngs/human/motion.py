@@ -6,6 +6,7 @@ Local letters: J joints, F frames, B shape parameters.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -14,8 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.data.limits import VARIABLE, allowed
 from dyngs.data.write import whole_file
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
 
 if TYPE_CHECKING:
     from dyngs.human.body import Body
@@ -35,6 +37,13 @@ ROWS = {55: tuple(range(55)), 52: (*range(22), *range(25, 55)), 24: tuple(range(
 """By number of joints of a body: which of the 55 its first joints are. SMPL's last two, the hands, are none of them."""
 
 Up = Literal["auto", "y", "z"]
+
+MAX_JOINT_POSES = 5_000_000
+"""Joints (55 at least) times frames of a motion at most: 90,909 frames, or 50 minutes at 30 frames per second."""
+_RATES = (1e-3, 1e5)
+"""Frames per second that a file may say."""
+_CHUNK = 1024
+"""Frames that are worked on at once: what is needed beside the motion itself does not grow with its length."""
 
 
 @dataclass(frozen=True)
@@ -73,13 +82,21 @@ class Motion:
         Rotations turn at constant speed the shorter way between two frames, all else is linear. Nothing is smoothed.
 
         Raises:
-            DyngsError: ``fps`` is not a positive number, or asks for more than a million frames.
+            DyngsError: ``fps`` is not a positive number, or asks for more frames than ``MAX_JOINT_POSES`` allows.
         """
-        if not len(self) * fps <= 1_000_000 * self.fps:
-            raise DyngsError(f"cannot resample the motion to {fps:g} frames per second; ask for 30 or the like")
+        most = allowed(MAX_JOINT_POSES) / len(JOINTS)
+        if not len(self) * fps <= most * self.fps:
+            raise DyngsError(
+                f"cannot resample the motion to {fps:g} frames per second, as it would have more than {most:,.0f} "
+                f"frames; ask for 30 or the like, or set {VARIABLE}=N to allow N times as many"
+            )
         times = sample_times(len(self) - 1, self.fps, fps)
         if fps == self.fps:
             return self
+        return joined([self._between(times[rows], fps) for rows in chunks(len(times))])
+
+    def _between(self, times: np.ndarray, fps: float) -> Motion:
+        """The motion at ``times`` (F,), in its own frames."""
         before = np.minimum(times.astype(np.int64), max(len(self) - 2, 0))
         after = np.minimum(before + 1, len(self) - 1)
         share = torch.from_numpy(times - before).to(self.trans.dtype)
@@ -90,6 +107,46 @@ class Motion:
 
         poses = _turned_partly(self.poses[before], self.poses[after], times - before)
         return Motion(poses, linear(self.trans), self.betas, fps, linear(self.scale))
+
+
+def joined(parts: Sequence[Motion]) -> Motion:
+    """One motion after the other; at least one, all of one person and rate."""
+    whole = {name: torch.cat([getattr(part, name) for part in parts]) for name in ("poses", "trans", "scale")}
+    return replace(parts[0], **whole)
+
+
+def chunks(count: int) -> list[slice]:
+    """Slices of at most a thousand frames that make up ``count`` of them."""
+    return [slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK)]
+
+
+def require_moderate(path: Path, frames: float, joints: int) -> None:
+    """Check that the motion of a file fits into memory, before it is made.
+
+    Raises:
+        DyngsError: it has more than ``MAX_JOINT_POSES``.
+    """
+    amount, most = frames * max(joints, len(JOINTS)), allowed(MAX_JOINT_POSES)
+    if not amount <= most:
+        factor = f"{math.ceil(amount / MAX_JOINT_POSES)}" if amount < 1e15 else "N"
+        raise DyngsError(
+            f"{path}: {frames:.0f} frames of {max(joints, len(JOINTS))} joints are too many, {most:,} poses of joints "
+            f"are read at most; cut it into shorter pieces, or set the environment variable {VARIABLE}={factor}"
+        )
+
+
+def require_rate(path: Path, fps: float) -> float:
+    """``fps``, if it is a rate of frames per second that a motion can have.
+
+    Raises:
+        DyngsError: it is not.
+    """
+    if not _RATES[0] <= fps <= _RATES[1]:
+        raise DyngsError(
+            f"{path}: {fps:g} frames per second are not those of a motion ({_RATES[0]:g} to {_RATES[1]:g}); repair its "
+            "frame rate or frame time"
+        )
+    return fps
 
 
 def sample_times(last: float, from_fps: float, fps: float) -> np.ndarray:
@@ -135,12 +192,13 @@ def read_motion(
     if clip is not None and kind not in (".glb", ".gltf"):
         raise DyngsError(f"{path}: a {kind} holds one motion without a name; do not ask for '{clip}'")
     body = default_body() if body is None else body
-    if kind == ".npz":
-        motion = read_amass(path, body, up)
-    elif kind == ".bvh":
-        motion = retarget(read_bvh(path), body)
-    else:
-        motion = retarget(read_gltf(path, 30.0 if fps is None else fps, clip), body)
+    with reading(path):
+        if kind == ".npz":
+            motion = read_amass(path, body, up)
+        elif kind == ".bvh":
+            motion = retarget(read_bvh(path), body)
+        else:
+            motion = retarget(read_gltf(path, 30.0 if fps is None else fps, clip), body)
     return motion if fps is None else motion.resampled(fps)
 
 

@@ -10,17 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.errors import DyngsError
 from dyngs.human.body import Body
-from dyngs.human.motion import JOINTS, ROWS, Motion
+from dyngs.human.motion import JOINTS, ROWS, Motion, chunks
 from dyngs.human.rigs import match_joints
 from dyngs.human.skinning import joint_transforms, rotations
-
-MAX_JOINT_POSES = 5_000_000
-"""Joints times frames of a file at most: 100 joints for 7 minutes at 120 frames per second."""
 
 _PARENTS = (
     *(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 15, 15, 15),
@@ -69,16 +67,6 @@ class SourceMotion:
     world_is_y_up: bool
 
 
-def require_moderate(path: Path, frames: float, joints: int) -> None:
-    """Check that the motion of a file fits into memory.
-
-    Raises:
-        DyngsError: it has more than ``MAX_JOINT_POSES``.
-    """
-    if frames * joints > MAX_JOINT_POSES:
-        raise DyngsError(f"{path}: {frames:.0f} frames of {joints} joints are too many; cut it into shorter pieces")
-
-
 def retarget(source: SourceMotion, body: Body) -> Motion:
     """The source's motion on ``body``: 55 joints, y up, float32, its rest pose facing +z.
 
@@ -99,27 +87,47 @@ def retarget(source: SourceMotion, body: Body) -> Motion:
     ours = {JOINTS[row]: body.joints[i].double().numpy() for i, row in enumerate(ROWS[len(body.joints)])}
     theirs = {name: target_from_rest @ source.rest[i] for name, i in found.items()}
     turns = _alignments(ours, theirs)
-    world = np.empty((len(source.rotations), 55, 3, 3))
-    for i, name in enumerate(JOINTS):
-        if name in found:
-            world[:, i] = target_from_world @ source.rotations[:, found[name]] @ target_from_rest.T @ turns[name]
-        else:
-            world[:, i] = world[:, _PARENTS[i]]
-    local = np.concatenate([world[:, :1], world[:, _PARENTS[1:]].swapaxes(2, 3) @ world[:, 1:]], axis=1)
-    poses = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 55, 3)
+    to_target = {name: (i, target_from_rest.T @ turns[name]) for name, i in found.items()}
+    poses = [
+        _axis_angles(_turned(source.rotations[rows], target_from_world, to_target))
+        for rows in chunks(len(source.rotations))
+    ]
     first = {name: source.positions[0, i] for name, i in found.items()}
     ratio = _leg_length(ours) / max(_leg_length(first), 1e-9)
     trans = ratio * source.positions[:, found["pelvis"]] @ target_from_world.T - ours["pelvis"]
     return on_floor(
         Motion(
-            torch.from_numpy(poses).float(),
+            torch.cat(poses),
             torch.from_numpy(trans).float(),
             torch.zeros(10),
             source.fps,
-            torch.ones(len(poses)),
+            torch.ones(len(trans)),
         ),
         body,
     )
+
+
+def _turned(
+    rotations_of: np.ndarray, target_from_world: np.ndarray, to_target: dict[str, tuple[int, np.ndarray]]
+) -> np.ndarray:
+    """(F, 55, 3, 3) world rotations of our joints from those of the source (F, S, 3, 3).
+
+    ``to_target`` has, for each of our joints that the source has, which that is and what turns it at rest.
+    """
+    world = np.empty((len(rotations_of), 55, 3, 3))
+    for i, name in enumerate(JOINTS):
+        if name in to_target:
+            joint, turn = to_target[name]
+            world[:, i] = target_from_world @ rotations_of[:, joint] @ turn
+        else:
+            world[:, i] = world[:, _PARENTS[i]]
+    return world
+
+
+def _axis_angles(world: np.ndarray) -> Tensor:
+    """(F, 55, 3) float32 rotations relative to the parents, of those in the world (F, 55, 3, 3)."""
+    local = np.concatenate([world[:, :1], world[:, _PARENTS[1:]].swapaxes(2, 3) @ world[:, 1:]], axis=1)
+    return torch.from_numpy(Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec()).float().reshape(-1, 55, 3)
 
 
 def on_floor(motion: Motion, body: Body) -> Motion:
@@ -135,9 +143,17 @@ def on_floor(motion: Motion, body: Body) -> Motion:
 
 def _lowest(poses: Tensor, body: Body) -> Tensor:
     """(F,) smallest y of the vertices in the poses (F, J, 3), of blended transforms of which only row y is needed."""
-    rows = joint_transforms(body.joints, body.parents, rotations(poses))[:, :, 1]
+    followed = body.weights.nonzero(as_tuple=True)
     points = torch.cat([body.vertices, torch.ones_like(body.vertices[:, :1])], dim=1)
-    return torch.stack([((body.weights @ row) * points).sum(1).min() for row in rows])
+    shares = (body.weights[followed][:, None] * points[followed[0]]).double().numpy()
+    columns = (4 * followed[1][:, None] + torch.arange(4)).numpy()
+    vertex = followed[0].repeat_interleave(4).numpy()
+    height = csr_array((shares.ravel(), (vertex, columns.ravel())), shape=(len(points), 4 * len(body.joints)))
+    lowest = []
+    for part in chunks(len(poses)):
+        rows = joint_transforms(body.joints, body.parents, rotations(poses[part]))[:, :, 1].flatten(1).double().numpy()
+        lowest += [(height @ few.T).min(axis=0) for few in np.array_split(rows, range(64, len(rows), 64))]
+    return torch.from_numpy(np.concatenate(lowest)).to(poses.dtype)
 
 
 def _target_from_rest(source: SourceMotion, found: dict[str, int]) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from measured import cost_of
 from motion_files import (
     as_local,
     depth_first,
@@ -128,6 +129,9 @@ def test_looks_do_not_matter(two: Path, change: tuple[str, str]) -> None:
         ("Frames: 2", "Frames: 999999999", "says 999999999 frames"),
         ("Frame Time: 0.025", "Frame Time: 0", "a positive Frame Time"),
         ("Frame Time: 0.025", "Frame Time: -1", "a positive Frame Time"),
+        ("Frame Time: 0.025", "Frame Time: 1e-310", "inf frames per second are not those of a motion"),
+        ("Frame Time: 0.025", "Frame Time: 1e-9", "1e.09 frames per second are not those of a motion"),
+        ("Frame Time: 0.025", "Frame Time: 1e8", "1e-08 frames per second are not those of a motion"),
         ("5 0 0 0 90", "5 0 0 0", "says 2 frames of 5 numbers but holds 9"),
         ("5 0 0 0 90", "5 0 0 0 inf", "NaN or huge"),
         ("5 0 0 0 90", "5 0 0 0 1e30", "NaN or huge"),
@@ -159,6 +163,30 @@ def test_damage_ends_in_one_line(two: Path, cut: int, junk: bytes) -> None:
     except DyngsError as error:
         message = str(error)
     assert "\n" not in message
+
+
+HOSTILE = {
+    "frames": (f"{TWO[: TWO.index('Frames')]}Frames: 300000\nFrame Time: 0.03\n" + "0 " * 1_500_000, "too many"),
+    "blank lines": ("HIERARCHY" + "\n" * 1_000_000, "has no part MOTION"),
+    "joints": ("HIERARCHY ROOT a\n{\n" + "JOINT a\n{\n" * 5000 + "MOTION\n", "asks for 4,097 joints"),
+    "a long name": ("HIERARCHY\nROOT " + "a" * 1_000_000 + "\n{\n}\nMOTION", "has no OFFSET"),
+    "a long word": (TWO.replace("0.025", "9" * 1_000_000), "NaN or huge"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_files_cost_little(two: Path, name: str) -> None:
+    text, problem = HOSTILE[name]
+    two.write_text(text)
+
+    def read() -> None:
+        with pytest.raises(DyngsError, match=problem) as caught:
+            read_bvh(two)
+        assert len(str(caught.value)) < 600
+
+    memory, seconds = cost_of(read)
+    assert memory < 150e6
+    assert seconds < 20
 
 
 def test_joints_are_written_depth_first() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from measured import cost_of
 from motion_files import Clip, Glb, as_local, glb_of, pelvis_path, random_motion, skeleton, tiny_body, world_rotations
 from scipy.spatial.transform import Rotation
 
@@ -294,6 +295,39 @@ def test_files_of_another_kind(tmp_path: Path, content: bytes) -> None:
     with pytest.raises(DyngsError, match=r"x\.glb: ") as caught:
         read_gltf(tmp_path / "x.glb")
     assert "\n" not in str(caught.value)
+
+
+def _shared_sampler(glb: Glb) -> None:
+    """Sixty thousand channels of one accessor with a thousand keys."""
+    times, values = glb.add(np.zeros(1000), "SCALAR"), glb.add(np.ones((1000, 4)), "VEC4")
+    animation = glb.json["animations"][0]
+    animation["samplers"][0].update(input=times, output=values)
+    animation["channels"] = [{"sampler": 0, "target": {"node": 0, "path": "rotation"}}] * 60_000
+
+
+HOSTILE: dict[str, tuple[Callable[[Glb], object], str]] = {
+    "keys 2.8 hours apart": (lambda g: _sampler(g, input=g.add(np.array([0, 10_080.0]), "SCALAR")), "too many"),
+    "nodes": (lambda g: g.json.update(nodes=[{}] * 200_000), "nodes: "),
+    "joints": (lambda g: g.json["skins"][0].update(joints=[0] * 5000), "skins.0.joints: "),
+    "one sampler": (_shared_sampler, "numbers of keys"),
+    "a count": (lambda g: g.json["accessors"][1].update(count=2**62), "lies outside its buffer"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_files_cost_little(tmp_path: Path, case: str) -> None:
+    glb = two_joints()
+    spoil, problem = HOSTILE[case]
+    spoil(glb)
+    path = glb.write(tmp_path / "x.glb")
+
+    def read() -> None:
+        with pytest.raises(DyngsError, match=problem):
+            read_gltf(path)
+
+    memory, seconds = cost_of(read)
+    assert memory < 100e6
+    assert seconds < 20
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

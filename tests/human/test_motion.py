@@ -15,7 +15,18 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
 from dyngs.human.body import default_body, posed_vertices
-from dyngs.human.motion import JOINTS, ROWS, Motion, read_motion, sample_times, save_motion
+from dyngs.human.motion import (
+    JOINTS,
+    MAX_JOINT_POSES,
+    ROWS,
+    Motion,
+    chunks,
+    read_motion,
+    require_moderate,
+    require_rate,
+    sample_times,
+    save_motion,
+)
 
 BODY = tiny_body()
 
@@ -160,3 +171,38 @@ def test_times_that_float32_rounds_down_keep_their_last_frame() -> None:
 def test_rates_that_make_no_sense(fps: float) -> None:
     with pytest.raises(DyngsError, match="ask for 30 or the like"):
         random_motion().resampled(fps)
+
+
+# --- limits -----------------------------------------------------------------------------------------------------------
+
+
+def test_motions_that_fill_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of few joints too, as the body has 55."""
+    require_moderate(Path("x.glb"), MAX_JOINT_POSES // 100, 100)
+    for frames, joints in ((MAX_JOINT_POSES // 100 + 1, 100), (MAX_JOINT_POSES // 55 + 1, 1), (float("inf"), 1)):
+        with pytest.raises(DyngsError, match=r"x\.glb: .* too many, 5,000,000 .* or set .* DYNGS_LIMITS="):
+            require_moderate(Path("x.glb"), frames, joints)
+    monkeypatch.setenv("DYNGS_LIMITS", "2")
+    require_moderate(Path("x.glb"), 2 * MAX_JOINT_POSES // 100, 100)
+
+
+def test_resampling_has_the_same_limit() -> None:
+    motion = replace(random_motion(), fps=1e-3)
+    with pytest.raises(DyngsError, match=r"more than 90,909 frames; ask for 30 or the like, or set DYNGS_LIMITS=N"):
+        motion.resampled(30.0)
+
+
+@pytest.mark.parametrize("fps", [0.0, 1e-310, 1e-9, 1e6, float("inf"), float("nan")])
+def test_rates_of_no_motion(fps: float) -> None:
+    with pytest.raises(DyngsError, match=r"x\.bvh: .* frames per second are not those of a motion"):
+        require_rate(Path("x.bvh"), fps)
+
+
+def test_long_motions_are_worked_on_in_parts() -> None:
+    """As if they were not."""
+    motion = random_motion(2500)
+    whole, parts = motion.resampled(24.0), chunks(2500)
+    assert [(part.start, part.stop) for part in parts] == [(0, 1024), (1024, 2048), (2048, 2500)]
+    expected = motion._between(sample_times(2499, 30.0, 24.0), 24.0)
+    for name in ("poses", "trans", "scale"):
+        torch.testing.assert_close(getattr(whole, name), getattr(expected, name))

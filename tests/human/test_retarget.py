@@ -25,11 +25,9 @@ from scipy.spatial.transform import Rotation
 from dyngs.errors import DyngsError
 from dyngs.human.motion import JOINTS, Motion
 from dyngs.human.retarget import (
-    MAX_JOINT_POSES,
     SourceMotion,
     least_rotation,
     on_floor,
-    require_moderate,
     retarget,
 )
 
@@ -272,9 +270,3 @@ def test_unknown_names_are_refused() -> None:
     own = skeleton()
     with pytest.raises(DyngsError, match=r"x\.bvh: unknown joint names"):
         retarget(at_rest(replace(own, names=tuple(f"bone{i}" for i in range(55)))), tiny_body())
-
-
-def test_motions_that_fill_the_memory_are_refused() -> None:
-    require_moderate(Path("x.glb"), MAX_JOINT_POSES // 100, 100)
-    with pytest.raises(DyngsError, match=r"x\.glb: .* too many"):
-        require_moderate(Path("x.glb"), MAX_JOINT_POSES // 100 + 1, 100)
