@@ -110,6 +110,8 @@ def render(
         gaussians = _deal_with_nonfinite(gaussians, options.nonfinite)
     projection, opacities = _project(gaussians, cameras, options)
     colors = _colors(gaussians, cameras, projection.radii, options, shader)
+    if options.nonfinite != "trust":
+        colors = _finite_colors(colors, options.nonfinite)
     if background is not None:
         background = background.to(colors.dtype).expand(len(cameras), 3)
     if options.depth != "none":
@@ -162,6 +164,14 @@ def _colors(
         return shader(gaussians, cameras, radii)
     degree = gaussians.sh_degree if options.sh_degree is None else min(options.sh_degree, gaussians.sh_degree)
     return evaluate_harmonics(gaussians.means, cameras.centers, gaussians.sh, radii, degree)
+
+
+def _finite_colors(colors: Tensor, policy: str) -> Tensor:
+    """``colors``, which may overflow though all that they come from is finite."""
+    if policy == "error":
+        check_finite({"colors": colors}, "lower sh, or the weights of the network that colours")
+        return colors
+    return torch.where(colors.isfinite(), colors, torch.zeros_like(colors))
 
 
 def _project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Projection, Tensor]:

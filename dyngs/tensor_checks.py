@@ -29,11 +29,11 @@ def require_tensor(name: str, x: Tensor, shape: Sequence[int | None], dtype: tor
     return x
 
 
-def require_indices(name: str, x: Tensor, shape: Sequence[int | None], count: int) -> Tensor:
+def require_indices(
+    name: str, x: Tensor, shape: Sequence[int | None], count: int, dtype: torch.dtype = torch.int64
+) -> Tensor:
     """``x``, if it holds whole numbers from 0 to ``count`` - 1 in this shape. Raises ValueError."""
-    if x.dtype not in (torch.int64, torch.int32, torch.uint8):
-        raise ValueError(f"'{name}' is {_said(x.dtype)}, not whole numbers")
-    require_tensor(name, x, shape, x.dtype)
+    require_tensor(name, x, shape, dtype)
     if bool(((x < 0) | (x >= count)).any()):
         raise ValueError(f"'{name}' names something beyond the {count} that there are")
     return x

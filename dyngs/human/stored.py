@@ -74,6 +74,6 @@ def require_anchors(anchors: Mapping[str, Tensor], num_gaussians: int, num_joint
 def require_shapes(directions: Tensor, faces: Tensor, num_joints: int) -> None:
     """Nothing, if these are pose blend shapes of a template with J joints. Raises ValueError."""
     require_tensor("shapes.directions", directions, (9 * (num_joints - 1), None), torch.float16)
-    require_indices("shapes.faces", faces, (None, 3), directions.shape[1] // 3)
+    require_indices("shapes.faces", faces, (None, 3), directions.shape[1] // 3, torch.int32)
     if directions.shape[1] % 3:
         raise ValueError(f"'shapes.directions' has {directions.shape[1]} columns, not three for each vertex")

@@ -1,0 +1,119 @@
+"""Files whose checksum fits and whose contents do not: tensors and headers, mutated by somebody who knows them."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from moving_scene import camera
+from torch import Tensor
+
+from dyngs.rendering import RenderOptions
+from dyngs.storage.coding import compressed
+from dyngs.storage.file import _DTYPES, MAGIC, MAX_HEADER, SceneInfo, _Header, _stored
+from dyngs.storage.tensors import Coding, Kind
+from dyngs.train.scene import Scene, moment_of
+
+Tensors = dict[str, Tensor]
+Header = dict[str, Any]
+
+_VALUES = (torch.nan, torch.inf, -torch.inf, 3e38, -3e38, 1e20, 1e-45, -1.0, 0.0, 1e9, 255.0)
+_TYPES = (torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.uint8, torch.bool)
+_WRONG = (None, "", "x" * 300, -1, 0, 2**70, 1e308, float("nan"), float("inf"), True, [], {}, [[1]], "\x00\n\x1b[31m")
+
+
+def forged(tensors: Mapping[str, Tensor], header: Mapping[str, Any], chance: random.Random) -> tuple[Tensors, Header]:
+    """The contents of a file with one to three things wrong."""
+    changed, told = {name: x.clone() for name, x in tensors.items()}, dict(header)
+    for _ in range(chance.choice((1, 1, 1, 2, 3))):
+        if chance.random() < 0.15:
+            key = chance.choice(sorted(told)) if told else "step"
+            if chance.random() < 0.2:
+                told.pop(key, None)
+            else:
+                told[key] = chance.choice(_WRONG)
+        elif changed:
+            _change(changed, chance.choice(sorted(changed)), chance)
+    return changed, told
+
+
+def _change(tensors: Tensors, name: str, chance: random.Random) -> None:
+    x = tensors[name]
+    changes: list[Callable[[], Tensor | None]] = [
+        lambda: None,
+        lambda: x.to(chance.choice(_TYPES)),
+        lambda: x.reshape(-1),
+        lambda: x[None],
+        lambda: x[..., None],
+        lambda: x[:-1] if x.ndim else x[None],
+        lambda: x[:0] if x.ndim else x[None][:0],
+        lambda: torch.cat([x, x[-1:]]) if x.ndim else x,
+        lambda: torch.cat([x, x]) if x.ndim else x,
+        lambda: x[..., :-1].contiguous() if x.ndim else x,
+        lambda: torch.cat([x, x[..., -1:]], dim=-1) if x.ndim else x,
+        lambda: x.transpose(0, -1).contiguous() if x.ndim > 1 else x.flip(0) if x.ndim else x,
+        lambda: x.reshape(-1)[:1].reshape(()) if x.numel() else x,
+        lambda: torch.full_like(x, _fitting(chance, x)),
+        lambda: torch.zeros_like(x),
+        lambda: _with_value(x, _fitting(chance, x), chance),
+        lambda: _with_value(x, _fitting(chance, x), chance),
+        lambda: _with_value(x, _fitting(chance, x), chance),
+        lambda: tensors[chance.choice(sorted(tensors))].clone(),
+    ]
+    made = chance.choice(changes)()
+    if made is None:
+        del tensors[name]
+        if chance.random() < 0.3:
+            tensors[f"{name}{chance.choice('0x.')}"] = x
+    else:
+        tensors[name] = made.contiguous()
+
+
+def _fitting(chance: random.Random, x: Tensor) -> float | int:
+    """A value that ``x`` can hold."""
+    if x.is_floating_point():
+        return chance.choice(_VALUES)
+    return (
+        chance.choice((-1, 0, 1, 7, 255, 2**31 - 1, 2**62, -(2**62)))
+        if x.dtype == torch.int64
+        else chance.choice((0, 1))
+    )
+
+
+def _with_value(x: Tensor, value: float, chance: random.Random) -> Tensor:
+    if x.numel():
+        x.view(-1)[chance.randrange(x.numel())] = value
+    return x
+
+
+def stored_as_they_are(tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -> bytes:
+    """The bytes of a ``scene.dyngs`` of any tensors, for a reader to judge.
+
+    Raises:
+        ValueError: the format cannot say that.
+    """
+    kept = {name: x for name, x in tensors.items() if str(x.dtype).removeprefix("torch.") in _DTYPES}
+    stored = [_stored(name, x, Coding(Kind.EXACT), None) for name, x in sorted(kept.items())]
+    header = _Header(info=SceneInfo(**info), tensors=tuple(entry for entry, _ in stored))
+    packed = compressed(header.model_dump_json().encode(), room=MAX_HEADER)
+    body = b"".join([MAGIC, len(packed).to_bytes(4, "little"), packed, *(block for _, block in stored)])
+    return body + hashlib.sha256(body).digest()
+
+
+def require_drawable(scene: Scene) -> None:
+    """Nothing, if the pictures of a scene are finite; raises what drawing it raises."""
+    for time in (None, 0.0, 0.37, 1.0):
+        for options in (RenderOptions(), RenderOptions(near=0.01, depth="expected")):
+            drawn = moment_of(scene, time).seen_by(camera(), options, torch.ones(3))
+            assert bool(drawn.rgb.isfinite().all()), "a picture is not finite"
+
+
+def one_line(error: Exception, path: Path) -> None:
+    """Nothing, if the message is one line of printable characters that names the file or says what is not drawn."""
+    text = str(error)
+    assert text.isprintable(), text
+    assert str(path) in text or "render" in text or "clean the input" in text or "not finite" in text, text
