@@ -18,6 +18,7 @@ The same seed makes the same choices, but not the same timing. Linux and macOS.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import random
@@ -49,6 +50,7 @@ WRITES = os.O_WRONLY | os.O_RDWR
 PATIENCE = 300.0
 """Seconds after which a command counts as hung."""
 LOST_CODE = 70
+NUMBERS = itertools.count()
 COMMON = (
     "run.threads=1 run.seed=3 init.kind=random train.log_every=1 model.sh_degree=1 strategy.kind=default "
     "strategy.start=1 strategy.every=3 strategy.grad_threshold=1e-6 strategy.max_gaussians=300"
@@ -148,7 +150,7 @@ def forked(words: str, out: Path, prepare: Callable[[], Trap | None], meet: Call
             wanted.
         meet: called in the parent with the child's number and the file at which those bytes arrive.
     """
-    errors, start = out.parent / "stderr", time.perf_counter()
+    errors, start = out.parent / f"stderr{next(NUMBERS)}", time.perf_counter()
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -448,6 +450,8 @@ def main() -> int:
         number = 0
         while soak.kills < given.kills and time.perf_counter() - start < 60 * given.minutes:
             job = jobs[number % len(jobs)]
+            if number % 20 == 19:
+                print(f"{soak.kills} kills in {(time.perf_counter() - start) / 60:.1f} minutes", flush=True)
             soak.kill_round(job, min(dice.randint(1, 5), given.kills - soak.kills))
             if number // len(jobs) % 4 == 3 or number < len(jobs):
                 soak.limit_round(job, limits[number % len(limits)])

@@ -77,7 +77,7 @@ def run_demo(out: Path = DEFAULT_OUT, options: DemoOptions = DemoOptions()) -> D
         DyngsError: the folder cannot be written.
     """
     start = time.perf_counter()
-    with _claimed_folder(out) as folder:
+    with claimed_folder(out) as folder:
         return _run_demo(folder, options, start)
 
 
@@ -130,7 +130,7 @@ def unused_folder(wanted: Path) -> Path:
 
 
 @contextmanager
-def _claimed_folder(wanted: Path) -> Iterator[Path]:
+def claimed_folder(wanted: Path) -> Iterator[Path]:
     """An unused folder that no other demo takes while the block lasts."""
     with ExitStack() as stack:
         for number in range(1, 1001):

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from dyngs.cli import main
-from dyngs.demo import DemoOptions, demo_config, run_demo, unused_folder
+from dyngs.demo import DemoOptions, claimed_folder, demo_config, run_demo, unused_folder
+from dyngs.train.run_lock import LOCK_NAME
 
 TINY = DemoOptions(steps=30, threads=1, size=24, num_points=300, num_frames=3)
 
@@ -31,6 +32,16 @@ def test_a_second_demo_leaves_the_first_alone(tmp_path: Path) -> None:
     assert unused_folder(wanted) == tmp_path / "demo-2"
     (tmp_path / "demo-2").touch()
     assert unused_folder(wanted) == tmp_path / "demo-3"
+
+
+def test_two_demos_at_once_take_two_folders(tmp_path: Path) -> None:
+    with claimed_folder(tmp_path / "demo") as first, claimed_folder(tmp_path / "demo") as second:
+        assert (first, second) == (tmp_path / "demo", tmp_path / "demo-2")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo" / LOCK_NAME).touch()  # of one that was killed
+    with claimed_folder(tmp_path / "demo") as folder:
+        assert folder == tmp_path / "demo"
 
 
 def test_the_demo_trains_the_packaged_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

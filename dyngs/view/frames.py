@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.data.capture import Capture
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.write import to_uint8, write_image
@@ -73,6 +74,7 @@ class Shot:
         options: how the scene wants to be drawn.
         background: (3,) colour; None is black.
         notes: lines for people, about what was chosen for them.
+        kept: files of the capture, which no picture replaces.
     """
 
     scene: Scene
@@ -80,6 +82,7 @@ class Shot:
     options: RenderOptions = DEFAULT_OPTIONS
     background: Tensor | None = None
     notes: tuple[str, ...] = ()
+    kept: frozenset[Path] = frozenset()
 
 
 def render_frame(
@@ -133,7 +136,7 @@ def write_path_frames(shot: Shot, out_dir: Path | None, output: OutputOptions = 
     if output.depth and out_dir is not None:
         limits = _shared_depth_limits(shot_frames(replace(shot, path=_sample(shot.path))))
     digits = max(4, len(str(len(shot.path) - 1)))
-    with _FrameWriter(out_dir, output, limits) as writer:
+    with _FrameWriter(out_dir, output, shot.kept, limits) as writer:
         for i, frame in enumerate(shot_frames(shot)):
             writer.write(f"frame_{i:0{digits}d}", frame)
     return writer.written
@@ -163,7 +166,7 @@ def write_split(run_dir: Path, split: str, out_dir: Path, output: OutputOptions 
     scene = scene_of_split(run, capture, split)
     shown = set(np.linspace(0, len(loader) - 1, min(len(loader), _SHEET_ROWS)).round().astype(int).tolist())
     rows: list[SheetRow] = []
-    with _FrameWriter(out_dir, output) as writer:
+    with _FrameWriter(out_dir, output, files_of(capture)) as writer:
         for i, stem in enumerate(file_stems([view.name for view in views])):
             picture = loader[i]
             frame = render_frame(moment_of(scene, picture.time), picture.cameras, options, background)
@@ -172,9 +175,15 @@ def write_split(run_dir: Path, split: str, out_dir: Path, output: OutputOptions 
                 truth = picture.composite(background)
                 label = f"{picture.name}  {psnr(torch.from_numpy(frame.rgb), truth, picture.mask):.2f} dB"
                 rows.append(_sheet_row(label, truth, torch.from_numpy(frame.rgb), picture.mask))
-    sheet = out_dir / "sheet.png"
-    write_image(sheet, contact_sheet(rows))
-    return [*writer.written, sheet]
+    writer.write_picture(out_dir / "sheet.png", contact_sheet(rows))
+    return writer.written
+
+
+def files_of(capture: Capture) -> frozenset[Path]:
+    """The pictures and masks of a capture, without links in their paths."""
+    views = [view for split in capture.splits.values() for view in split]
+    files = (path for view in views for path in (view.image_path, view.mask_path) if path is not None)
+    return frozenset(path.resolve() for path in files)
 
 
 def _sheet_row(label: str, truth: Tensor, rendered: Tensor, mask: Tensor | None) -> SheetRow:
@@ -215,8 +224,15 @@ def file_stems(names: Sequence[str]) -> list[str]:
 class _FrameWriter:
     """A context that writes frames as pictures and into a video; ``written`` lists the files."""
 
-    def __init__(self, out_dir: Path | None, output: OutputOptions, limits: tuple[float, float] | None = None) -> None:
+    def __init__(
+        self,
+        out_dir: Path | None,
+        output: OutputOptions,
+        kept: frozenset[Path],
+        limits: tuple[float, float] | None = None,
+    ) -> None:
         self.written: list[Path] = []
+        self._kept = kept
         self._out_dir, self._output, self._limits = out_dir, output, limits
         self._stack = ExitStack()
         self._video: VideoWriter | None = None
@@ -241,14 +257,18 @@ class _FrameWriter:
             self._video.add(rgb)
         if self._out_dir is None:
             return
-        self._picture(self._out_dir / f"{stem}.png", rgb)
+        self.write_picture(self._out_dir / f"{stem}.png", rgb)
         if self._output.alpha:
-            self._picture(self._out_dir / f"{stem}_alpha.png", frame.alpha)
+            self.write_picture(self._out_dir / f"{stem}_alpha.png", frame.alpha)
         if self._output.depth and frame.depth is not None:
-            self._picture(self._out_dir / f"{stem}_depth.png", depth_to_rgb(frame.depth, frame.alpha, self._limits))
-            self._picture(self._out_dir / f"{stem}_depth.exr", frame.depth)
+            self.write_picture(
+                self._out_dir / f"{stem}_depth.png", depth_to_rgb(frame.depth, frame.alpha, self._limits)
+            )
+            self.write_picture(self._out_dir / f"{stem}_depth.exr", frame.depth)
 
-    def _picture(self, path: Path, pixels: np.ndarray) -> None:
+    def write_picture(self, path: Path, pixels: np.ndarray) -> None:
+        if self._kept and path.resolve() in self._kept:
+            raise DyngsError(f"{path}: is a picture of the capture, which would be replaced; give another --out")
         write_image(path, pixels)
         self.written.append(path)
 

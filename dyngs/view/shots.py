@@ -19,7 +19,7 @@ from dyngs.train.assemble import training_cameras
 from dyngs.train.checkpoint import LoadedRun, load_run
 from dyngs.train.evaluate import evaluation_background, render_options, scene_of_split, split_views
 from dyngs.train.playing import at_rest, playing_motion
-from dyngs.view.frames import Shot, file_stems, splat_options
+from dyngs.view.frames import Shot, file_stems, files_of, splat_options
 from dyngs.view.paths import (
     CameraPath,
     frame_orbit_for_points,
@@ -92,7 +92,7 @@ def shot_of_run(run_dir: Path, options: ShotOptions) -> Shot:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     if fps is not None:
         path = replace(path, fps=fps)
-    return Shot(run.scene, path, render_options(run.config.model), background, notes)
+    return Shot(run.scene, path, render_options(run.config.model), background, notes, files_of(capture))
 
 
 def shot_of_ply(file: Path, options: ShotOptions) -> Shot:

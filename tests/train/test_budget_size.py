@@ -90,4 +90,7 @@ def test_a_run_writes_it_and_a_finished_one_makes_it_again(
     shutil.rmtree(folder / SMALL_FOLDER)
     train(load_resolved(folder), resume_from=folder)
     assert file.read_bytes() == wanted
+    (folder / SMALL_FOLDER / "config.yaml").unlink()  # a kill right after the file was written
+    train(load_resolved(folder), resume_from=folder)
+    assert len(load_run(folder / SMALL_FOLDER).scene) > 0
     assert checkpoint_paths(folder)[-1].read_bytes() == end

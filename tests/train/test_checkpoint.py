@@ -19,6 +19,7 @@ from dyngs.config_io import RESOLVED_NAME, save_config
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.static.filters import fuse_filter
+from dyngs.train import checkpoint
 from dyngs.train.checkpoint import (
     Checkpoint,
     CheckpointInfo,
@@ -51,6 +52,29 @@ def _checkpoint(step: int) -> Checkpoint:
 
 def _config(root: Path, **model: bool) -> Config:
     return Config(data=DataConfig(root=root), model=StaticModel(**model), run=RunConfig(name="x"))  # type: ignore[arg-type]
+
+
+def test_the_newest_is_that_of_the_most_steps(tmp_path: Path) -> None:
+    """Also where steps take more digits than names have room for."""
+    for step in (9_999_998, 9_999_999, 10_000_000):
+        save_checkpoint(tmp_path, _checkpoint(step), 1.0)
+    assert [path.stem for path in checkpoint_paths(tmp_path)] == ["step_9999999", "step_10000000"]
+    assert latest_checkpoint(tmp_path).info.step == 10_000_000
+
+
+def test_a_run_can_be_loaded_while_it_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two checkpoints are saved, and the one that was found removed, before it is opened."""
+    save_checkpoint(tmp_path, _checkpoint(1), 1.0)
+    real = checkpoint.load_checkpoint
+
+    def saved_meanwhile(path: Path) -> Checkpoint:
+        if path.stem == "step_0000001":
+            for step in (2, 3):
+                save_checkpoint(tmp_path, _checkpoint(step), 1.0)
+        return real(path)
+
+    monkeypatch.setattr(checkpoint, "load_checkpoint", saved_meanwhile)
+    assert latest_checkpoint(tmp_path).info.step == 3
 
 
 def test_what_is_saved_is_what_is_loaded(tmp_path: Path) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -258,6 +260,16 @@ def test_a_new_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="exists already"), new_folder(tmp_path / "new") as started:
         _filled(tmp_path / "new", {"b": "of somebody else"})
     assert _contents(tmp_path) == {"out/a": b"", "new/b": b"of somebody else"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="forks")
+def test_a_few_kills_lose_nothing(tmp_path: Path) -> None:
+    """The first seconds of benchmarks/soak.py, which does this for long."""
+    soak = Path(__file__).parents[2] / "benchmarks" / "soak.py"
+    words = [sys.executable, str(soak), "--kills", "8", "--minutes", "1", "--jobs", "static,compact,export"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"^\d kills in .*, 0 lost$", done.stdout, re.MULTILINE)
 
 
 def test_the_command_says_it_in_one_line(still: Path, run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ from moving_scene import Sliding, camera, moving_scene, still_scene, write_movin
 
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig
-from dyngs.config_io import RESOLVED_NAME, save_config
+from dyngs.config_io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import RasterizeMode
+from dyngs.data.read import read_capture
 from dyngs.data.synthetic import StillOptions, write_still_capture
 from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
@@ -29,6 +31,7 @@ from dyngs.view.frames import (
     OutputOptions,
     Shot,
     file_stems,
+    files_of,
     render_frame,
     shot_frames,
     splat_options,
@@ -221,6 +224,23 @@ def test_split_of_a_run(tmp_path) -> None:
     with pytest.raises(DyngsError, match="'val' has no views"):
         write_split(run_dir, "val", tmp_path / "val")
     assert not (tmp_path / "val").exists()
+
+
+def test_pictures_of_the_capture_are_not_replaced(tmp_path) -> None:
+    """Views and their pictures have the same names; so may frames of a path."""
+    run_dir = write_run(tmp_path)
+    views = read_capture(load_resolved(run_dir).data).splits["test"]
+    folder = views[0].image_path.parent
+    before = {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    (tmp_path / "link").symlink_to(folder)
+    for out in (folder, tmp_path / "link"):
+        with pytest.raises(DyngsError, match=r"picture of the capture.*--out"):
+            write_split(run_dir, "test", out)
+    shot = balls_shot(cameras_around(1))
+    with pytest.raises(DyngsError, match="picture of the capture"):
+        write_path_frames(replace(shot, kept=frozenset({tmp_path / "new" / "frame_0000.png"})), tmp_path / "new")
+    assert files_of(read_capture(load_resolved(run_dir).data)) >= {view.image_path.resolve() for view in views}
+    assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
 
 
 def test_exported_file_is_drawn_like_the_run(tmp_path) -> None:
