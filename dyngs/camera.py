@@ -28,8 +28,8 @@ class Cameras:
             raise ValueError(f"cam_from_world must be (V, 4, 4), got {tuple(self.cam_from_world.shape)}")
         if self.intrinsics.shape != (len(self.cam_from_world), 3, 3):
             raise ValueError(f"intrinsics must be (V, 3, 3), got {tuple(self.intrinsics.shape)}")
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"image size must be positive, got {self.width}x{self.height}")
+        if not all(hasattr(size, "__index__") and size >= 1 for size in (self.width, self.height)):
+            raise ValueError(f"image size must be positive, in whole pixels, got {self.width}x{self.height}")
 
     def __len__(self) -> int:
         return len(self.cam_from_world)

@@ -12,11 +12,14 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.conventions import MAX_SH_DEGREE
 from dyngs.errors import DyngsError
 from dyngs.ops.finite import check_finite
 from dyngs.ops.harmonics import evaluate_harmonics
+from dyngs.ops.options import LARGEST_COUNT, check_choice, check_count, check_near_and_far, check_number
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import MAX_CHANNELS, TILE, BlendOptions, TileEntries, bin_tiles, rasterize
+from dyngs.rendering import check_focal_lengths
 
 GSPLAT_ALPHA_MAX = 0.999
 """Largest alpha of gsplat 1.5 (dyngs and 3DGS: 0.99)."""
@@ -71,10 +74,10 @@ def rasterization(
         scales: (N, 3) standard deviations.
         opacities: (N,) in [0, 1].
         colors: (N, D) or (C, N, D) values; with ``sh_degree``, (N, K, 3) or (C, N, K, 3) coefficients.
-        viewmats: (C, 4, 4) world to camera, OpenCV axes.
-        Ks: (C, 3, 3) intrinsics, px.
+        viewmats: (C, 4, 4) world to camera, OpenCV axes; rigid, the last row is not read.
+        Ks: (C, 3, 3) intrinsics, px; focal lengths positive, skew and the last row are not read.
         width, height: px.
-        near_plane, far_plane: view-space limits of the centres.
+        near_plane, far_plane: view-space limits of the centres; far_plane may be infinite.
         radius_clip: splats with no larger half extent are skipped, px.
         eps2d: 2D low-pass variance, px^2.
         sh_degree: degree to use; None if colors are values.
@@ -83,10 +86,11 @@ def rasterization(
         render_mode: colour, accumulated depth (D), expected depth (ED), or both; depth is the last channel.
         absgrad: see above.
         rasterize_mode: ``antialiased`` compensates the opacity for the low-pass.
-        channel_chunk: channels per pass, at most 40.
+        channel_chunk: channels per pass; at most 40 are taken.
 
     Raises:
-        DyngsError: shapes that do not fit, NaN or infinite input, or an argument that dyngs does not support.
+        DyngsError: shapes that do not fit, NaN or infinite input, numbers out of their range (planes in the wrong
+            order, focal lengths or sizes that are not positive, ...), or an argument that dyngs does not support.
     """
     unsupported = {
         "tile_size": tile_size != TILE,
@@ -105,10 +109,14 @@ def rasterization(
         "viewmats_rs": viewmats_rs is not None,
     }
     _refuse(unsupported)
-    _check_choices(render_mode, rasterize_mode)
-    _check_shapes(means, quats, scales, opacities, viewmats, Ks)
-    check_finite({"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors})
-    check_finite({"viewmats": viewmats, "Ks": Ks})
+    _check_settings(width, height, near_plane, far_plane, radius_clip, eps2d, channel_chunk)
+    check_choice("rasterization: render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
+    check_choice("rasterization: rasterize_mode", rasterize_mode, ("classic", "antialiased"))
+    tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
+    tensors |= {"viewmats": viewmats, "Ks": Ks} | ({} if backgrounds is None else {"backgrounds": backgrounds})
+    _check_shapes(tensors, sh_degree, with_colors="RGB" in render_mode)
+    check_finite(tensors)
+    check_focal_lengths(Ks, "Ks")
     cameras = Cameras(viewmats, Ks, width, height)
     limits = ProjectionOptions(eps2d, near_plane, far_plane, 1 / 255, radius_clip, rasterize_mode == "antialiased")
     splats = _project(means, quats, scales, opacities, cameras, limits, packed=packed)
@@ -144,35 +152,53 @@ def _refuse(unsupported: dict[str, bool]) -> None:
         raise DyngsError(f"rasterization: dyngs does not support {', '.join(names)} with the value given")
 
 
-def _check_choices(render_mode: str, rasterize_mode: str) -> None:
-    modes = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-    if render_mode not in modes:
-        raise DyngsError(f"rasterization: render_mode {render_mode!r} is none of {', '.join(modes)}")
-    if rasterize_mode not in ("classic", "antialiased"):
-        raise DyngsError(f"rasterization: rasterize_mode {rasterize_mode!r} is neither classic nor antialiased")
-
-
-def _check_shapes(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, intrinsics: Tensor
+def _check_settings(
+    width: int, height: int, near: float, far: float, radius_clip: float, eps2d: float, channel_chunk: int
 ) -> None:
+    try:
+        for name, count in (("width", width), ("height", height), ("channel_chunk", channel_chunk)):
+            check_count(name, count, 1, LARGEST_COUNT)
+        check_near_and_far(near, far)
+        check_number("radius_clip", radius_clip, 0)
+        check_number("eps2d", eps2d, 0)
+    except DyngsError as error:
+        raise DyngsError(f"rasterization: {error}") from None
+
+
+def _check_shapes(tensors: dict[str, Tensor], sh_degree: int | None, *, with_colors: bool) -> None:
+    for name, x in tensors.items():
+        if not isinstance(x, Tensor):
+            raise DyngsError(f"rasterization: {name} must be a torch tensor, got {type(x).__name__}")
+        if x.device.type != "cpu":
+            raise DyngsError(f"rasterization: {name} is on {x.device}; dyngs draws on the CPU")
+    means, colors = tensors["means"], tensors["colors"]
     if means.ndim != 2:
         raise DyngsError(f"rasterization: means must be (N, 3), got {tuple(means.shape)}; scenes are not batched here")
     if means.dtype not in (torch.float32, torch.float64):
         raise DyngsError(f"rasterization: means is {means.dtype}; use float32 (or float64 for checks)")
-    n, c = len(means), len(viewmats)
-    wanted = {
-        "means": (means, (n, 3)),
-        "quats": (quats, (n, 4)),
-        "scales": (scales, (n, 3)),
-        "opacities": (opacities, (n,)),
-        "viewmats": (viewmats, (c, 4, 4)),
-        "Ks": (intrinsics, (c, 3, 3)),
-    }
-    for name, (x, shape) in wanted.items():
-        if tuple(x.shape) != shape:
-            raise DyngsError(f"rasterization: {name} must be {shape}, got {tuple(x.shape)}")
+    n, c = len(means), tensors["viewmats"].shape[0] if tensors["viewmats"].ndim else 0
+    wanted: dict[str, tuple[int, ...]] = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+    wanted |= {"viewmats": (c, 4, 4), "Ks": (c, 3, 3)}
+    if with_colors:  # to depth alone the background does not matter
+        wanted["backgrounds"] = (c, *((3,) if sh_degree is not None else colors.shape[-1:]))
+    for name, x in tensors.items():
+        if name in wanted and tuple(x.shape) != wanted[name]:
+            raise DyngsError(f"rasterization: {name} must be {wanted[name]}, got {tuple(x.shape)}")
         if x.dtype != means.dtype:
             raise DyngsError(f"rasterization: {name} is {x.dtype}, but means is {means.dtype}; use one dtype")
+    _check_colors(colors, n, c, sh_degree)
+
+
+def _check_colors(colors: Tensor, n: int, c: int, sh_degree: int | None) -> None:
+    if sh_degree is None:
+        if tuple(colors.shape[:-1]) not in ((n,), (c, n)) or colors.shape[-1] == 0:
+            raise DyngsError(f"rasterization: colors must be ({n}, D) or ({c}, {n}, D), got {tuple(colors.shape)}")
+        return
+    if tuple(colors.shape[:-2]) not in ((n,), (c, n)) or colors.shape[-1] != 3:
+        raise DyngsError(f"rasterization: with sh_degree colors must be ([{c},] {n}, K, 3), got {tuple(colors.shape)}")
+    check_count("rasterization: sh_degree", sh_degree, 0, MAX_SH_DEGREE)
+    if (sh_degree + 1) ** 2 > colors.shape[-2]:
+        raise DyngsError(f"rasterization: sh_degree {sh_degree} does not fit {colors.shape[-2]} coefficients")
 
 
 def _project(
@@ -202,13 +228,7 @@ def _colors(means: Tensor, cameras: Cameras, colors: Tensor, projection: Project
     """(C, N, D) colour values."""
     c, n = projection.depths.shape
     if sh_degree is None:
-        if tuple(colors.shape[:-1]) not in ((n,), (c, n)):
-            raise DyngsError(f"rasterization: colors must be ({n}, D) or ({c}, {n}, D), got {tuple(colors.shape)}")
         return colors.expand(c, n, colors.shape[-1])
-    if tuple(colors.shape[:-2]) not in ((n,), (c, n)) or colors.shape[-1] != 3:
-        raise DyngsError(f"rasterization: with sh_degree colors must be ([{c},] {n}, K, 3), got {tuple(colors.shape)}")
-    if not 0 <= sh_degree <= 4 or (sh_degree + 1) ** 2 > colors.shape[-2]:
-        raise DyngsError(f"rasterization: sh_degree {sh_degree} does not fit {colors.shape[-2]} coefficients")
     if colors.ndim == 3:
         return evaluate_harmonics(means, cameras.centers, colors, projection.radii, sh_degree)
     per_camera = [
@@ -224,7 +244,7 @@ def _with_depth(
     """Channels to blend and their backgrounds; depth comes last, on a background of 0."""
     depth = depths[..., None]
     if render_mode in ("D", "ED"):
-        return depth, None if backgrounds is None else torch.zeros_like(backgrounds[:, :1])
+        return depth, None
     if render_mode == "RGB":
         return shades, backgrounds
     if backgrounds is not None:
@@ -242,7 +262,7 @@ def _blend(
     channel_chunk: int,
 ) -> tuple[Tensor, Tensor]:
     """Picture (C, H, W, D) and alpha (C, H, W, 1), in passes of ``channel_chunk`` channels."""
-    chunk = max(1, min(channel_chunk, MAX_CHANNELS))
+    chunk = min(channel_chunk, MAX_CHANNELS)
     probe = _absgrad_probe(splats) if options.absgrad else None
     pictures, transmittance = [], None
     for start in range(0, channels.shape[-1], chunk):

@@ -10,12 +10,17 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.conventions import RasterizeMode
+from dyngs.conventions import MAX_SH_DEGREE, RasterizeMode
+from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.ops.finite import check_finite, finite_rows
 from dyngs.ops.harmonics import evaluate_harmonics
+from dyngs.ops.options import check_choice, check_count
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
+
+FOCAL_LENGTHS = (1e-6, 1e12)
+"""px. Beyond them gradients leave the range of float32; a picture of 8 px shows 180 degrees or nothing there."""
 
 Shader = Callable[[Gaussians, Cameras, Tensor], Tensor]
 """(V, N, 3) colours of N Gaussians for V cameras. Those with radii (V, N, 2) of zero are not drawn: theirs are of no
@@ -36,6 +41,9 @@ class RenderOptions:
         absgrad: fill the absolute part of the probe's gradient.
         nonfinite: NaN or infinite input is an ``error``, or its Gaussians are left out (``skip``), or nobody looks
             (``trust``; the trainer, whose optimizer never writes such values).
+
+    Raises:
+        DyngsError: a number that is negative, NaN or beyond its range, or a choice that does not exist.
     """
 
     near: float = 0.2
@@ -49,6 +57,14 @@ class RenderOptions:
     depth: Literal["none", "accumulated", "expected"] = "none"
     absgrad: bool = False
     nonfinite: Literal["error", "skip", "trust"] = "error"
+
+    def __post_init__(self) -> None:
+        check_choice("mode", self.mode, [mode.value for mode in RasterizeMode])
+        check_choice("depth", self.depth, ("none", "accumulated", "expected"))
+        check_choice("nonfinite", self.nonfinite, ("error", "skip", "trust"))
+        if self.sh_degree is not None:
+            check_count("sh_degree", self.sh_degree, 0, MAX_SH_DEGREE)
+        _ = self.projection, self.blending  # these check the numbers
 
     @property
     def projection(self) -> ProjectionOptions:
@@ -102,12 +118,12 @@ def render(
         shader: gives the colours; None: the Gaussians' harmonics do.
 
     Raises:
-        DyngsError: NaN or infinite input (names the argument and the count), or a render too large to bin.
+        DyngsError: NaN or infinite input (names the argument and the count), focal lengths that are not positive, a
+            background or probe of another shape, or a render too large to bin.
     """
-    gaussians, cameras = _one_dtype(gaussians, cameras)
-    if options.nonfinite != "trust":
-        _check_finite_views(cameras, background)
-        gaussians = _deal_with_nonfinite(gaussians, options.nonfinite)
+    gaussians, cameras = _checked(gaussians, cameras, background, options)
+    if probe is not None and probe.shape != (len(cameras), len(gaussians), 4):
+        raise DyngsError(f"probe must be ({len(cameras)}, {len(gaussians)}, 4), got {tuple(probe.shape)}")
     projection, opacities = _project(gaussians, cameras, options)
     colors = _colors(gaussians, cameras, projection.radii, options, shader)
     if options.nonfinite != "trust":
@@ -132,8 +148,12 @@ def render(
 
 
 def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()) -> Tensor:
-    """(V, N) sum over pixels of each Gaussian's blending weight: its share of every picture, for pruning scores."""
-    gaussians, cameras = _one_dtype(gaussians.detach(), cameras)
+    """(V, N) sum over pixels of each Gaussian's blending weight: its share of every picture, for pruning scores.
+
+    Raises:
+        DyngsError: as ``render``.
+    """
+    gaussians, cameras = _checked(gaussians.detach(), cameras, None, options)
     projection, opacities = _project(gaussians, cameras, options)
     return tally(projection, opacities, (cameras.width, cameras.height), Tally.WEIGHTS, options.blending)
 
@@ -146,8 +166,12 @@ def sensitivities(
     background: Tensor | None = None,
     shader: Shader | None = None,
 ) -> Tensor:
-    """(V, N) sum over pixels of (dI/dG)^2, I a pixel's channels added up, G the Gaussian there (Tu et al. 2026)."""
-    gaussians, cameras = _one_dtype(gaussians.detach(), cameras)
+    """(V, N) sum over pixels of (dI/dG)^2, I a pixel's channels added up, G the Gaussian there (Tu et al. 2026).
+
+    Raises:
+        DyngsError: as ``render``.
+    """
+    gaussians, cameras = _checked(gaussians.detach(), cameras, background, options)
     projection, opacities = _project(gaussians, cameras, options)
     colors = _colors(gaussians, cameras, projection.radii, options, shader)
     if background is not None:
@@ -192,10 +216,38 @@ def _one_dtype(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Camer
     return gaussians, cameras
 
 
-def _check_finite_views(cameras: Cameras, background: Tensor | None) -> None:
+def _checked(
+    gaussians: Gaussians, cameras: Cameras, background: Tensor | None, options: RenderOptions
+) -> tuple[Gaussians, Cameras]:
+    """Both in one dtype, and what is not finite dealt with as ``options`` say."""
+    if background is not None and tuple(background.shape) not in ((3,), (len(cameras), 3)):
+        raise DyngsError(f"background must be (3,) or ({len(cameras)}, 3), got {tuple(background.shape)}")
+    gaussians, cameras = _one_dtype(gaussians, cameras)
+    if options.nonfinite != "trust":
+        _check_views(cameras, background)
+        gaussians = _deal_with_nonfinite(gaussians, options.nonfinite)
+    return gaussians, cameras
+
+
+def _check_views(cameras: Cameras, background: Tensor | None) -> None:
     check_finite({"cam_from_world": cameras.cam_from_world, "intrinsics": cameras.intrinsics})
+    check_focal_lengths(cameras.intrinsics)
     if background is not None:
         check_finite({"background": background.to(cameras.intrinsics.dtype)})
+
+
+def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
+    """Nothing, if fx and fy of all (V, 3, 3) matrices lie within ``FOCAL_LENGTHS``.
+
+    Raises:
+        DyngsError: naming the first camera whose do not.
+    """
+    focal, (shortest, longest) = intrinsics.detach().diagonal(dim1=1, dim2=2)[:, :2], FOCAL_LENGTHS
+    bad = torch.nonzero(~((focal >= shortest) & (focal <= longest)).all(1))[:, 0]
+    if len(bad):
+        fx, fy = focal[bad[0]].tolist()
+        wanted = f"{name}: focal lengths must be positive, from {shortest:g} to {longest:g} px"
+        raise DyngsError(f"{wanted}, but camera {int(bad[0])} has {fx:g} and {fy:g}")
 
 
 def _deal_with_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:

@@ -12,6 +12,8 @@ from typing import Any
 
 import pytest
 import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from scenes import Scene, random_scene, relative_error, weights
 from torch import Tensor
 
@@ -312,8 +314,8 @@ def test_unsupported_arguments_are_refused_by_name(name: str, scene: Scene) -> N
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"render_mode": "rgb"}, "render_mode 'rgb' is none of RGB, D"),
-        ({"rasterize_mode": "mip"}, "rasterize_mode 'mip' is neither"),
+        ({"render_mode": "rgb"}, "render_mode must be one of RGB, D, ED, .*got 'rgb'"),
+        ({"rasterize_mode": "mip"}, "rasterize_mode must be one of classic, antialiased, got 'mip'"),
         ({"sh_degree": 3}, "with sh_degree colors must be"),
         ({"colors": torch.zeros(7, 3).double()}, r"colors must be \(20, D\) or \(2, 20, D\), got \(7, 3\)"),
         ({"colors": torch.zeros(20, 4, 3).double(), "sh_degree": 2}, "sh_degree 2 does not fit 4 coefficients"),
@@ -322,6 +324,109 @@ def test_unsupported_arguments_are_refused_by_name(name: str, scene: Scene) -> N
 def test_what_does_not_fit_is_named(options: dict[str, Any], message: str, scene: Scene) -> None:
     with pytest.raises(DyngsError, match=message):
         call(scene, **options)
+
+
+NUMBERS: dict[str, list[Any]] = {
+    "near_plane": [-1e-3, math.nan, math.inf, -math.inf, "0.1", None],
+    "far_plane": [-1.0, 0.0, 0.01, math.nan, -math.inf, None],
+    "radius_clip": [-1.0, math.nan, math.inf],
+    "eps2d": [-0.1, math.nan, math.inf, -math.inf, 1e39, None],
+    "channel_chunk": [0, -1, 2.5, None],
+    "width": [0, -1, 2.5, math.nan, "37", 2**31, True],
+    "height": [0, -1, 2.5, None],
+    "sh_degree": [-1, 5, 1.5, "2"],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in NUMBERS.items() for value in values])
+def test_numbers_out_of_range_are_refused_by_name(name: str, value: Any) -> None:
+    """Some gave an empty picture, some a mirrored one, some an error of another library."""
+    scene = random_scene(degree=3)
+    said = {"near_plane": "near", "far_plane": "far"}.get(name, name)
+    sizes = {"width": scene.width, "height": scene.height} | ({name: value} if name in ("width", "height") else {})
+    options = {} if name in sizes else {name: value}
+    with pytest.raises(DyngsError, match=f"^rasterization: (?s:.*){said}"):
+        call(replace(scene, **sizes), **({"colors": scene.sh} | options if name == "sh_degree" else options))
+
+
+@pytest.mark.parametrize("position", [(0, 0), (1, 1)])
+@pytest.mark.parametrize("focal", [0.0, -0.0, -30.0])
+def test_focal_lengths_are_positive(position: tuple[int, int], focal: float, scene: Scene) -> None:
+    intrinsics = scene.intrinsics.clone()
+    intrinsics[1][position] = focal
+    with pytest.raises(DyngsError, match=r"Ks: focal lengths must be positive.*camera 1 has"):
+        call(replace(scene, intrinsics=intrinsics))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds"])
+def test_what_is_not_finite_is_named(name: str, bad: float, scene: Scene) -> None:
+    fields = {"viewmats": "cam_from_world", "Ks": "intrinsics"}
+    options = {"colors": scene.sh[:, 0].abs(), "backgrounds": scene.background}
+    x = (options[name] if name in options else getattr(scene, fields.get(name, name))).clone()
+    x.view(-1)[0] = bad
+    changed = {} if name in options else {fields.get(name, name): x}
+    options |= {name: x} if name in options else {}
+    with pytest.raises(DyngsError, match=f"^{name} holds 1 NaN or infinite"):
+        call(replace(scene, **changed), **options)
+
+
+@pytest.mark.parametrize("backgrounds", [torch.zeros(3), torch.zeros(2, 2), torch.zeros(1, 3), torch.zeros(2, 4)])
+def test_backgrounds_fit_cameras_and_channels(backgrounds: Tensor, scene: Scene) -> None:
+    for mode in ("RGB", "RGB+D"):
+        with pytest.raises(DyngsError, match=r"backgrounds must be \(2, 3\)"):
+            call(scene, backgrounds=backgrounds.double(), render_mode=mode)
+    picture, _, _ = call(scene, backgrounds=backgrounds.double(), render_mode="D")
+    assert torch.equal(picture, call(scene, render_mode="D")[0])
+
+
+def test_what_is_no_tensor_is_named(scene: Scene) -> None:
+    with pytest.raises(DyngsError, match="colors must be a torch tensor, got ndarray"):
+        call(scene, colors=scene.sh[:, 0].numpy())
+    with pytest.raises(DyngsError, match=r"colors is torch.float32, but means is torch.float64"):
+        call(scene, colors=scene.sh[:, 0].float())
+    with pytest.raises(DyngsError, match=r"colors must be \(20, D\)"):
+        call(scene, colors=scene.sh[:, 0, :0])
+
+
+EXTREMES: dict[str, list[float]] = {
+    "near_plane": [0.0, 1e-45, 1e-3, 3.0, 1e30, 3.4e38],
+    "far_plane": [1e-44, 5.0, 1e10, 3.4e38, 1e300, math.inf],
+    "radius_clip": [0.0, 1e-30, 5.0, 1e30],
+    "eps2d": [0.0, 1e-45, 1e-30, 0.3, 1e10, 1e30, 3.4e38],
+}
+
+
+@settings(max_examples=40, deadline=None)
+@example(  # gradients of NaN, from a focal length that is refused now
+    {"near_plane": 0.0, "far_plane": 5.0, "radius_clip": 0.0, "eps2d": 1e-45}, 1e-45, torch.float32, "classic", "RGB"
+)
+@given(
+    st.fixed_dictionaries({name: st.sampled_from(values) for name, values in EXTREMES.items()}),
+    st.sampled_from([1e-45, 1e-30, 1e-7, 1e-3, 1.0, 1e3, 1e10, 1e15, 1e30, 3e38]),
+    st.sampled_from([torch.float32, torch.float64]),
+    st.sampled_from(["classic", "antialiased"]),
+    st.sampled_from(["RGB", "RGB+ED", "D"]),
+)
+def test_extreme_numbers_give_finite_pictures_or_one_line(
+    limits: dict[str, float], focal: float, dtype: torch.dtype, rasterize_mode: str, render_mode: str
+) -> None:
+    scene = random_scene(n=8, views=1).to(dtype)
+    intrinsics = scene.intrinsics.clone()
+    intrinsics[:, 0, 0] *= focal
+    scene = replace(scene, intrinsics=intrinsics)
+    leaves = scene.leaves()
+    try:
+        picture, alpha, _ = call(leaves, rasterize_mode=rasterize_mode, render_mode=render_mode, **limits)
+    except DyngsError:
+        assert limits["far_plane"] <= limits["near_plane"] or not 1e-6 <= float(intrinsics[0, 0, 0]) <= 1e12
+        return
+    assert bool(picture.isfinite().all())
+    assert 0 <= float(alpha.detach().min()) <= float(alpha.detach().max()) <= 1
+    picture.sum().backward()
+    for name in ("means", "quats", "scales", "opacities"):
+        grad = getattr(leaves, name).grad
+        assert grad is None or bool(grad.isfinite().all()), name
 
 
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "cam_from_world", "intrinsics"])

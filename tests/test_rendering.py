@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0, RasterizeMode
+from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.ops.projection import ProjectionOptions
 from dyngs.ops.rasterization import BlendOptions
@@ -289,3 +291,36 @@ def test_compiles_into_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
     compiled, plain = compiled_and_plain(scene, RenderOptions(nonfinite="trust", mode=RasterizeMode.ANTIALIASED))
     for x, y in zip(compiled, plain, strict=True):
         torch.testing.assert_close(x, y, rtol=1e-12, atol=1e-14)
+
+
+VERBS = [render, contributions, sensitivities]
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("focal", [0.0, -20.0, 1e-7, 1e13])
+def test_focal_lengths_that_show_nothing_are_refused(verb: Callable[..., object], focal: float) -> None:
+    scene = random_scene()
+    scene.intrinsics[1, 1, 1] = focal
+    with pytest.raises(DyngsError, match=r"intrinsics: focal lengths must be positive.*camera 1 has"):
+        verb(scene.gaussians, scene.cameras)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_names_what_is_not_finite(verb: Callable[..., object]) -> None:
+    scene = random_scene()
+    scene.means[3, 1] = math.nan
+    with pytest.raises(DyngsError, match=r"means holds 1 NaN or infinite value\(s\) in 1 of 20 rows"):
+        verb(scene.gaussians, scene.cameras)
+    skipped = verb(scene.gaussians, scene.cameras, RenderOptions(nonfinite="skip"))
+    found = skipped.rgb if isinstance(skipped, Rendering) else skipped
+    assert isinstance(found, Tensor)
+    assert found.isfinite().all()
+
+
+@pytest.mark.parametrize("shape", [(2,), (4,), (3, 3), (1, 3), (2, 1), (2, 29, 37, 3), ()])
+def test_background_and_probe_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    scene = random_scene()
+    with pytest.raises(DyngsError, match=r"background must be \(3,\) or \(2, 3\), got"):
+        render(scene.gaussians, scene.cameras, background=torch.zeros(shape))
+    with pytest.raises(DyngsError, match=r"probe must be \(2, 20, 4\), got"):
+        render(scene.gaussians, scene.cameras, probe=torch.zeros(shape))

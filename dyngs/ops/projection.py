@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.options import check_near_and_far, check_number
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,9 @@ class ProjectionOptions:
         alpha_min: pixels with less alpha are not drawn; sets the extent of a splat.
         radius_clip: splats with no larger half extent are culled, px.
         antialiased: the extent uses the compensated opacity.
+
+    Raises:
+        DyngsError: a negative number or NaN, or ``far`` not beyond ``near``.
     """
 
     eps2d: float = 0.3
@@ -29,6 +33,12 @@ class ProjectionOptions:
     alpha_min: float = 1 / 255
     radius_clip: float = 0.0
     antialiased: bool = False
+
+    def __post_init__(self) -> None:
+        check_number("eps2d", self.eps2d, 0)
+        check_near_and_far(self.near, self.far)
+        check_number("alpha_min", self.alpha_min, 0, 1)
+        check_number("radius_clip", self.radius_clip, 0)
 
 
 @dataclass(frozen=True)

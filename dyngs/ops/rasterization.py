@@ -10,11 +10,14 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError
 from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.options import check_number
 from dyngs.ops.projection import Projection
 
 TILE = 16
 MAX_CHANNELS = 40
 MAX_ENTRIES = 2**31 - 1
+LARGEST_ALPHA = 1 - 2.0**-20
+"""Beyond it nothing of what lies behind would be left in float32, from which the backward pass restores the rest."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,9 @@ class BlendOptions:
         transmittance_min: a pixel stops before the Gaussian that would take it below.
         absgrad: also sum the absolute gradients of the 2D means into the probe.
         max_entries: refuse renders with more (Gaussian, tile) pairs, before allocating them.
+
+    Raises:
+        DyngsError: numbers out of [0, 1] or NaN, an ``alpha_max`` that float32 cannot tell from 1, a negative count.
     """
 
     alpha_min: float = 1 / 255
@@ -34,6 +40,12 @@ class BlendOptions:
     transmittance_min: float = 1e-4
     absgrad: bool = False
     max_entries: int = MAX_ENTRIES
+
+    def __post_init__(self) -> None:
+        check_number("alpha_min", self.alpha_min, 0, 1)
+        check_number("alpha_max", self.alpha_max, 0, LARGEST_ALPHA)
+        check_number("transmittance_min", self.transmittance_min, 0, 1)
+        check_number("max_entries", self.max_entries, 0)
 
     @property
     def thresholds(self) -> list[float]:
