@@ -1,6 +1,9 @@
-// The extension module. The whole of it is compiled once per instruction set, as _core_v2, _core_v3, _core_v4: separate
-// shared objects, so that no inline function compiled for a newer processor can be linked into an older one's code.
+// The extension module, one per instruction set: _core_v2, _core_v3, _core_v4, the baseline's bindings with the kernels of
+// that set. Separate shared objects, so that no inline function compiled for a newer processor can be linked into an older
+// one's code.
 #include <nanobind/nanobind.h>
+
+#include "core/isa.hpp"
 
 namespace nb = nanobind;
 
@@ -17,10 +20,11 @@ namespace {
 
 // The newest of the x86-64 levels compiled here that this processor runs. Asked of the baseline module only.
 const char* best_isa() {
-#if defined(__x86_64__)
-  __builtin_cpu_init();
-  if (__builtin_cpu_supports("x86-64-v4")) return "v4";
-  if (__builtin_cpu_supports("x86-64-v3")) return "v3";
+#if defined(DYNGS_HAS_v4)
+  if (runs_v4()) return "v4";
+#endif
+#if defined(DYNGS_HAS_v3)
+  if (runs_v3()) return "v3";
 #endif
   return "v2";
 }

@@ -1,22 +1,15 @@
 // The formulas of csrc/math: every hand-derived vjp against central differences in double, the forward passes against
 // plain formulas in long double, and packets against scalars. Prints what failed; the exit code is 1 if anything did.
-#include <cstdio>
-#include <functional>
-#include <random>
-#include <string>
-#include <vector>
-
 #include "math/harmonics.hpp"
 #include "math/packet.hpp"
 #include "math/projection.hpp"
+#include "tests/check.hpp"
 
 namespace {
 
 using namespace dyngs;
-using Values = std::vector<double>;
+using namespace check;
 using Function = std::function<Values(const Values&)>;
-
-int failures = 0;
 
 void expect_near(const std::string& what, double got, double wanted, double tolerance) {
   if (std::abs(got - wanted) <= tolerance * std::max(1.0, std::abs(wanted))) return;  // false for NaN
@@ -24,19 +17,9 @@ void expect_near(const std::string& what, double got, double wanted, double tole
   ++failures;
 }
 
-std::mt19937_64 generator(7);
-
-double uniform(double lo, double hi) { return std::uniform_real_distribution<double>(lo, hi)(generator); }
-
-Values uniforms(int n, double lo, double hi) {
-  Values v(n);
-  for (double& x : v) x = uniform(lo, hi);
-  return v;
-}
-
 // `gradient` must be the gradient of <cotangent, f(x)>.
-void expect_gradient(const std::string& what, const Function& f, const Values& x, const Values& cotangent,
-                     const Values& gradient) {
+void expect_vjp(const std::string& what, const Function& f, const Values& x, const Values& cotangent,
+                const Values& gradient) {
   const auto scalar = [&](const Values& at) {
     const Values y = f(at);
     double sum = 0;
@@ -81,7 +64,7 @@ void test_normalize() {
       for (double& e : v) e *= size;
       return f(v);
     };
-    expect_gradient("normalize_vjp", of_scaled, scaled, g, gradient);
+    expect_vjp("normalize_vjp", of_scaled, scaled, g, gradient);
   }
 }
 
@@ -106,7 +89,7 @@ void test_rotation_matrix() {
   const auto f = [](const Values& v) { return values(rotation_matrix(quat(v))); };
   Mat3<double> cotangent;
   for (int i = 0; i < 9; ++i) cotangent.m[i / 3][i % 3] = g[i];
-  expect_gradient("rotation_matrix_vjp", f, x, g, values(rotation_matrix_vjp(quat(x), cotangent)));
+  expect_vjp("rotation_matrix_vjp", f, x, g, values(rotation_matrix_vjp(quat(x), cotangent)));
 }
 
 // Inputs of project() in a row: centre in the camera 0-2, quaternion 3-6, scales 7-9, camera rotation 10-18.
@@ -159,7 +142,7 @@ void test_project_vjp(double eps, bool outside) {
   for (double e : values(d.unit)) gradient.push_back(e);
   for (double e : {d.scale.x, d.scale.y, d.scale.z}) gradient.push_back(e);
   for (const auto& row : d.view) gradient.insert(gradient.end(), row, row + 3);
-  expect_gradient("project_vjp eps " + std::to_string(eps) + (outside ? " clamped" : ""), f, x, g, gradient);
+  expect_vjp("project_vjp eps " + std::to_string(eps) + (outside ? " clamped" : ""), f, x, g, gradient);
 }
 
 // The conic's factor against a covariance inverted in long double.
@@ -207,7 +190,7 @@ void test_harmonics() {
     };
     Values gradient(3);
     sh_basis_vjp(degree, x[0], x[1], x[2], g.data(), gradient[0], gradient[1], gradient[2]);
-    expect_gradient("sh_basis_vjp degree " + std::to_string(degree), f, x, g, gradient);
+    expect_vjp("sh_basis_vjp degree " + std::to_string(degree), f, x, g, gradient);
   }
 }
 
@@ -255,6 +238,7 @@ void test_exp2() {
 }  // namespace
 
 int main() {
+  skip_unless_supported();
   for (int trial = 0; trial < 20; ++trial) {
     test_normalize();
     test_rotation_matrix();
@@ -267,6 +251,5 @@ int main() {
   test_packets<double>(1e-13);  // same formulas, other order of fused multiply-adds
   test_packets<float>(2e-5);    // float rounding, 6e-8, times the condition of the formulas
   test_exp2();
-  std::printf(failures == 0 ? "all passed\n" : "%d checks failed\n", failures);
-  return failures == 0 ? 0 : 1;
+  return report();
 }

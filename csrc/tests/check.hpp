@@ -1,0 +1,110 @@
+// What the C++ tests share: random inputs that are the same on every machine, comparisons that print what failed, and
+// slopes by central differences.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <functional>
+#include <random>
+#include <string>
+#include <vector>
+
+#include "core/isa.hpp"
+
+namespace check {
+
+using Values = std::vector<double>;
+
+inline int failures = 0;
+// Not a global: nothing may run before skip_unless_supported().
+inline std::mt19937_64& generator() {
+  static std::mt19937_64 state(7);
+  return state;
+}
+
+inline double uniform(double lo, double hi) { return std::uniform_real_distribution<double>(lo, hi)(generator()); }
+
+// Rounded to float, so that the float and the double kernels are given the same numbers.
+inline Values uniforms(int64_t n, double lo, double hi) {
+  Values v(n);
+  for (double& x : v) x = static_cast<float>(uniform(lo, hi));
+  return v;
+}
+
+template <class S, class T>
+std::vector<S> as(const std::vector<T>& v) {
+  std::vector<S> to(v.size());
+  for (size_t i = 0; i < v.size(); ++i) to[i] = static_cast<S>(v[i]);
+  return to;
+}
+
+inline void expect(bool holds, const std::string& what) {
+  if (holds) return;
+  std::printf("FAILED %s\n", what.c_str());
+  ++failures;
+}
+
+// The largest difference is at most `tolerance` times the largest magnitude wanted; false for NaN.
+template <class A, class B>
+void expect_close(const std::string& what, const std::vector<A>& got, const std::vector<B>& wanted, double tolerance) {
+  double error = 0, largest = 0;
+  for (size_t i = 0; i < got.size(); ++i) {
+    const double difference = std::abs(static_cast<double>(got[i]) - static_cast<double>(wanted[i]));
+    if (!(difference <= error)) error = difference;
+    largest = std::max(largest, std::abs(static_cast<double>(wanted[i])));
+  }
+  if (got.size() == wanted.size() && largest > 0 && error <= tolerance * largest) return;
+  std::printf("FAILED %s: largest error %.3g, largest value %.3g, tolerance %.1g\n", what.c_str(), error, largest, tolerance);
+  ++failures;
+}
+
+template <class T>
+void expect_same_bits(const std::string& what, const std::vector<T>& a, const std::vector<T>& b) {
+  expect(a.size() == b.size() && std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) == 0, what);
+}
+
+// `gradient` is that of `scalar` at x: `count` entries of it, spread over the array, against central differences with
+// steps of `h`, to `tolerance` of the largest gradient.
+inline void expect_gradient(const std::string& what, const std::function<double(const Values&)>& scalar, const Values& x,
+                            const Values& gradient, double h, double tolerance, int64_t count = 12) {
+  const int64_t n = static_cast<int64_t>(x.size());
+  Values got, slopes;
+  for (int64_t k = 0; k < std::min(n, count); ++k) {
+    const int64_t i = n <= count ? k : (k * n) / count + (k * 7) % (n / count);
+    Values up = x, down = x;
+    up[i] += h, down[i] -= h;
+    got.push_back(gradient[i]);
+    slopes.push_back((scalar(up) - scalar(down)) / (2 * h));
+  }
+  expect_close(what, got, slopes, tolerance);
+}
+
+inline double dot(const Values& a, const Values& b) {
+  double sum = 0;
+  for (size_t i = 0; i < a.size(); ++i) sum += a[i] * b[i];
+  return sum;
+}
+
+// Ends the program with the code that CTest knows for "skipped" where the processor lacks what it was compiled for.
+inline void skip_unless_supported() {
+#if defined(DYNGS_NEEDS_v4)
+  const bool runs = dyngs::runs_v4();
+#elif defined(DYNGS_NEEDS_v3)
+  const bool runs = dyngs::runs_v3();
+#else
+  const bool runs = true;
+#endif
+  if (runs) return;
+  std::printf("skipped: this processor lacks the instructions\n");
+  std::exit(77);
+}
+
+inline int report() {
+  std::printf(failures == 0 ? "all passed\n" : "%d checks failed\n", failures);
+  return failures == 0 ? 0 : 1;
+}
+
+}  // namespace check
