@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from motion_files import Clip, as_local, glb_of, pelvis_path, random_motion, skeleton, tiny_body
+from refused import error_line
 
 from dyngs.cli import data, main
 from dyngs.config import DataConfig
@@ -152,3 +153,18 @@ def test_a_person_is_refused_in_one_line(words: str, part: str, tmp_path: Path, 
 
 def test_the_scene_is_listed() -> None:
     assert "human" in data.SYNTHETIC_SCENES
+
+
+def test_inspect_takes_keys_of_data(tmp_path: Path, capsys: PrintedOutput) -> None:
+    root = tmp_path / "capture"
+    assert main(["data", "synth", "still", str(root), "--size", "8", "--views", "4"]) == 0
+    picture = next((root / "train").iterdir())
+    picture.rename(tmp_path / "own.png")
+    picture.symlink_to(tmp_path / "own.png")
+    capsys.readouterr()
+    assert "set data.follow_links=true" in error_line(capsys, "data", "inspect", str(root))
+    assert main(["data", "inspect", str(root), "--deep", "data.follow_links=true"]) == 0
+    assert "a link that leads out of the capture" in capsys.readouterr().out
+    assert "give keys of data" in error_line(capsys, "data", "inspect", str(root), "train.steps=3")
+    assert "give keys of data" in error_line(capsys, "data", "inspect", str(root), "data.root=elsewhere")
+    assert "did you mean" in error_line(capsys, "data", "inspect", str(root), "data.follow_link=true")

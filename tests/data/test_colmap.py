@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import shutil
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,11 @@ import pytest
 import torch
 from tiny_captures import opengl_pose, random_pixels, write_colmap, write_picture
 
+from dyngs.config import DataConfig
 from dyngs.data.colmap import is_colmap, pinhole_and_lens, read_colmap
 from dyngs.data.colmap_check import check_model_file
 from dyngs.data.lens import distort
+from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 
 MODELS = {
@@ -185,3 +188,22 @@ def test_cup(shared: Path) -> None:
     pixels = on_camera @ view.intrinsics.T
     errors = np.linalg.norm(pixels[:, :2] / pixels[:, 2:] - [point.xy for point in seen], axis=1)
     assert np.median(errors) < 1
+
+
+@pytest.mark.parametrize("extension", ["bin", "txt"])
+def test_names_in_latin_1_are_one_line(tmp_path: Path, extension: str) -> None:
+    root = write_colmap(tmp_path, extension)
+    path = root / f"sparse/0/images.{extension}"
+    path.write_bytes(path.read_bytes().replace(b"left/01.jpg", b"l\xe9ft/01.jpg"))
+    with pytest.raises(DyngsError, match=r"sparse/0\S*: cannot be read \(.*(UTF-8|utf-8)"):
+        read_capture(DataConfig(root=root))  # type: ignore[call-arg]
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_counts_that_no_file_has(colmap_root: Path, name: str) -> None:
+    path = colmap_root / f"sparse/0/{name}.bin"
+    data = path.read_bytes()
+    for count in (2**63, 2**64 - 1, 2**31):
+        path.write_bytes(struct.pack("<Q", count) + data[8:])
+        with pytest.raises(DyngsError, match=rf"{name}\.bin: the COLMAP file is truncated"):
+            read_colmap(colmap_root)

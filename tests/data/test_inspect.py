@@ -240,3 +240,30 @@ def test_drawing_shows_cameras_and_points(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="usable pose"):
         draw_cameras(lost, tmp_path / "lost.png")
     assert not (tmp_path / "lost.png").exists()
+
+
+def test_links_that_leave_the_capture_are_reported(tmp_path: Path) -> None:
+    """Also those that no picture needs; and a picture that lies outside is the first problem."""
+    root = tmp_path / "capture"
+    write_still_capture(root, StillOptions(size=8, num_train=4))
+    assert inspect_capture(root).ok
+    (root / "notes").symlink_to(tmp_path)
+    report = inspect_capture(root)
+    assert report.capture is not None
+    assert report.problems == (f"{root / 'notes'}: a link that leads out of the capture, to {tmp_path.resolve()}",)
+    picture = next((root / "train").iterdir())
+    picture.rename(tmp_path / "own.png")
+    picture.symlink_to(tmp_path / "own.png")
+    report = inspect_capture(root)
+    assert report.capture is None
+    assert "lies outside the capture" in report.problems[0]
+    assert any(f"{picture}: a link that leads out" in line for line in report.problems[1:])
+    followed = inspect_capture(DataConfig(root=root, follow_links=True))
+    assert followed.capture is not None
+
+
+def test_large_pictures_are_reported_by_a_deep_look(tmp_path: Path) -> None:
+    root = tmp_path / "capture"
+    write_still_capture(root, StillOptions(size=100, num_train=4))
+    report = inspect_capture(DataConfig(root=root, max_megapixels=0.005), deep=True)
+    assert any("100x100 pixels are 0.01 megapixels" in line for line in report.problems)

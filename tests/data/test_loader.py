@@ -209,3 +209,10 @@ def test_silhouettes_become_alpha(tmp_path: Path) -> None:
     (tmp_path / "person.png").unlink()
     with pytest.raises(DyngsError, match=r"3 of 6 pictures are missing, the first is .*person\.png"):
         loader(tuple(views))
+
+
+def test_pictures_beyond_the_limit_are_refused_at_the_beginning(blender_root: Path) -> None:
+    views = views_of(blender_root)
+    with pytest.raises(DyngsError, match=r"12x8 pixels are 9\.6e-05 megapixels, but data\.max_megapixels is 9e-05"):
+        PictureLoader(views, DataConfig(root=blender_root, max_megapixels=9e-5))
+    assert len(PictureLoader(views, DataConfig(root=blender_root, max_megapixels=1e-4))[0].rgb_premultiplied) == 8

@@ -274,3 +274,47 @@ def test_npz(tmp_path: Path) -> None:
         with pytest.raises(DyngsError, match=r"a\.npz: cannot be read") as caught:
             read_npz(path, ("poses",))
         assert "\n" not in str(caught.value)
+
+
+def test_hdf5_that_leads_to_another_file(hdf5: Path) -> None:
+    """By a link, a virtual data set or external storage: none is followed."""
+    h5py = pytest.importorskip("h5py")
+    private = hdf5.with_name("private.bin")
+    private.write_bytes(bytes(range(6)))
+    with h5py.File(hdf5, "a") as file:
+        file["linked"] = h5py.ExternalLink("m2.hdf5", "masks")
+        file["soft"] = h5py.SoftLink("/linked")
+        file.create_dataset("outside", (1, 2, 3), np.uint8, external=[(str(private), 0, 6)])
+        layout = h5py.VirtualLayout((5, 2, 3), np.uint8)
+        layout[:] = h5py.VirtualSource("m2.hdf5", "masks", (5, 2, 3))
+        file.create_virtual_dataset("virtual", layout)
+    hdf5.with_name("m2.hdf5").write_bytes(hdf5.read_bytes())
+    for key in ("linked", "soft", "outside", "virtual"):
+        with pytest.raises(DyngsError, match=f"the data set '{key}' is missing"):
+            read_hdf5(hdf5, key)
+
+
+def test_hdf5_that_would_fill_the_memory(hdf5: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(hdf5, "a") as file:
+        file.create_dataset("empty", (10**6, 10**6), np.float32)
+        file.create_dataset("row", (2, 10**5, 10**5), np.uint8, chunks=(1, 1000, 1000), compression="gzip")
+        file.create_dataset("chunk", (200, 1000, 1000), np.uint8, chunks=(200, 1000, 1000), compression="gzip")
+    for key, rows in (("empty", ...), ("row", 0), ("chunk", 0)):
+        with pytest.raises(DyngsError, match=r"m\.hdf5: .*data\.max_megapixels is 100"):
+            read_hdf5(hdf5, key, rows)
+    assert hdf5_length(hdf5, "empty") == 10**6
+
+
+def test_damaged_hdf5_is_read_or_refused_in_one_line(hdf5: Path) -> None:
+    data, lines = hdf5.read_bytes(), []
+    for seed in range(300):
+        rng, changed = np.random.default_rng(seed), bytearray(data)
+        for _ in range(rng.choice([1, 4, 16])):
+            changed[int(rng.integers(len(changed)))] = rng.integers(256)
+        hdf5.write_bytes(changed)
+        try:
+            read_hdf5(hdf5, "masks", 3)
+        except DyngsError as error:
+            lines.append(str(error))
+    assert [line for line in lines if str(hdf5) not in line or "\n" in line] == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -107,3 +108,20 @@ def test_bad_requests_are_one_line(tmp_path: Path) -> None:
         estimate_poses(tmp_path / "text.mp4", tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["photos", "text.mp4"]
+
+
+def test_photos_that_are_links_are_followed_only_if_asked(tmp_path: Path) -> None:
+    """What they lead to would be copied into a folder that is given away."""
+    photos = tmp_path / "photos"
+    for i in range(3):
+        write_image(photos / f"{i}.png", np.zeros((8, 12, 3), np.uint8))
+    (photos / "0.png").rename(tmp_path / "private.png")
+    (photos / "0.png").symlink_to("../private.png")
+    with pytest.raises(DyngsError, match=r"0\.png: leads to .*private\.png.*data\.follow_links=true"):
+        estimate_poses(photos, tmp_path / "out", FAST)
+    with pytest.raises(DyngsError, match="no poses could be found"):
+        estimate_poses(photos, tmp_path / "out", replace(FAST, follow_links=True))
+    assert (tmp_path / "private.png").is_file()
+    with pytest.raises(DyngsError, match=r"12x8 .*data\.max_megapixels is 9e-05"):
+        estimate_poses(photos, tmp_path / "out", replace(FAST, follow_links=True, max_megapixels=9e-5))
+    assert not (tmp_path / "out").exists()
