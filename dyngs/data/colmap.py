@@ -138,7 +138,7 @@ def _stored_size(path: Path) -> tuple[int, int] | None:
 def _find_masks(folder: Path) -> dict[str, Path]:
     """Masks by their path below ``folder``, both with and without the last extension."""
     found: dict[str, Path] = {}
-    for path in sorted(folder.rglob("*")) if folder.is_dir() else ():
+    for path in sorted(inside(folder).rglob("*")) if folder.is_dir() else ():
         if path.suffix.lower() in SUFFIXES:
             relative = path.relative_to(folder)
             found[relative.as_posix()] = path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,9 +48,10 @@ def read_points(path: Path) -> PointCloud:
         raise DyngsError(f"{path}: no such point file; restore it or remove ply_file_path")
     # Out of an open file, because textures that it names would be looked for beside one with a path.
     with reading(path, "it must be a .ply file of points; export it again"), path.open("rb") as file:
-        loaded = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
-        xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)  # type: ignore[union-attr]
-        colours = loaded.colors if isinstance(loaded, trimesh.PointCloud) else loaded.visual.vertex_colors  # type: ignore
+        loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
+        xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        own = isinstance(loaded, trimesh.PointCloud)
+        colours = loaded.colors if own else getattr(loaded.visual, "vertex_colors", None)
         rgb = np.full((len(xyz), 3), 128, np.uint8)
         if colours is not None and len(colours) == len(xyz):
             rgb = np.ascontiguousarray(np.asarray(colours)[:, :3].astype(np.uint8))

@@ -171,3 +171,10 @@ def test_sizes() -> None:
         check_size(Path("a.exr"), 1000, 1000, 1000)
     with pictures_up_to(400):
         check_size(Path("a.png"), 20_000, 20_000)
+
+
+def test_a_folder_of_masks_that_is_a_link_is_not_searched(colmap_root: Path) -> None:
+    """It would be looked through for pictures, however large."""
+    (colmap_root / "masks").symlink_to("/")
+    with pytest.raises(DyngsError, match=r"masks: leads to /, which lies outside the capture"):
+        read(colmap_root)
