@@ -9,7 +9,7 @@ from dyngs.data.blender import read_blender
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.people import BodyFrames, body_frames, read_npz, rows_of
 from dyngs.data.transforms import read_frame_file, read_views
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
 
 _TRAIN = "body_train.npz"
 _NEW_POSES = cast(Split, "pose")
@@ -31,6 +31,11 @@ def read_body_json(root: Path) -> Capture:
     Raises:
         DyngsError: missing or bad parameters, and see ``dyngs.data.transforms.read_views``.
     """
+    with reading(root):
+        return _read(root)
+
+
+def _read(root: Path) -> Capture:
     capture = read_blender(root)
     splits, warnings = dict(capture.splits), capture.warnings
     path = root / "transforms_pose.json"

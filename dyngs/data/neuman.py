@@ -50,6 +50,11 @@ def read_neuman(root: Path) -> Capture:
     Raises:
         DyngsError: anything missing, broken or inconsistent; names the file.
     """
+    with reading(root):
+        return _read(root)
+
+
+def _read(root: Path) -> Capture:
     capture = read_colmap(root)
     posed = sorted(capture.splits["train"], key=lambda view: view.image_path.name)
     names = [view.image_path.name for view in posed]
@@ -115,7 +120,7 @@ def _per_picture(path: Path, key: str, value: object, count: int) -> np.ndarray:
 
 def _number(root: Path, name: str) -> int:
     digits = re.findall(r"\d+", Path(name).stem)
-    if not digits:
+    if not digits or len(digits[-1]) > 15:
         raise DyngsError(f"{root / 'images' / name}: no frame number in its name; call it 00000.png or the like")
     return int(digits[-1])
 

@@ -334,10 +334,6 @@ def _mean_row(where: Path, name: str, value: object, frames: Sequence[int]) -> n
     return _rows(where, name, value, frames).mean(axis=0)
 
 
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split())[:100] or type(error).__name__
-
-
 def _hdf5(path: Path, key: str, rows: int | EllipsisType | None) -> Any:
     """Rows of a data set; its shape where ``rows`` is None."""
     try:
@@ -354,6 +350,8 @@ def _hdf5(path: Path, key: str, rows: int | EllipsisType | None) -> Any:
             raise DyngsError(f"{path}: the data set '{key}' is missing; export it again")
         if rows is None:
             return found.shape
+        if found.dtype.kind not in "biuf":
+            raise DyngsError(f"{path}: '{key}' must hold numbers; export it again")
         shape = found.shape if isinstance(rows, EllipsisType) else found.shape[1:]
         check_size(path, max(math.prod(shape), math.prod(found.chunks or ())), max(1, found.dtype.itemsize // 4))
         return found[rows]

@@ -26,7 +26,7 @@ from dyngs.data.pickles import read_pickle
 from dyngs.data.poses import inverse_rigid
 from dyngs.data.trust import inside
 from dyngs.data.video import VIDEO_SUFFIXES
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
 
 CAMERA = "camera.pkl"
 MASK_FILE = "masks.hdf5"
@@ -48,6 +48,11 @@ def read_people_snapshot(root: Path) -> Capture:
     Raises:
         DyngsError: h5py is not installed; anything missing, broken or inconsistent; names the file.
     """
+    with reading(root):
+        return _read(root)
+
+
+def _read(root: Path) -> Capture:
     camera = open_camera((video := _video(root)).stem, video)
     body = _body(root / POSE_FILE)
     usable = set(body.frames) & set(range(hdf5_length(root / MASK_FILE, MASKS)))

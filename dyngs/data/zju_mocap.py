@@ -26,7 +26,7 @@ from dyngs.data.pickles import read_pickle, read_pickled_array
 from dyngs.data.poses import checked_pose, inverse_rigid
 from dyngs.data.transforms import Frame, FrameFile, read_views
 from dyngs.data.trust import inside
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
 
 ANNOTATIONS = "annots.npy"
 CAMERAS = "cameras.pkl"
@@ -76,6 +76,11 @@ def read_zju_mocap(root: Path) -> Capture:
     Raises:
         DyngsError: anything missing, broken or inconsistent; names the file.
     """
+    with reading(root):
+        return _read(root)
+
+
+def _read(root: Path) -> Capture:
     if (root / ANNOTATIONS).is_file():
         path, shots = root / ANNOTATIONS, _annotated_shots(root / ANNOTATIONS)
         found, body = _params_per_file(root, {shot.frame for shot in shots})
@@ -229,7 +234,7 @@ def _mask(root: Path, file: str, folders: Sequence[str]) -> Path | None:
 def _frame_number(path: Path, name: str) -> int:
     """The number in a picture's name: ``000123.jpg``, ``frame_000123`` or ``Camera (1)_0123_2019-08-23_16.592.jpg``."""
     stem = PurePosixPath(name.replace("\\", "/")).name
-    found = re.search(r"\)_(\d+)", stem) or re.search(r"(\d+)(?:\.\w+)?$", stem)
+    found = re.search(r"\)_(\d{1,15})(?!\d)", stem) or re.search(r"(?<!\d)(\d{1,15})(?:\.\w+)?$", stem)
     if not found:
         raise DyngsError(f"{path}: no frame number in the name {name!r:.80}; call the picture 000000.jpg or the like")
     return int(found[1])

@@ -23,7 +23,7 @@ import torch
 
 from dyngs.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
 from dyngs.data.write import whole_file
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
 from dyngs.export.ply_header import PlyHeader, read_header
 from dyngs.gaussians import Gaussians
 
@@ -105,6 +105,13 @@ def read_ply(path: Path | str, *, nonfinite: Literal["error", "skip"] = "error")
             count has been compared with the size of the file.
     """
     path = Path(path)
+    with reading(path):
+        return _read(path, nonfinite)
+
+
+def _read(path: Path, nonfinite: Literal["error", "skip"]) -> SplatFile:
+    if path.exists() and not path.is_file():
+        raise DyngsError(f"{path}: cannot read: it is no file; name a 3DGS .ply")
     try:
         with open(path, "rb") as file:
             header = read_header(file, path)
@@ -221,7 +228,9 @@ def _described(gaussians: Gaussians, comments: tuple[str, ...], path: Path) -> S
         value = value.strip()
         if key == "SplatRenderMode":
             if value not in _MODE_OF_NAME:
-                raise DyngsError(f"{path}: SplatRenderMode {value!r} is not supported, only {', '.join(_MODE_OF_NAME)}")
+                raise DyngsError(
+                    f"{path}: SplatRenderMode {value!r:.60} is not supported, only {', '.join(_MODE_OF_NAME)}"
+                )
             mode = _MODE_OF_NAME[value]
         elif key == "antialiased" and value in ("0", "1"):
             mode = RasterizeMode.ANTIALIASED if value == "1" else RasterizeMode.CLASSIC
@@ -239,7 +248,7 @@ def _numbers(text: str, count: int, comment: str, path: Path) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count or not np.isfinite(values).all():
-        raise DyngsError(f"{path}: the header comment {comment!r} should hold {count} finite number(s)")
+        raise DyngsError(f"{path}: the header comment {comment!r:.80} should hold {count} finite number(s)")
     return values
 
 

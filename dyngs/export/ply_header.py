@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
+from dyngs.data.limits import require_at_most
 from dyngs.errors import DyngsError
 
 _SCALARS = {
@@ -23,6 +24,8 @@ _SCALARS = {
 }
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
 _MAX_HEADER_BYTES = 1 << 20
+_MOST_PROPERTIES = 4096
+_MOST_ELEMENTS = 256
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,7 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
     byte_order: str | None = None
     seen_format = False
     elements: list[_Element] = []
+    properties: list[dict[str, str]] = []  # of each element
     comments: list[str] = []
     while True:
         line = _next_line(file, path)
@@ -117,9 +121,14 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
         elif keyword == "format" and len(words) == 3 and words[1] in _BYTE_ORDERS and not seen_format:
             byte_order, seen_format = _BYTE_ORDERS[words[1]], True
         elif keyword == "element" and len(words) == 3 and _is_count(words[2]):
+            require_at_most(path, len(elements) + 1, _MOST_ELEMENTS, "elements of a .ply")
             elements.append(_Element(words[1], int(words[2])))
+            properties.append({})
         elif keyword == "property" and elements:
-            elements[-1] = _with_property(elements[-1], words, path)
+            if not _is_list(words):
+                _add_property(properties[-1], words, path)
+            elif not elements[-1].has_list:
+                elements[-1] = replace(elements[-1], has_list=True)
         elif keyword:
             raise DyngsError(f"{path}: bad .ply header line {_shown(line)}")
     if not seen_format:
@@ -128,7 +137,8 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
     if "vertex" not in names:
         raise DyngsError(f"{path}: has no vertices, so it is not a 3DGS .ply")
     upto = names.index("vertex") + 1
-    return PlyHeader(byte_order, tuple(elements[:upto]), tuple(comments), file.tell())
+    whole = (replace(e, properties=tuple(own.items())) for e, own in zip(elements[:upto], properties, strict=False))
+    return PlyHeader(byte_order, tuple(whole), tuple(comments), file.tell())
 
 
 def _next_line(file: BinaryIO, path: Path) -> str:
@@ -140,15 +150,18 @@ def _next_line(file: BinaryIO, path: Path) -> str:
     return raw.decode("utf-8", errors="replace").strip()
 
 
-def _with_property(element: _Element, words: list[str], path: Path) -> _Element:
-    if len(words) == 5 and words[1] == "list":
-        return _Element(element.name, element.count, element.properties, has_list=True)
+def _is_list(words: list[str]) -> bool:
+    return len(words) == 5 and words[1] == "list"
+
+
+def _add_property(properties: dict[str, str], words: list[str], path: Path) -> None:
+    """Add what a line of the header says to the types by name."""
     if len(words) != 3 or words[1] not in _SCALARS:
         raise DyngsError(f"{path}: bad .ply header line {_shown(' '.join(words))}")
-    if any(name == words[2] for name, _ in element.properties):
-        raise DyngsError(f"{path}: the .ply header has the property {words[2]} twice")
-    properties = (*element.properties, (words[2], _SCALARS[words[1]]))
-    return _Element(element.name, element.count, properties, element.has_list)
+    if words[2] in properties:
+        raise DyngsError(f"{path}: the .ply header has the property {words[2]:.60} twice")
+    require_at_most(path, len(properties) + 1, _MOST_PROPERTIES, "properties of an element of a .ply")
+    properties[words[2]] = _SCALARS[words[1]]
 
 
 def _ascii_row(line: bytes, width: int, index: int, path: Path) -> list[float]:

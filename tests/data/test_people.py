@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from measured import cost_of
 from scipy.spatial.transform import Rotation
 from tiny_captures import random_pixels, write_picture
 
@@ -249,6 +250,43 @@ def test_bad_hdf5(hdf5: Path) -> None:
     with pytest.raises(DyngsError, match="must be a data set in an HDF5 file") as caught:
         read_hdf5(hdf5, "masks")
     assert "\n" not in str(caught.value)
+
+
+def test_hdf5_that_asks_for_much_or_lies_elsewhere(tmp_path: Path) -> None:
+    """A data set of 800 GB, of which nothing is there; one in another file; one of texts; a link."""
+    h5py: Any = pytest.importorskip("h5py")
+    path = tmp_path / "m.hdf5"
+    (tmp_path / "other").write_bytes(bytes(800))
+    with h5py.File(path, "w") as file:
+        file.create_dataset("huge", shape=(10**9, 100), chunks=(1000, 100), dtype="u1")
+        file.create_dataset("wide", shape=(2, 10**9), chunks=(1, 1000), dtype="u1")
+        file.create_dataset("other", shape=(100,), dtype="f8", external=[(str(tmp_path / "other"), 0, 800)])
+        file.create_dataset("text", data=["a", "b"])
+        file["linked"] = h5py.ExternalLink("n.hdf5", "huge")
+    lines = {
+        "huge": "data.max_megapixels is",
+        "other": "'other' is missing",
+        "text": "'text' must hold numbers",
+        "linked": "'linked' is missing",
+    }
+    for key, line in lines.items():
+        with pytest.raises(DyngsError, match=line):
+            read_hdf5(path, key)
+    with pytest.raises(DyngsError, match="data.max_megapixels is"):
+        read_hdf5(path, "wide", 1)
+    assert hdf5_length(path, "huge") == 10**9
+
+
+def test_texts_among_numbers(tmp_path: Path) -> None:
+    """NumPy would make each as long as the longest."""
+    shared: Any = [1.0] * 1000
+    shared[0] = "a" * 1_000_000
+
+    def read() -> None:
+        with pytest.raises(DyngsError, match="must hold"):
+            numbers_of("x", [shared, shared], None)
+
+    assert cost_of(read)[0] < 1e6
 
 
 def test_without_h5py_the_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from measured import cost_of
 
 from dyngs.conventions import RasterizeMode, num_sh_terms
 from dyngs.errors import DyngsError
@@ -211,6 +212,33 @@ def header_of(*lines: str) -> bytes:
 
 
 _NEEDED = [f"property float {name}" for name in plain_columns(make_gaussians(1, 0))]
+
+
+HOSTILE = {
+    "properties": (
+        ["element vertex 1", *(f"property float {i:x}" for i in range(50_000))],
+        "4,097 properties",
+    ),
+    "lists": (["element vertex 1", *_NEEDED, *["property list int int a"] * 40_000], "list properties"),
+    "elements": ([f"element {i:x} 0" for i in range(60_000)], "asks for 257 elements"),
+    "a comment": (["comment eps2d: " + "9 " * 400_000, "element vertex 1", *_NEEDED], "should hold 1 finite"),
+    "a name": (["element vertex 1", *["property float " + "a" * 400_000] * 2], "twice"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_headers_of_a_megabyte_cost_little(tmp_path, case) -> None:
+    lines, message = HOSTILE[case]
+    (tmp_path / "a.ply").write_bytes(header_of(*lines) + bytes(56))
+
+    def read() -> None:
+        with pytest.raises(DyngsError, match=message) as caught:
+            read_ply(tmp_path / "a.ply")
+        assert len(str(caught.value)) < 600
+
+    memory, seconds = cost_of(read)
+    assert memory < 60e6
+    assert seconds < 15
 
 
 @pytest.mark.parametrize(
