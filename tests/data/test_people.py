@@ -272,7 +272,7 @@ def test_hdf5_that_asks_for_much_or_lies_elsewhere(tmp_path: Path) -> None:
     for key, line in lines.items():
         with pytest.raises(DyngsError, match=line):
             read_hdf5(path, key)
-    with pytest.raises(DyngsError, match="data.max_megapixels is"):
+    with pytest.raises(DyngsError, match=r"data\.max_megapixels is"):
         read_hdf5(path, "wide", 1)
     assert hdf5_length(path, "huge") == 10**9
 
