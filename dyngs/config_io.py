@@ -7,9 +7,8 @@ rest. What was resolved is saved with every run and is all that later commands r
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
-from yaml.composer import ComposerError
 
 from dyngs.config import Config
 from dyngs.config_schema import (
@@ -30,14 +28,16 @@ from dyngs.config_schema import (
     section_class,
     section_classes,
 )
+from dyngs.config_yaml import Leaf, read_file, read_override, require_usable
 from dyngs.data.write import write_text
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, printable
 
 RESOLVED_NAME = "config.yaml"
 """Name of the resolved configuration inside a run folder."""
 
+MAX_WHOLE = 2**63 - 1
+"""The largest whole number of a configuration."""
 _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
-_EXACT_FLOAT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
 
 
 # ---------------------------------------------------------------------------------------------------- loading
@@ -133,102 +133,7 @@ def _packaged_presets() -> dict[str, Path]:
     return {f.stem: f for f in sorted(folder.glob("*.yaml"))} if folder else {}
 
 
-# ---------------------------------------------------------------------------------------------------- YAML text
-
-
-class _PresetLoader(yaml.SafeLoader):
-    """Safe YAML without aliases, and with ``1e-4`` read as the number that it is."""
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
-            raise ComposerError(None, None, "aliases (*name) are not allowed here", mark)
-        return super().compose_node(parent, index)
-
-
-_PresetLoader.add_implicit_resolver("tag:yaml.org,2002:float", _EXACT_FLOAT, list("-+.0123456789"))
-
-
-@dataclass(frozen=True)
-class _Leaf:
-    """One value of a file or an override: where it lies, what it is, how it was written and where."""
-
-    keys: tuple[str, ...]
-    value: Any
-    text: str
-    origin: str
-
-
-def _read_leaves(text: str, origin: str) -> list[_Leaf]:
-    """The values of a YAML mapping in file order; an empty section is a leaf of value None."""
-    loader = _PresetLoader(text)
-    try:
-        root = loader.get_single_node()
-        if root is None:
-            return []
-        if not isinstance(root, yaml.MappingNode):
-            raise DyngsError(f"{origin}: must be a mapping of sections (data:, train:, ...)")
-        return list(_walk(loader, root, (), origin))
-    except yaml.YAMLError as error:
-        raise DyngsError(_describe_yaml_error(error, origin)) from None
-    except RecursionError:
-        raise DyngsError(f"{origin}: nested too deeply for a configuration") from None
-    finally:
-        loader.dispose()
-
-
-def _walk(loader: yaml.SafeLoader, node: yaml.MappingNode, above: tuple[str, ...], origin: str) -> Iterator[_Leaf]:
-    seen: set[str] = set()
-    for key_node, value_node in node.value:
-        line = key_node.start_mark.line + 1
-        if not isinstance(key_node, yaml.ScalarNode):
-            raise DyngsError(f"{origin}:{line}: keys must be plain words")
-        key = key_node.value
-        if "." in key:
-            raise DyngsError(f"{origin}:{line}: {key!r} must be nested in YAML: {key.replace('.', ': {', 1)}: ...}}")
-        if key in seen:
-            raise DyngsError(f"{origin}:{line}: duplicate key {'.'.join((*above, key))}; keep one of the two")
-        seen.add(key)
-        if isinstance(value_node, yaml.MappingNode) and value_node.value:
-            yield from _walk(loader, value_node, (*above, key), origin)
-        else:
-            text = value_node.value if isinstance(value_node, yaml.ScalarNode) else ""
-            yield _Leaf((*above, key), loader.construct_object(value_node, deep=True), text, f"{origin}:{line}")
-
-
-def _describe_yaml_error(error: yaml.YAMLError, origin: str) -> str:
-    if isinstance(error, yaml.MarkedYAMLError):
-        mark = error.problem_mark or error.context_mark
-        problem = error.problem or error.context or "not valid YAML"
-        if "'\\t'" in problem:
-            problem = "a tab where YAML wants spaces; indent with spaces"
-        where = f":{mark.line + 1}" if mark is not None else ""
-        return f"{origin}{where}: not valid YAML: {problem}"
-    return f"{origin}: not valid YAML: {' '.join(str(error).split())}"
-
-
 # ---------------------------------------------------------------------------------------------------- layers
-
-
-def _read_override(text: str) -> list[_Leaf]:
-    """The values that an override sets: one, or those of a section that is given as a whole."""
-    key, equals, written = (part.strip() for part in text.partition("="))
-    keys = tuple(key.split("."))
-    if not equals or not all(re.fullmatch(r"\w+", k) for k in keys):
-        raise DyngsError(f"{text!r} is not an override; write section.key=value, for instance train.steps=2000")
-    loader = _PresetLoader(written)
-    try:
-        node = loader.get_single_node()
-        if isinstance(node, yaml.MappingNode) and not node.flow_style:
-            return [_Leaf(keys, written, written, text)]  # "10:", which only looks like a mapping
-        if isinstance(node, yaml.MappingNode) and node.value:
-            return [replace(leaf, origin=text) for leaf in _walk(loader, node, keys, text)]
-        value = None if node is None else loader.construct_object(node, deep=True)
-    except (yaml.YAMLError, RecursionError):
-        value = written  # a path or a name that happens not to be YAML
-    finally:
-        loader.dispose()
-    return [_Leaf(keys, value, written, text)]
 
 
 @dataclass
@@ -240,17 +145,11 @@ class _Layers:
     written: dict[tuple[str, ...], str] = field(default_factory=dict)
 
     def add_file(self, path: Path) -> None:
-        try:
-            text = path.read_text(encoding="utf-8")
-        except UnicodeDecodeError:
-            raise DyngsError(f"{path}: not a text file in UTF-8; give a YAML preset") from None
-        except OSError as error:
-            raise DyngsError(f"{path}: cannot be read ({error.strerror})") from None
-        for leaf in _read_leaves(text, str(path)):
+        for leaf in read_file(path):
             self._set(leaf)
 
     def add_overrides(self, overrides: Iterable[str]) -> None:
-        leaves = [leaf for text in overrides for leaf in _read_override(text)]
+        leaves = [leaf for text in overrides for leaf in read_override(text)]
         # what empties a section goes first, outer sections before inner ones
         for leaf in sorted(leaves, key=lambda o: (o.keys[-1] != "kind" and o.value != {}, len(o.keys))):
             if leaf.keys[-1] == "kind":
@@ -267,7 +166,8 @@ class _Layers:
             section.clear()
             self.origins = {k: v for k, v in self.origins.items() if k[: len(keys)] != keys}
 
-    def _set(self, leaf: _Leaf) -> None:
+    def _set(self, leaf: Leaf) -> None:
+        require_usable(leaf)
         keys, value, section = leaf.keys, leaf.value, self.tree
         for depth, key in enumerate(keys[:-1], start=1):
             inner = section.setdefault(key, {})
@@ -311,13 +211,25 @@ def _fill_in_kinds(section: type[BaseModel], node: dict[str, Any]) -> None:
 def _validate(layers: _Layers) -> Config:
     _fill_in_kinds(Config, layers.tree)
     try:
-        return Config.model_validate(layers.tree)
+        config = Config.model_validate(layers.tree)
+        _require_countable(config.model_dump(), (), layers)
+        return config
     except ValidationError as error:
         problems = sorted(error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden")
     if _take_as_text(layers, problems):
         return _validate(layers)
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     raise DyngsError(_explain(layers, problems[0]) + more)
+
+
+def _require_countable(section: dict[str, Any], above: tuple[str, ...], layers: _Layers) -> None:
+    """Nothing, if no whole number needs more than 64 bits. Raises DyngsError."""
+    for key, value in section.items():
+        keys = (*above, key)
+        if isinstance(value, dict):
+            _require_countable(value, keys, layers)
+        elif any(isinstance(x, int) and abs(x) > MAX_WHOLE for x in (value if isinstance(value, tuple) else (value,))):
+            raise DyngsError(f"{layers.origin_of(keys)}: {'.'.join(keys)} must be below 2^63, not {_shorten(value)}")
 
 
 def _take_as_text(layers: _Layers, problems: list[ErrorDetails]) -> bool:
@@ -352,7 +264,7 @@ def _explain(layers: _Layers, problem: ErrorDetails) -> str:
         allowed = f"one of {', '.join(choices)}"
     else:
         value, choices, allowed = layers.value_at(keys), choices_of(info.annotation), allowed_values(info)
-    close = get_close_matches(str(value), choices, n=1)
+    close = get_close_matches(value[:100], choices, n=1) if isinstance(value, str) else []
     hint = f"; did you mean {close[0]!r}?" if close else ""
     return f"{prefix}{dotted} must be {allowed}, not {_shorten(value)}{hint}"
 
@@ -372,8 +284,10 @@ def _explain_unknown(layers: _Layers, keys: tuple[str, ...]) -> str:
 
 
 def _shorten(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    try:
+        return printable(repr(value), 60)
+    except (ValueError, RecursionError):  # a number of more digits than Python writes
+        return "something very long"
 
 
 def _did_you_mean_key(keys: tuple[str, ...], section: type[BaseModel], inside: bool) -> str:

@@ -1,0 +1,206 @@
+"""YAML of presets and overrides as values with the places where they were written: one boundary for all that it raises.
+
+What YAML takes for a number, a date or the like and then cannot make one of (``2024-02-30``, ``0x_``, 5,000 digits) is
+the text that it was written as; the schema says what it must be.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+from yaml.composer import ComposerError
+from yaml.reader import ReaderError
+
+from dyngs.errors import DyngsError, printable, reason
+
+MAX_BYTES = 2**20
+"""Of a preset or an override; the longest that we know has 5 KB."""
+MAX_DEPTH = 40
+"""Of mappings and lists within each other; a configuration has 4."""
+_BITS = 63
+"""Of a whole number."""
+_SHOWN = 100
+"""Characters of an override that a message repeats."""
+_EXACT_FLOAT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One value of a file or an override: where it lies, what it is, how it was written and where."""
+
+    keys: tuple[str, ...]
+    value: Any
+    text: str
+    origin: str
+
+
+def read_file(path: Path) -> list[Leaf]:
+    """The values of a file in its order; an empty section is a leaf of value None.
+
+    Raises:
+        DyngsError: names the file, the line and what is wrong there.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise DyngsError(f"{path}: cannot be read ({error.strerror})") from None
+    if len(data) > MAX_BYTES:
+        raise DyngsError(f"{path}: is larger than {MAX_BYTES // 2**20} MiB, no configuration is; give a YAML preset")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise DyngsError(f"{path}: not a text file in UTF-8; give a YAML preset") from None
+    origin = str(path)
+    with _Text(text, origin) as loader:
+        root = loader.get_single_node()
+        if root is None:
+            return []
+        if not isinstance(root, yaml.MappingNode):
+            raise DyngsError(f"{origin}: must be a mapping of sections (data:, train:, ...)")
+        return list(_walk(loader, root, (), origin, lines=True))
+
+
+def read_override(text: str) -> list[Leaf]:
+    """The values that ``section.key=value`` sets: one, or those of a section that is given as a whole.
+
+    Raises:
+        DyngsError: it is no override, or its value holds the same key twice and the like.
+    """
+    key, equals, written = (part.strip() for part in text.partition("="))
+    keys, origin = tuple(key.split(".")), printable(text, _SHOWN)
+    if not equals or not all(re.fullmatch(r"\w+", k) for k in keys):
+        shown = printable(repr(text), _SHOWN)
+        raise DyngsError(f"{shown} is not an override; write section.key=value, for instance train.steps=2000")
+    if len(written) > MAX_BYTES:
+        raise DyngsError(f"{origin}: has {len(written)} characters; no value is as long")
+    try:
+        with _Text(written, origin) as loader:
+            node = loader.get_single_node()
+            if isinstance(node, yaml.MappingNode) and not node.flow_style:
+                return [Leaf(keys, written, written, origin)]  # "10:", which only looks like a mapping
+            if isinstance(node, yaml.MappingNode) and node.value:
+                return [replace(leaf, origin=origin) for leaf in _walk(loader, node, keys, origin)]
+            value = None if node is None else loader.construct_object(node, deep=True)  # type: ignore[no-untyped-call]
+    except _NotYaml:
+        value = written  # a path or a name that happens not to be YAML
+    return [Leaf(keys, value, written, origin)]
+
+
+class _NotYaml(DyngsError):
+    """What YAML itself cannot read, other than what we do not allow in it."""
+
+
+class _PresetLoader(yaml.SafeLoader):
+    """Safe YAML without aliases, of limited depth, and with ``1e-4`` read as the number that it is."""
+
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+        if self.check_event(yaml.AliasEvent):
+            raise ComposerError(None, None, "aliases (*name) are not allowed here", mark)
+        if self.depth > MAX_DEPTH:
+            raise ComposerError(None, None, "nested too deeply for a configuration", mark)
+        self.depth += 1
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self.depth -= 1
+
+    def fetch_flow_collection_start(self, TokenClass: Any) -> None:
+        if self.flow_level > MAX_DEPTH:  # before composing: thousands of brackets take the scanner seconds
+            raise ComposerError(None, None, "nested too deeply for a configuration", self.get_mark())
+        super().fetch_flow_collection_start(TokenClass)  # type: ignore[no-untyped-call]
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """What a node says; the text of a scalar that is not what it looks like, or of a number that is too large."""
+        if not isinstance(node, yaml.ScalarNode):
+            return super().construct_object(node, deep)  # type: ignore[no-untyped-call]
+        try:
+            value = super().construct_object(node, deep)  # type: ignore[no-untyped-call]
+        except Exception:  # of int(), date() and the like, which YAML passes on
+            return node.value
+        return node.value if isinstance(value, int) and value.bit_length() > _BITS else value
+
+
+_PresetLoader.add_implicit_resolver("tag:yaml.org,2002:float", _EXACT_FLOAT, list("-+.0123456789"))
+
+
+class _Text:
+    """A block that reads ``text`` with a loader; whatever YAML raises there is one line."""
+
+    def __init__(self, text: str, origin: str) -> None:
+        self._text, self._origin = text, origin
+        self._loader: _PresetLoader | None = None
+
+    def __enter__(self) -> _PresetLoader:
+        try:
+            self._loader = _PresetLoader(self._text)
+        except yaml.YAMLError as error:
+            raise self._told(error) from None
+        return self._loader
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if self._loader is not None:
+            self._loader.dispose()
+        if isinstance(error, Exception) and not isinstance(error, DyngsError):
+            raise self._told(error) from error
+
+    def _told(self, error: Exception) -> _NotYaml:
+        if isinstance(error, RecursionError):
+            return _NotYaml(f"{self._origin}: nested too deeply for a configuration")
+        if isinstance(error, ReaderError):
+            line = self._text.count("\n", 0, error.position) + 1
+            return _NotYaml(
+                f"{self._origin}:{line}: not valid YAML: the control character {chr(error.character)!r}; remove it"
+            )
+        if isinstance(error, yaml.MarkedYAMLError):
+            mark = error.problem_mark or error.context_mark
+            problem = printable(error.problem or error.context or "not valid YAML", 2 * _SHOWN)
+            if "'\\t'" in problem:
+                problem = "a tab where YAML wants spaces; indent with spaces"
+            where = f":{mark.line + 1}" if mark is not None else ""
+            return _NotYaml(f"{self._origin}{where}: not valid YAML: {problem}")
+        return _NotYaml(f"{self._origin}: not valid YAML: {reason(error)}")
+
+
+def _walk(
+    loader: yaml.SafeLoader, node: yaml.MappingNode, above: tuple[str, ...], origin: str, *, lines: bool = False
+) -> Iterator[Leaf]:
+    seen: set[str] = set()
+    for key_node, value_node in node.value:
+        where = f"{origin}:{key_node.start_mark.line + 1}" if lines else origin
+        if not isinstance(key_node, yaml.ScalarNode):
+            raise DyngsError(f"{where}: keys must be plain words")
+        key = key_node.value
+        shown = printable(key, _SHOWN)
+        if "." in key:
+            raise DyngsError(f"{where}: {shown!r} must be nested in YAML: {shown.replace('.', ': {', 1)}: ...}}")
+        if key in seen:
+            dotted = printable(".".join((*above, key)), _SHOWN)
+            raise DyngsError(f"{where}: duplicate key {dotted}; keep one of the two")
+        seen.add(key)
+        if isinstance(value_node, yaml.MappingNode) and value_node.value:
+            yield from _walk(loader, value_node, (*above, key), origin, lines=lines)
+        else:
+            text = value_node.value if isinstance(value_node, yaml.ScalarNode) else ""
+            yield Leaf((*above, key), loader.construct_object(value_node, deep=True), text, where)
+
+
+def require_usable(leaf: Leaf) -> None:
+    """Nothing, if a text can name a file: no NUL, nothing that is no character. Raises DyngsError."""
+    if isinstance(leaf.value, str):
+        try:
+            if b"\0" not in os.fsencode(leaf.value):
+                return
+        except UnicodeEncodeError:
+            pass
+        dotted = printable(".".join(leaf.keys), _SHOWN)
+        raise DyngsError(f"{leaf.origin}: {dotted} holds a character that no name or path may hold; remove it")
