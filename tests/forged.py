@@ -10,8 +10,13 @@ from typing import Any
 
 import torch
 from moving_scene import camera
+from tiny_fields import KINDS, cloud, stirred_field, tiny_options, tiny_setup
 from torch import Tensor
 
+from dyngs.colour.colours import NetworkColours
+from dyngs.config import DcacColour, DynamicModel, SceneModel, StaticModel
+from dyngs.deform.fields import field_state
+from dyngs.deform.masks import KeyMasks
 from dyngs.rendering import RenderOptions
 from dyngs.storage.coding import compressed
 from dyngs.storage.file import _DTYPES, MAGIC, MAX_HEADER, SceneInfo, _Header, _stored
@@ -20,6 +25,8 @@ from dyngs.train.scene import Scene, moment_of
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]
+CONTENTS = ("static", "dcac", "masked", *KINDS)
+_ROWS = (0, 2, 3, 6)
 
 _VALUES = (torch.nan, torch.inf, -torch.inf, 3e38, -3e38, 1e20, 1e-45, -1.0, 0.0, 1e9, 255.0)
 _TYPES = (torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.uint8, torch.bool)
@@ -117,3 +124,25 @@ def one_line(error: Exception, path: Path) -> None:
     text = str(error)
     assert text.isprintable(), text
     assert str(path) in text or "render" in text or "clean the input" in text or "not finite" in text, text
+
+
+def contents(kind: str) -> tuple[Tensors, SceneModel]:
+    """Of a checkpoint of nine Gaussians: "static", "dcac", "masked", or a field's kind; and its model."""
+    gaussians, model = cloud(9), StaticModel()
+    state: Tensors = {"filter_std": torch.rand(9, generator=torch.Generator().manual_seed(1))}
+    if kind == "dcac":
+        gaussians = gaussians.replace(sh=gaussians.sh[:, :1].contiguous())
+        box, options = torch.stack([torch.zeros(3), torch.ones(3)]), DcacColour(width=8, depth=2)
+        colours = NetworkColours(options, 10, box, torch.Generator().manual_seed(0), sees_time=True)
+        state |= {f"colour.{name}": x for name, x in colours.state().items()}
+    elif kind != "static":
+        field = "trajectory" if kind == "masked" else kind
+        model = DynamicModel(deform=tiny_options(field))
+        stored = field_state(stirred_field(field, len(_ROWS)), tiny_setup(len(_ROWS)))
+        state |= {f"field.{name}": x for name, x in stored.items()}
+        state |= {"rows": torch.tensor(_ROWS), "times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)}
+    if kind == "masked":
+        masks = KeyMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])
+        state |= {f"masks.{name}": x for name, x in masks.state().items()}
+    tensors = {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
+    return {name: x.contiguous() for name, x in (tensors | {f"model.{n}": x for n, x in state.items()}).items()}, model

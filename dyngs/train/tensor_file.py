@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -89,5 +90,5 @@ def _digest(tensors: Mapping[str, Tensor], header: Mapping[str, object]) -> str:
     for name in sorted(tensors):
         x = tensors[name].contiguous()
         total.update(f"{name} {x.dtype} {tuple(x.shape)}\n".encode())
-        total.update(x.reshape(-1).numpy().data)
+        total.update(x.reshape(-1).view(torch.uint8).numpy().data)  # numpy lacks some types
     return total.hexdigest()

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import math
 import os
+import random
 import subprocess
 import sys
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 import torch
+from forged import CONTENTS, contents, forged, one_line, require_drawable, stored_as_they_are
 from moving_scene import MOVING_ROWS, TRAIN_TIMES, moved_x, write_moving_run
 
 from dyngs.config import Config, DataConfig, RunConfig, StaticModel
@@ -19,6 +22,7 @@ from dyngs.config_io import RESOLVED_NAME, save_config
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.static.filters import fuse_filter
+from dyngs.storage.drawable import drawable
 from dyngs.train import checkpoint
 from dyngs.train.checkpoint import (
     Checkpoint,
@@ -30,6 +34,7 @@ from dyngs.train.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
+from dyngs.train.tensor_file import write_tensors
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -222,3 +227,101 @@ def test_missing_things_are_named(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="lacks 'sh'"):
         load_run(tmp_path)
     assert json.loads((tmp_path / "timing.json").read_text()) == {"seconds_train": {"5": 1.0}}
+
+
+def _header(**changes: object) -> dict[str, object]:
+    info = CheckpointInfo(7, 1.5, (0.0, 0.0, 0.0), "white", "classic")
+    return asdict(info) | changes
+
+
+@pytest.mark.parametrize("is_compact", [False, True])
+@pytest.mark.parametrize("kind", CONTENTS)
+def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_picture(
+    tmp_path: Path, kind: str, is_compact: bool
+) -> None:
+    """The checksum fits; tensors lack, have other types, shapes and values, headers others kinds of fields."""
+    (tensors, model), chance = contents(kind), random.Random(kind)
+    save_config(Config(data=DataConfig(root=tmp_path), model=model), tmp_path / RESOLVED_NAME)
+    path = tmp_path / ("scene.dyngs" if is_compact else "checkpoints/step_0000007.safetensors")
+    path.parent.mkdir(exist_ok=True)
+    tensors = drawable(tensors) if is_compact else tensors
+    refused, told = 0, []
+    for trial in range(61):
+        changed, header = forged(tensors, _header(), chance) if trial else (tensors, _header())
+        try:
+            if is_compact:
+                path.write_bytes(stored_as_they_are(changed, header))
+            else:
+                write_tensors(path, checkpoint._KIND, changed, header)
+        except (ValueError, DyngsError):
+            continue  # the format cannot say that
+        try:
+            require_drawable(load_run(tmp_path).scene)
+        except DyngsError as error:
+            refused += 1
+            told.append(error)
+            assert trial, error  # noqa: PT017 (the first is whole)
+    assert refused > 20
+    for error in told:
+        one_line(error, path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("step", "7"),
+        ("step", 7.5),
+        ("step", -1),
+        ("step", True),
+        ("step", 2**70),
+        ("extent", None),
+        ("extent", math.nan),
+        ("extent", -1.0),
+        ("world_offset", [0, 0]),
+        ("world_offset", [0, 0, math.inf]),
+        ("world_offset", 3),
+        ("background", "pink"),
+        ("background", ["white"]),
+        ("rasterize_mode", "x" * 1000),
+        ("rasterize_mode", {}),
+    ],
+)
+def test_headers_of_other_types_are_refused(tmp_path: Path, key: str, value: object) -> None:
+    path = tmp_path / "checkpoints" / "step_0000007.safetensors"
+    path.parent.mkdir()
+    write_tensors(path, checkpoint._KIND, contents("static")[0], _header(**{key: value}))
+    with pytest.raises(DyngsError, match=r"step_0000007\.safetensors: cannot be read") as caught:
+        load_checkpoint(path)
+    one_line(caught.value, path)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("model.rows", lambda x: x.flip(0), "'rows' does not ascend"),
+        ("model.rows", lambda x: x + 6, "'rows' names something beyond the 9"),
+        ("model.rows", lambda x: x.int(), "'rows' is int32"),
+        ("model.times", lambda x: x + 0.5, "outside"),
+        ("model.filter_std", lambda x: -x, "negative"),
+        ("model.field.buffers.followed", lambda x: x + 5, "'followed' names something beyond the 4"),
+        ("model.field.buffers.followed", lambda x: x[1:], r"'followed' is int64 \(3, 4\)"),
+        ("model.field.buffers.radii", torch.zeros_like, "'radii' must be above 0"),
+        ("model.field.buffers.positions", lambda x: x[1:], r"float32 \(4,"),
+        ("model.field.learned.means", lambda x: x[:, 1:], "'means' is float32"),
+        ("model.field.learned.exp_avg.means", lambda x: x.double(), "'exp_avg.means' is float64"),
+        ("model.field.box", torch.zeros_like, "'box' must be above 0"),
+        ("model.field.numbers", lambda x: -x, "'numbers' must be above 0"),
+        ("gaussians.sh", lambda x: x[:, :3], "'sh' has 3 terms"),
+        ("gaussians.means", lambda x: x * torch.nan, "'means' holds NaN"),
+    ],
+)
+def test_what_does_not_fit_is_named(
+    tmp_path: Path, name: str, change: Callable[[torch.Tensor], torch.Tensor], said: str
+) -> None:
+    tensors, model = contents("skeleton")
+    save_config(Config(data=DataConfig(root=tmp_path), model=model), tmp_path / RESOLVED_NAME)
+    path = tmp_path / "checkpoints" / "step_0000007.safetensors"
+    path.parent.mkdir()
+    write_tensors(path, checkpoint._KIND, tensors | {name: change(tensors[name]).contiguous()}, _header())
+    with pytest.raises(DyngsError, match=rf"step_0000007\.safetensors: cannot be read \(ValueError: .*{said}"):
+        load_run(tmp_path)
