@@ -74,6 +74,9 @@ def read_tensors(path: Path, kind: FileKind, advice: str) -> tuple[dict[str, Any
             header = json.loads((file.metadata() or {}).get(kind.key, "null"))
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
     except Exception as error:  # the library lists none of what it raises
+        if isinstance(error, OSError | MemoryError) or "allocate memory" in str(error):  # says nothing of the file
+            is_there = not isinstance(error, FileNotFoundError)
+            advice = "; the file itself may be whole: keep it, try again" if is_there else ""
         raise DyngsError(f"{path}: cannot be read as {kind.what} ({reason(error)}){advice}") from error
     if not isinstance(header, dict) or "format" not in header:
         raise DyngsError(f"{path}: not {kind.what} of dyngs{advice}")

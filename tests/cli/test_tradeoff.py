@@ -10,6 +10,7 @@ from refused import error_line
 
 from dyngs.cli import main
 from dyngs.train.checkpoint import load_run
+from dyngs.train.run_lock import LOCK_NAME, writing
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -48,3 +49,13 @@ def test_wrong_usage_ends_in_one_line(words: str, part: str, capsys: pytest.Capt
     out = [] if "static" in words else ["--out", "x"]
     assert part in error_line(capsys, "tradeoff", *words.split(), *out)
     assert list(Path().iterdir()) == []
+
+
+def test_two_sweeps_do_not_mix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, out = write_moving_run(tmp_path), tmp_path / "out"
+    with writing(out):
+        assert main(["tradeoff", str(run), "--out", str(out), "--vary", "scale=0.5"]) == 2
+        assert [path.name for path in out.iterdir()] == [LOCK_NAME]
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "has been writing there since" in told

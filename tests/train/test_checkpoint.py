@@ -23,7 +23,7 @@ from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.static.filters import fuse_filter
 from dyngs.storage.drawable import drawable
-from dyngs.train import checkpoint
+from dyngs.train import checkpoint, tensor_file
 from dyngs.train.checkpoint import (
     Checkpoint,
     CheckpointInfo,
@@ -65,6 +65,24 @@ def test_the_newest_is_that_of_the_most_steps(tmp_path: Path) -> None:
         save_checkpoint(tmp_path, _checkpoint(step), 1.0)
     assert [path.stem for path in checkpoint_paths(tmp_path)] == ["step_9999999", "step_10000000"]
     assert latest_checkpoint(tmp_path).info.step == 10_000_000
+
+
+def test_nobody_is_told_to_delete_a_file_that_may_be_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Too little memory, too many open files, no permission."""
+    for step in (1, 2):
+        save_checkpoint(tmp_path, _checkpoint(step), 1.0)
+    for error in (
+        RuntimeError("unable to mmap: Cannot allocate memory (12)"),
+        MemoryError(),
+        PermissionError(13, "no"),
+    ):
+
+        def failing(*given: object, error: Exception = error, **named: object) -> None:
+            raise error
+
+        monkeypatch.setattr(tensor_file, "safe_open", failing)
+        with pytest.raises(DyngsError, match=r"keep it, try again$"):
+            latest_checkpoint(tmp_path)
 
 
 def test_a_run_can_be_loaded_while_it_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

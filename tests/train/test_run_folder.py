@@ -23,7 +23,7 @@ from dyngs.train.checkpoint import KEEP_CHECKPOINTS, checkpoint_paths, latest_ch
 from dyngs.train.compacted import compact_run
 from dyngs.train.log import RunLog
 from dyngs.train.run_folder import new_folder, tidy
-from dyngs.train.run_lock import LOCK_NAME
+from dyngs.train.run_lock import LOCK_NAME, InUseError, writing
 from dyngs.train.stored import write_compact
 from dyngs.train.trainer import train
 
@@ -270,6 +270,17 @@ def test_a_few_kills_lose_nothing(tmp_path: Path) -> None:
     done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"^\d kills in .*, 0 lost$", done.stdout, re.MULTILINE)
+
+
+@pytest.mark.parametrize("command", ["train", "export", "resume"])
+def test_nothing_is_written_while_another_writes(still: Path, run_dir: Path, tmp_path: Path, command: str) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(run_dir, out)
+    with writing(out):
+        before = _contents(out)
+        with pytest.raises(InUseError, match=f"process {os.getpid()} on "):
+            COMMANDS[command](still, out if command == "export" else run_dir, out)
+        assert _contents(out) == before
 
 
 def test_the_command_says_it_in_one_line(still: Path, run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
