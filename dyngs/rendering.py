@@ -37,7 +37,7 @@ class RenderOptions:
         mode: classic, or antialiased (opacity compensated for the low-pass).
         sh_degree: highest degree used; None = all that is stored.
         alpha_min, alpha_max, transmittance_min: see ``BlendOptions``.
-        depth: none, accumulated (sum of weight times depth) or expected (that, divided by alpha).
+        depth: none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha).
         absgrad: fill the absolute part of the probe's gradient.
         nonfinite: NaN or infinite input is an ``error``, or its Gaussians are left out (``skip``), or nobody looks
             (``trust``; the trainer, whose optimizer never writes such values).
@@ -131,9 +131,7 @@ def render(
     if background is not None:
         background = background.to(colors.dtype).expand(len(cameras), 3)
     if options.depth != "none":
-        colors = torch.cat([colors, projection.depths[..., None]], dim=-1)
-        if background is not None:
-            background = torch.cat([background, torch.zeros_like(background[:, :1])], dim=-1)
+        colors, background = _with_depth(colors, projection.depths, background, weights=_needs_weights(options))
     size = (cameras.width, cameras.height)
     blended = rasterize(
         projection, opacities, colors, size, background=background, probe=probe, options=options.blending
@@ -142,9 +140,25 @@ def render(
     if options.depth != "none":
         depth = blended.color[..., 3]
         if options.depth == "expected":
-            alpha = 1 - blended.transmittance
+            alpha = blended.color[..., 4] if _needs_weights(options) else 1 - blended.transmittance
             depth = depth / torch.where(alpha > 0, alpha, 1.0)
     return Rendering(blended.color[..., :3], blended.transmittance, depth, projection.radii)
+
+
+def _needs_weights(options: RenderOptions) -> bool:
+    """Whether alpha is to be summed from the weights: where it may be small, 1 - transmittance has no digits left. From
+    1/255 on it has four, and one channel less to blend."""
+    return options.depth == "expected" and options.alpha_min < 1 / 255
+
+
+def _with_depth(
+    colors: Tensor, depths: Tensor, background: Tensor | None, *, weights: bool
+) -> tuple[Tensor, Tensor | None]:
+    """Channels (V, N, D) with the depth added, and 1 if the sum of ``weights`` is wanted; their backgrounds are 0."""
+    more = [depths[..., None]] + ([torch.ones_like(depths)[..., None]] if weights else [])
+    if background is not None:
+        background = torch.nn.functional.pad(background, (0, len(more)))
+    return torch.cat([colors, *more], dim=-1), background
 
 
 def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()) -> Tensor:

@@ -35,6 +35,7 @@ void add(const std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, Array<S>>& gau
          const std::tuple<Array<const S>, Maybe<S>, Maybe<S>, Maybe<S>, Maybe<S>>& offsets, int threads) {
   const auto& [means, quats, log_scales, logit_opacities, sh] = gaussians;
   const auto& [by_means, by_quats, by_log_scales, by_logit_opacities, by_colors] = offsets;
+  if (by_means.ndim() != 2) throw nb::value_error("offsets: arrays of different sizes");
   const int64_t n = logit_opacities.size(), count = by_means.shape(0);
   const auto wrong = [n](int64_t row) { return row < 0 || row >= n; };
   if (rows ? std::any_of(rows->data(), rows->data() + rows->size(), wrong) : count > n)

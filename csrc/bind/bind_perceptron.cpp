@@ -16,14 +16,20 @@ namespace nb = nanobind;
 namespace dyngs {
 namespace {
 
-template <class S>
-Perceptron<S> network(const std::vector<int64_t>& widths, int64_t skip, const Array<const S>& params, int threads) {
+constexpr int64_t kMaxWidth = 1 << 24;  // so that products of two fit 64 bits
+
+void check_widths(const std::vector<int64_t>& widths, int64_t skip) {
   if (widths.size() < 2) throw nb::value_error("perceptron: no layers");
   for (const int64_t width : widths)
-    if (width < 1) throw nb::value_error("perceptron: a width below 1");
-  const Perceptron<S> net{widths, skip, params.data(), threads};
-  if (skip < 0 || skip >= net.layers()) throw nb::value_error("perceptron: no such layer to skip to");
-  return net;
+    if (width < 1 || width > kMaxWidth) throw nb::value_error("perceptron: a width below 1 or above 2^24");
+  if (skip < 0 || skip >= static_cast<int64_t>(widths.size()) - 1)
+    throw nb::value_error("perceptron: no such layer to skip to");
+}
+
+template <class S>
+Perceptron<S> network(const std::vector<int64_t>& widths, int64_t skip, const Array<const S>& params, int threads) {
+  check_widths(widths, skip);
+  return {widths, skip, params.data(), threads};
 }
 
 // Refuses arrays whose size is not `count`: the last line of defence before raw pointers.
@@ -83,6 +89,7 @@ void bind(nb::module_& module) {
 
 void bind_perceptron(nb::module_& module) {
   module.def("perceptron_kept_per_row", [](const std::vector<int64_t>& widths, int64_t skip) {
+    check_widths(widths, skip);
     return Perceptron<float>{widths, skip, nullptr, 1}.kept_per_row();
   }, nb::arg("widths"), nb::arg("skip"), "Scalars per row that the forward pass can keep for the backward pass.");
   bind<float>(module), bind<double>(module);

@@ -5,6 +5,7 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <optional>
 #include <tuple>
 #include <vector>
@@ -80,6 +81,9 @@ void hexplane_backward_arrays(const Array<const S, nb::shape<-1, 3>>& coords, co
   if (g_features.shape(0) != coords.shape(0) || order.shape(0) != coords.shape(0) ||
       (g_coords && g_coords->shape(0) != coords.shape(0)) || g_features.shape(1) != levels.size() * planes.channels)
     throw nb::value_error("hexplane_backward: arrays of different sizes");
+  const auto missing = [&points](int32_t i) { return i < 0 || i >= points.count; };
+  if (std::any_of(order.data(), order.data() + points.count, missing))
+    throw nb::index_error("hexplane_backward: no such point");
   nb::gil_scoped_release release;
   hexplane_backward(planes, points, order.data(), g_features.data(), grads, g_coords ? g_coords->data() : nullptr,
                     num_threads);

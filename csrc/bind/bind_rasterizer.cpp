@@ -3,14 +3,18 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
 #include <optional>
+#include <string>
 #include <tuple>
 
 #include "bind/arrays.hpp"
 #include "cpu/finite.hpp"
 #include "cpu/kernels.hpp"
+#include "cpu/memory.hpp"
 
 namespace nb = nanobind;
 
@@ -37,6 +41,22 @@ void expect(const MaybeArray<T>& array, int64_t count, const char* name) {
   if (array) expect(*array, count, name);
 }
 
+template <class A>
+void expect_rank(const A& array, size_t rank, const char* name) {
+  if (array.ndim() != rank)
+    throw nb::value_error((std::string(name) + " has " + std::to_string(array.ndim()) + " axes, expected " +
+                           std::to_string(rank)).c_str());
+}
+
+// A picture's side, or a number of threads.
+int within(int64_t value, int64_t most, const char* name) {
+  if (value < 1 || value > most)
+    throw nb::value_error((std::string(name) + " is " + std::to_string(value) + ", expected 1 to " +
+                           std::to_string(most)).c_str());
+  return static_cast<int>(value);
+}
+constexpr int64_t kMaxThreads = 1 << 16;
+
 struct ProjectSettings {
   int width, height;
   double eps2d, near, far, alpha_min, radius_clip;
@@ -61,6 +81,7 @@ struct GaussianArrays {
   Array<const S> means, quats, scales, opacities, viewmats, intrinsics;
 
   GaussianViews<S> views() const {
+    expect_rank(means, 2, "means"), expect_rank(viewmats, 3, "viewmats");
     const int64_t n = means.shape(0), v = viewmats.shape(0);
     expect(means, 3 * n, "means"), expect(quats, 4 * n, "quats"), expect(scales, 3 * n, "scales");
     expect(opacities, n, "opacities"), expect(viewmats, 16 * v, "viewmats"), expect(intrinsics, 9 * v, "intrinsics");
@@ -113,6 +134,7 @@ void bind_projection(nb::module_& module, const char* arrays_name) {
 template <class S>
 Harmonics<S> harmonics_input(const Array<const S>& means, const Array<const S>& centers, const Array<const S>& sh,
                              const Array<const int32_t>& radii, int degree, int threads) {
+  expect_rank(means, 2, "means"), expect_rank(centers, 2, "centers"), expect_rank(sh, 3, "sh");
   const int64_t n = means.shape(0), v = centers.shape(0);
   const int terms = static_cast<int>(sh.shape(1));
   expect(means, 3 * n, "means"), expect(centers, 3 * v, "centers"), expect(sh, n * terms * 3, "sh");
@@ -156,6 +178,7 @@ struct SplatArrays {
   Array<const int32_t> radii;
 
   Splats<S> splats(const BlendSettings& settings) const {
+    expect_rank(opacities, 2, "opacities");
     const int64_t v = opacities.shape(0), n = opacities.shape(1);
     expect(means2d, 2 * v * n, "means2d"), expect(factors, 3 * v * n, "factors"), expect(radii, 2 * v * n, "radii");
     return {n, v, settings.width, settings.height, 0, means2d.data(), factors.data(), opacities.data(), nullptr,
@@ -165,6 +188,8 @@ struct SplatArrays {
 
   Splats<S> with_colors(const BlendSettings& settings, const Array<const S>& colors) const {
     Splats<S> s = splats(settings);
+    expect_rank(colors, 3, "colors");
+    if (colors.shape(2) > kMaxChannels) throw nb::value_error("rasterize: 1 to 40 channels");
     s.channels = static_cast<int>(colors.shape(2));
     if (s.channels < 1 || s.channels > kMaxChannels) throw nb::value_error("rasterize: 1 to 40 channels");
     expect(colors, s.num_views * s.num_gaussians * s.channels, "colors");
@@ -184,15 +209,35 @@ nb::ndarray<nb::numpy, T, nb::ndim<1>> release_vector(std::vector<T>&& vector) {
 using EntryArrays =
     std::tuple<Array<const int64_t>, Array<const int32_t>, Array<const int32_t>, Array<const int32_t>>;
 
+// Whether all of `count` indices are in [0, bound).
+bool all_within(const int32_t* indices, int64_t count, int64_t bound) {
+  uint32_t largest = 0;  // negative indices are larger than any other
+  for (int64_t i = 0; i < count; ++i) largest = std::max(largest, static_cast<uint32_t>(indices[i]));
+  return count == 0 || largest < static_cast<uint64_t>(bound);
+}
+
+// Whether the places that the lists of tiles and splats name are in them.
+bool in_order(const Entries& e, int64_t tiles, int64_t splats) {
+  bool good = e.tile_offsets[0] >= 0 && e.tile_offsets[tiles] <= e.count;
+  for (int64_t t = 0; t < tiles; ++t) good &= e.tile_offsets[t] <= e.tile_offsets[t + 1];
+  for (int64_t i = 0; i < splats; ++i)
+    good &= 0 <= e.slot_ranges[2 * i] && e.slot_ranges[2 * i] <= e.slot_ranges[2 * i + 1] &&
+            e.slot_ranges[2 * i + 1] <= e.count;
+  return good;
+}
+
 template <class S>
 Entries checked_entries(const EntryArrays& arrays, const Splats<S>& s) {
   const auto& [tile_offsets, slot_ranges, gaussians, slots] = arrays;
-  const int64_t tiles = int64_t{(s.width + kTile - 1) / kTile} * ((s.height + kTile - 1) / kTile);
-  expect(tile_offsets, s.num_views * tiles + 1, "tile_offsets");
-  expect(slot_ranges, 2 * s.num_views * s.num_gaussians, "slot_ranges");
-  const int64_t count = static_cast<int64_t>(gaussians.size());
+  const int64_t tiles = s.num_views * ((s.width + kTile - 1) / kTile) * int64_t{(s.height + kTile - 1) / kTile};
+  const int64_t splats = s.num_views * s.num_gaussians, count = static_cast<int64_t>(gaussians.size());
+  expect(tile_offsets, tiles + 1, "tile_offsets"), expect(slot_ranges, 2 * splats, "slot_ranges");
   expect(slots, count, "slots");
-  return {tile_offsets.data(), slot_ranges.data(), gaussians.data(), slots.data(), count};
+  const Entries entries{tile_offsets.data(), slot_ranges.data(), gaussians.data(), slots.data(), count};
+  if (!in_order(entries, tiles, splats)) throw nb::value_error("tile_offsets or slot_ranges name entries that are not there");
+  if (!all_within(entries.gaussians, count, splats)) throw nb::value_error("gaussians name splats that are not there");
+  if (!all_within(entries.slots, count, count)) throw nb::value_error("slots name places that are not there");
+  return entries;
 }
 
 template <class S>
@@ -268,19 +313,24 @@ void bind_blending(nb::module_& module) {
 
 void bind_rasterizer(nb::module_& module) {
   nb::class_<ProjectSettings>(module, "ProjectSettings")
-      .def("__init__", [](ProjectSettings* self, int width, int height, double eps2d, double near, double far,
-                          double alpha_min, double radius_clip, bool antialiased, int threads) {
-        new (self) ProjectSettings{width, height, eps2d, near, far, alpha_min, radius_clip, antialiased, threads};
+      .def("__init__", [](ProjectSettings* self, int64_t width, int64_t height, double eps2d, double near, double far,
+                          double alpha_min, double radius_clip, bool antialiased, int64_t threads) {
+        new (self) ProjectSettings{within(width, kMaxSide, "width"), within(height, kMaxSide, "height"), eps2d, near, far,
+                                   alpha_min, radius_clip, antialiased, within(threads, kMaxThreads, "threads")};
       });
   nb::class_<BlendSettings>(module, "BlendSettings")
-      .def("__init__", [](BlendSettings* self, int width, int height, double alpha_min, double alpha_max,
-                          double transmittance_min, int threads) {
-        new (self) BlendSettings{width, height, alpha_min, alpha_max, transmittance_min, threads};
+      .def("__init__", [](BlendSettings* self, int64_t width, int64_t height, double alpha_min, double alpha_max,
+                          double transmittance_min, int64_t threads) {
+        new (self) BlendSettings{within(width, kMaxSide, "width"), within(height, kMaxSide, "height"), alpha_min,
+                                 alpha_max, transmittance_min, within(threads, kMaxThreads, "threads")};
       });
   bind_projection<float>(module, "GaussianArraysF32"), bind_projection<double>(module, "GaussianArraysF64");
   bind_harmonics<float>(module), bind_harmonics<double>(module);
   bind_binning<float>(module, "SplatArraysF32"), bind_binning<double>(module, "SplatArraysF64");
   bind_blending<float>(module), bind_blending<double>(module);
+  module.attr("MAX_SIDE") = kMaxSide;
+  module.def("available_memory", [](const std::string& root) { return available_memory(root); }, nb::arg("root") = "",
+             "Bytes that this process can still take; `root` stands before /proc and /sys.");
   module.def("count_nonfinite", [](Array<const float> x, int threads) {
     nb::gil_scoped_release release;
     return count_nonfinite(x.data(), static_cast<int64_t>(x.size()), threads);

@@ -3,7 +3,12 @@
 // one's code.
 #include <nanobind/nanobind.h>
 
+#include <exception>
+#include <new>
+#include <string>
+
 #include "core/isa.hpp"
+#include "cpu/memory.hpp"
 
 namespace nb = nanobind;
 
@@ -32,7 +37,19 @@ const char* best_isa() {
 }  // namespace
 }  // namespace dyngs
 
+// What could not be allocated is refused in one line, as any other request that is too large.
+static void refuse_for_memory(const std::exception_ptr& exception, void*) {
+  try {
+    std::rethrow_exception(exception);
+  } catch (const std::bad_alloc&) {
+    const std::string left = dyngs::gigabytes(dyngs::available_memory());
+    nb::object type = nb::module_::import_("dyngs.errors").attr("DyngsError");
+    PyErr_SetString(type.ptr(), ("out of memory: " + left + " are available; ask for less at once").c_str());
+  }
+}
+
 NB_MODULE(DYNGS_MODULE, module) {
+  nb::register_exception_translator(refuse_for_memory);
   module.def("best_isa", dyngs::best_isa);
   dyngs::bind_planes(module);
   dyngs::bind_offsets(module);

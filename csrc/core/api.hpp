@@ -9,6 +9,7 @@ namespace dyngs {
 
 inline constexpr int kTile = 16;          // tile side, px
 inline constexpr int kMaxChannels = 40;   // D at most
+inline constexpr int kMaxSide = 1 << 23;  // W, H at most: float32 has no pixel centres beyond
 
 template <class S>
 struct GaussianViews {

@@ -2,13 +2,19 @@
 // by the ellipse where alpha >= alpha_min. The visible Gaussians are sorted by depth first; then everything streams in that
 // order. One span of tile columns per Gaussian and tile row is computed once; counting and emitting both read the spans,
 // so they cannot disagree.
+//
+// There may be more than memory holds, or than can be counted in a day. So all threads add up in one Budget what they find,
+// and once that is exceeded they only go on counting, for the message, and not for long.
+#include <atomic>
 #include <bit>
 #include <limits>
+#include <mutex>
 #include <stdexcept>
 #include <string>
 #include <utility>
 
 #include "cpu/kernels.hpp"
+#include "cpu/memory.hpp"
 #include "cpu/parallel.hpp"
 #include "cpu/spans.hpp"
 
@@ -18,6 +24,44 @@ namespace {
 constexpr int kRadixBits = 11, kBuckets = 1 << kRadixBits;
 // Below these sizes starting threads costs more than they save.
 constexpr int64_t kParallelSort = 1 << 18, kParallelSpans = 1 << 11;
+
+constexpr int64_t kBytesPerEntry = 20;      // of lists and spans, at most
+constexpr int64_t kFewEntries = 1 << 22;    // for so few nobody asks how much memory is left
+constexpr int64_t kCountedRows = 1 << 22;   // rows of spans that are still counted once there are too many entries
+
+// How many entries there may be.
+class Budget {
+ public:
+  explicit Budget(int64_t max_entries) : limit_(std::min<int64_t>(max_entries, std::numeric_limits<int32_t>::max())) {}
+
+  // Whether that many more are still within it.
+  bool add(int64_t entries) {
+    const int64_t total = total_.fetch_add(entries, std::memory_order_relaxed) + entries;
+    if (total <= kFewEntries) return total <= limit_;
+    std::call_once(asked_, [this] {
+      available_ = available_memory();
+      in_memory_ = std::max(available_ / kBytesPerEntry, kFewEntries);
+    });
+    return total <= std::min(limit_, in_memory_);
+  }
+
+  // The rest is for when all threads are done.
+  int64_t total() const { return total_; }
+  bool exceeded() const { return total_ > std::min(limit_, in_memory_); }
+
+  // What follows the number of entries in a message.
+  std::string reason() const {
+    if (total_ > limit_) return ", more than the limit of " + std::to_string(limit_);
+    return ", whose lists take " + gigabytes(kBytesPerEntry * total_) + "; " + gigabytes(available_) +
+           " of memory are available";
+  }
+
+ private:
+  const int64_t limit_;
+  std::atomic<int64_t> total_{0};
+  std::once_flag asked_;
+  int64_t available_ = 0, in_memory_ = std::numeric_limits<int64_t>::max();
+};
 
 template <class S>
 struct DepthKey;
@@ -76,6 +120,8 @@ struct Part {
   std::vector<Span> spans;
   std::vector<int64_t> per_tile;  // counts, then the places where this part writes next
   int64_t entries = 0;
+  bool within_budget = true;      // of all parts; else nothing is kept any more
+  int64_t counted_rows = 0;       // since then
 };
 
 template <class S>
@@ -83,6 +129,19 @@ void prefetch_splat(const Splats<S>& s, int64_t row) {
   __builtin_prefetch(s.means2d + 2 * row);
   __builtin_prefetch(s.factors + 3 * row);
   __builtin_prefetch(s.opacities + row);
+}
+
+// Notes the spans of one tile row of 16 splats.
+void note_spans(const Span (&spans)[kLanes], const int32_t (&begin)[kLanes], const int32_t (&end)[kLanes], int32_t r,
+                const Grid& grid, const size_t (&place)[kLanes], Part& part) {
+  for (int i = 0; i < kLanes; ++i) {
+    if (begin[i] + r >= end[i]) continue;
+    part.entries += spans[i].end - spans[i].begin;
+    if (!part.within_budget) continue;
+    part.spans[place[i] + r] = spans[i];
+    int64_t* tiles = part.per_tile.data() + int64_t{begin[i] + r} * grid.columns;
+    for (int32_t c = spans[i].begin; c < spans[i].end; ++c) ++tiles[c];
+  }
 }
 
 // Appends up to 16 splats to the part, each with its rows' spans.
@@ -98,36 +157,35 @@ void append_spans(const Splats<S>& s, const Grid& grid, const int32_t* order, in
     place[i] = total;
     total += end[i] - begin[i];
     most = std::max(most, end[i] - begin[i]);
-    if (begin[i] < end[i]) part.splats.push_back({rows[i], begin[i], end[i] - begin[i]});
+    if (begin[i] < end[i] && part.within_budget) part.splats.push_back({rows[i], begin[i], end[i] - begin[i]});
   }
-  part.spans.resize(total);
+  for (int i = count; i < kLanes; ++i) begin[i] = end[i] = 0;
+  if (part.within_budget) {
+    part.spans.resize(total);
+  } else {
+    part.counted_rows += most;
+  }
   for (int32_t r = 0; r < most; ++r) {
     Packet<S> tile_row;
     for (int i = 0; i < kLanes; ++i) tile_row[i] = static_cast<S>(begin[i] + r);
     Span spans[kLanes];
     row_spans(ellipses, tile_row, grid, spans);
-    for (int i = 0; i < count; ++i) {
-      if (begin[i] + r >= end[i]) continue;
-      part.spans[place[i] + r] = spans[i];
-      part.entries += spans[i].end - spans[i].begin;
-      int64_t* tiles = part.per_tile.data() + int64_t{begin[i] + r} * grid.columns;
-      for (int32_t c = spans[i].begin; c < spans[i].end; ++c) ++tiles[c];
-    }
+    note_spans(spans, begin, end, r, grid, place, part);
   }
 }
 
+// Fills the part; it has room for the least that there can be.
 template <class S>
-Part find_spans(const Splats<S>& s, const Grid& grid, const int32_t* order, int64_t count) {
-  Part part;
-  part.splats.reserve(count);
-  part.spans.reserve(2 * count);
-  part.per_tile.assign(int64_t{grid.columns} * grid.rows, 0);
-  for (int64_t k = 0; k < count; k += kLanes) {
+void find_spans(const Splats<S>& s, const Grid& grid, const int32_t* order, int64_t count, Budget& budget, Part& part) {
+  for (int64_t k = 0; k < count && part.counted_rows < kCountedRows; k += kLanes) {
     for (int64_t ahead = k + kLanes; ahead < std::min(count, k + 2 * kLanes); ++ahead)
       prefetch_splat(s, order[ahead]);  // depth order jumps through memory
+    const int64_t before = part.entries;
     append_spans(s, grid, order + k, static_cast<int>(std::min<int64_t>(kLanes, count - k)), part);
+    const bool within = budget.add(part.entries - before);
+    if (part.within_budget && !within) std::vector<Span>().swap(part.spans);
+    part.within_budget &= within;
   }
-  return part;
 }
 
 // Turns the parts' counts into the places where each part writes in each tile's list: parts in depth order.
@@ -155,20 +213,37 @@ void emit(Part& part, const Grid& grid, int64_t slot, Binning& out) {
 }
 
 template <class S>
-std::vector<Part> bin_view(const Splats<S>& s, const Grid& grid, int64_t view) {
+std::vector<Part> bin_view(const Splats<S>& s, const Grid& grid, int64_t view, Budget& budget) {
   const std::vector<int32_t> order = sort_by_depth(s, view * s.num_gaussians);
   const int64_t n = static_cast<int64_t>(order.size());
   std::vector<Part> parts(n > kParallelSpans ? s.threads : 1);
+  for (Part& part : parts) {
+    const int64_t count = n / static_cast<int64_t>(parts.size()) + 1;
+    part.splats.reserve(count);
+    part.spans.reserve(2 * count);
+    part.per_tile.assign(int64_t{grid.columns} * grid.rows, 0);
+  }
   parallel_parts(n, static_cast<int>(parts.size()), [&](int p, int64_t begin, int64_t end) {
-    parts[p] = find_spans(s, grid, order.data() + begin, end - begin);
+    find_spans(s, grid, order.data() + begin, end - begin, budget, parts[p]);
   });
   return parts;
 }
 
-[[noreturn]] void refuse(int64_t gaussians, int64_t views, const Grid& grid, int64_t entries, int64_t limit) {
-  throw std::length_error(std::to_string(gaussians) + " Gaussians in " + std::to_string(views) + " view(s) of " +
-                          std::to_string(grid.width) + "x" + std::to_string(grid.height) + " px meet " +
-                          std::to_string(entries) + " tiles, more than the limit of " + std::to_string(limit));
+std::string number_of(int64_t gaussians, int64_t views, const Grid& grid) {
+  return std::to_string(gaussians) + " Gaussians in " + std::to_string(views) + " view(s) of " +
+         std::to_string(grid.width) + "x" + std::to_string(grid.height) + " px";
+}
+
+// The lists of tiles themselves: one of offsets, and one of counts per thread.
+template <class S>
+void check_tiles(const Splats<S>& s, const Grid& grid) {
+  const double bytes = 8.0 * s.num_views * grid.columns * grid.rows * (s.threads + 1);
+  if (bytes <= kFewEntries * kBytesPerEntry) return;
+  const int64_t available = available_memory();
+  if (bytes <= static_cast<double>(available)) return;
+  throw std::length_error(number_of(s.num_gaussians, s.num_views, grid) + " have tiles whose lists take " +
+                          gigabytes(static_cast<int64_t>(std::min(bytes, 9e18))) + "; " + gigabytes(available) +
+                          " of memory are available");
 }
 
 }  // namespace
@@ -180,13 +255,18 @@ Binning bin_tiles(const Splats<S>& s, int64_t max_entries) {
   if (s.num_views * s.num_gaussians > std::numeric_limits<int32_t>::max())  // rows are int32
     throw std::length_error(std::to_string(s.num_gaussians) + " Gaussians in " + std::to_string(s.num_views) +
                             " views are more than 2^31 - 1 splats");
+  check_tiles(s, grid);
   std::vector<std::vector<Part>> views;
-  int64_t total = 0;
-  for (int64_t v = 0; v < s.num_views; ++v) {
-    views.push_back(bin_view(s, grid, v));
-    for (const Part& part : views.back()) total += part.entries;
+  Budget budget(max_entries);
+  bool counted = true;
+  for (int64_t v = 0; v < s.num_views && counted; ++v) {
+    views.push_back(bin_view(s, grid, v, budget));
+    for (const Part& part : views.back()) counted &= part.counted_rows < kCountedRows;
   }
-  if (total > max_entries) refuse(s.num_gaussians, s.num_views, grid, total, max_entries);
+  if (budget.exceeded())
+    throw std::length_error(number_of(s.num_gaussians, s.num_views, grid) + " meet " + (counted ? "" : "at least ") +
+                            std::to_string(budget.total()) + " tiles" + budget.reason());
+  const int64_t total = budget.total();
   Binning out;
   out.gaussians.resize(total);
   out.slots.resize(total);

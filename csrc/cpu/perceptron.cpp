@@ -304,7 +304,16 @@ void add_columns(const S* from, int64_t rows, int64_t columns, int64_t stride, S
   }
 }
 
-// What one range of blocks needs for the backward pass. x and grad_x are padded.
+// What one thread needs for the forward pass.
+template <class S>
+struct Rows {
+  Buffer<S> x, last, inputs;  // padded; the last two layers' inputs, unless all are kept
+  Rows(const Plan<S>& plan, bool kept)
+      : x(kBlock * stride_of(plan.input())), last(kBlock * stride_of(plan.layers.back().out)),
+        inputs(kept ? 0 : 2 * kBlock * plan.stride()) {}
+};
+
+// And for the backward pass. x and grad_x are padded.
 template <class S>
 struct Scratch {
   Buffer<S> x, kept, grad, next_grad, grad_x;
@@ -397,15 +406,15 @@ void perceptron_forward(const Perceptron<S>& net, int64_t rows, const S* x, S* y
   const int64_t in = plan.input(), out = plan.layers.back().out;
   const int64_t blocks = (rows + kBlock - 1) / kBlock, grain = kBlock * std::max<int64_t>(1, blocks / (4 * kParts));
   if (kept != nullptr) prefer_large_pages(kept, rows * plan.kept() * sizeof(S));
-  parallel_for(rows, grain, net.threads, [&](int64_t begin, int64_t end) {
-    Buffer<S> padded_x(kBlock * stride_of(in)), last(kBlock * stride_of(out));
-    Buffer<S> inputs(kept ? 0 : 2 * kBlock * plan.stride());
+  const auto scratch = for_each_worker<Rows<S>>(net.threads, plan, kept != nullptr);
+  parallel_workers(rows, grain, net.threads, [&](int worker, int64_t begin, int64_t end) {
+    S *padded_x = scratch[worker]->x.get(), *last = scratch[worker]->last.get();
     for (int64_t from = begin; from < end; from += kBlock) {
       const int64_t count = std::min(kBlock, end - from);
-      pad_rows(x + from * in, count, in, padded_x.get());
-      run_block<S>(plan, count, padded_x.get(), kept ? kept + from * plan.kept() : inputs.get(), kept != nullptr,
-                   last.get());
-      unpad_rows(last.get(), count, out, y + from * out);
+      pad_rows(x + from * in, count, in, padded_x);
+      run_block<S>(plan, count, padded_x, kept ? kept + from * plan.kept() : scratch[worker]->inputs.get(),
+                   kept != nullptr, last);
+      unpad_rows(last, count, out, y + from * out);
     }
   });
 }
@@ -417,8 +426,9 @@ void perceptron_backward(const Perceptron<S>& net, int64_t rows, const S* x, con
   const int64_t in = plan.input(), out = plan.layers.back().out;
   const int64_t blocks = (rows + kBlock - 1) / kBlock, parts = std::min(kParts, blocks);
   Buffer<S> sums(parts * plan.sums());
-  parallel_for(parts, 1, net.threads, [&](int64_t part, int64_t) {
-    Scratch<S> scratch(plan, kept == nullptr);
+  const auto all_scratch = for_each_worker<Scratch<S>>(net.threads, plan, kept == nullptr);
+  parallel_workers(parts, 1, net.threads, [&](int worker, int64_t part, int64_t) {
+    Scratch<S>& scratch = *all_scratch[worker];
     S* part_sums = sums.get() + part * plan.sums();
     std::fill_n(part_sums, plan.sums(), S(0));
     const int64_t end = std::min(rows, blocks * (part + 1) / parts * kBlock);

@@ -99,11 +99,9 @@ double distance_from_one(const S* p, S factor, S* to, int64_t n) {
 template <class S>
 struct RowDifferences {
   const Plane<S>& plane;
-  std::vector<S> ring;
+  S* ring;
 
-  explicit RowDifferences(const Plane<S>& plane) : plane(plane), ring(3 * plane.row_size()) {}
-
-  S* at(int64_t row) { return ring.data() + (row + 3) % 3 * plane.row_size(); }
+  S* at(int64_t row) { return ring + (row + 3) % 3 * plane.row_size(); }
 
   double compute(int64_t row) {
     const int64_t n = plane.row_size();
@@ -116,14 +114,18 @@ struct RowDifferences {
   }
 };
 
+// Numbers that band_penalty needs room for.
+template <class S>
+int64_t room_for(const Plane<S>& plane) { return 4 * plane.row_size() + 2 * plane.channels; }
+
 // The penalty of rows [begin, end), and its gradient.
 template <class S>
-double band_penalty(const Plane<S>& plane, int64_t begin, int64_t end) {
+double band_penalty(const Plane<S>& plane, int64_t begin, int64_t end, S* room) {
   const int64_t n = plane.row_size(), channels = plane.channels;
   const S by_rows = static_cast<S>(2 * plane.by_rows), by_columns = static_cast<S>(2 * plane.by_columns);
-  RowDifferences<S> down(plane);
-  std::vector<S> padded(n + 2 * channels);  // differences along the row, with a zero before and after
-  S* across = padded.data() + channels;
+  RowDifferences<S> down{plane, room};
+  S* across = room + 3 * n + channels;  // differences along the row, with a zero before and after
+  std::fill(across - channels, across + n + channels, S(0));
   double rows_sum = 0, columns_sum = 0, one_sum = 0;
   if (plane.grad) down.compute(begin - 1);
   rows_sum += down.compute(begin);
@@ -184,8 +186,11 @@ double plane_penalty(const HexPlane<S>& hexplane, const PenaltyWeights& weights,
     for (int64_t row = 0; row < planes[p].rows; row += kBandRows)
       bands.push_back({p, row, std::min(planes[p].rows, row + kBandRows)});
   std::vector<double> sums(bands.size());
-  parallel_for(static_cast<int64_t>(bands.size()), 1, num_threads, [&](int64_t b, int64_t) {
-    sums[b] = band_penalty(planes[bands[b].plane], bands[b].begin, bands[b].end);
+  int64_t most = 0;
+  for (const auto& plane : planes) most = std::max(most, room_for(plane));
+  const auto room = for_each_worker<std::vector<S>>(num_threads, most);
+  parallel_workers(static_cast<int64_t>(bands.size()), 1, num_threads, [&](int worker, int64_t b, int64_t) {
+    sums[b] = band_penalty(planes[bands[b].plane], bands[b].begin, bands[b].end, room[worker]->data());
   });
   double total = 0;
   for (const double sum : sums) total += sum;

@@ -345,14 +345,14 @@ void store_coords(const Task<S>& task, const Chunk<S>& chunk, const CoordGrad<S>
 
 // Shares the gradients by the lines (3, size, 16) out to the two rows of the time planes.
 template <class S>
-void store_lines(const Task<S>& task, const std::vector<S>& g_lines) {
+void store_lines(const Task<S>& task, const S* g_lines) {
   const S weight = static_cast<S>(task.rows.weight);
   const int64_t row_size = task.level.size * task.level.channels;
   for (int a = 0; a < kAxes; ++a) {
     if (!task.owns[a]) continue;
     S* plane = task.g_time + a * task.times * row_size;
     for (int64_t k = 0; k < task.level.size; ++k) {
-      const S* g = g_lines.data() + (a * task.level.size + k) * kLanes;
+      const S* g = g_lines + (a * task.level.size + k) * kLanes;
       S* to = plane + k * task.level.channels;
       for (int c = 0; c < task.width; ++c) {
         to[task.rows.first * row_size + c] += (1 - weight) * g[c];
@@ -362,12 +362,13 @@ void store_lines(const Task<S>& task, const std::vector<S>& g_lines) {
   }
 }
 
+// `g_lines`: room for the gradients of the task's lines.
 template <bool full, bool with_coords, class S>
-void run_task(const Task<S>& given, const std::vector<Chunk<S>>& chunks, int64_t count, int64_t row_size) {
+void run_task(const Task<S>& given, const std::vector<Chunk<S>>& chunks, int64_t count, int64_t row_size, S* g_lines) {
   constexpr int kWidth = Register<S>::kWidth;
   const Task<S> task = given;
   const int task_width = full ? kLanes : task.width;
-  std::vector<S> g_lines(kAxes * task.level.size * kLanes);
+  std::fill_n(g_lines, kAxes * task.level.size * kLanes, S(0));
   CoordGrad<S> g_coords[kLanes];
   for (size_t n = 0; n < chunks.size(); ++n) {
     const Chunk<S>& chunk = chunks[n];
@@ -383,7 +384,7 @@ void run_task(const Task<S>& given, const std::vector<Chunk<S>>& chunks, int64_t
       for (int c = 0; c < task_width; c += kWidth) {
         const int width = full ? kWidth : std::min(kWidth, task_width - c);
         const Vec<S> g = load<full>(from + c, width);
-        const auto part = point_gradients<full, with_coords>(task, places, scatter, i, g, g_lines.data(), c, width);
+        const auto part = point_gradients<full, with_coords>(task, places, scatter, i, g, g_lines, c, width);
         for (int a = 0; a < kAxes; ++a) sum.axis[a] += part.axis[a];
       }
       g_coords[i] = sum;
@@ -466,12 +467,15 @@ void hexplane_backward(const HexPlane<S>& planes, const PlanePoints<S>& points, 
                          time_rows(planes.time, level.times), level.times});
       }
   }
-  parallel_for(static_cast<int64_t>(tasks.size()), 1, num_threads, [&](int64_t t, int64_t) {
+  int64_t longest = 0;
+  for (const auto& level : planes.levels) longest = std::max(longest, kAxes * level.size * kLanes);
+  const auto g_lines = for_each_worker<std::vector<S>>(num_threads, longest);
+  parallel_workers(static_cast<int64_t>(tasks.size()), 1, num_threads, [&](int worker, int64_t t, int64_t) {
     const Task<S>& task = tasks[t];
     const bool full = task.width == kLanes;
     const auto run = task.g_coords ? (full ? run_task<true, true, S> : run_task<false, true, S>)
                                    : (full ? run_task<true, false, S> : run_task<false, false, S>);
-    run(task, chunks, points.count, channels * num_levels);
+    run(task, chunks, points.count, channels * num_levels, g_lines[worker]->data());
   });
   if (g_coords) sum_coords(parts, order, points.count, g_coords, num_threads);
 }

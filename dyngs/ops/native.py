@@ -7,6 +7,9 @@ picks an older one, for tests.
 from __future__ import annotations
 
 import os
+import sys
+import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -47,8 +50,60 @@ _kernel_threads: ContextVar[int | None] = ContextVar("kernel_threads", default=N
 
 
 def num_threads() -> int:
-    """Threads that the kernels use: those of ``kernel_threads``, else torch's setting."""
-    return _kernel_threads.get() or torch.get_num_threads()
+    """Threads that the kernels use: those of ``kernel_threads``, else torch's setting; after a fork see ``Fork``."""
+    wanted = _kernel_threads.get() or torch.get_num_threads()
+    return _fork.allowed(wanted) if _fork.lost_threads else wanted
+
+
+class Fork:
+    """What becomes of the threads of OpenMP in a process made by ``os.fork``.
+
+    The child has the parent's list of waiting threads, but not the threads: the next parallel loop, of the kernels as
+    of torch, would wait for them without end. Where the parent had started any, the child therefore runs kernels and
+    torch's operators on one thread, as torch's own DataLoader workers do, and says so once; results are the same bytes.
+    An error instead would end programs that fork for other reasons than speed.
+    """
+
+    def __init__(self) -> None:
+        self.lost_threads = False
+        self._told = False
+        self._before = _native_threads()
+        self._team = False
+
+    def remember(self) -> None:
+        """Called in the parent just before it forks."""
+        self._team = self.lost_threads or _native_threads() > self._before
+
+    def begin_child(self) -> None:
+        """Called in the child just after the fork."""
+        self._before = _native_threads()
+        self.lost_threads, self._told = self._team, False
+        if self.lost_threads:
+            self._told = (_kernel_threads.get() or torch.get_num_threads()) == 1
+            torch.set_num_threads(1)
+
+    def allowed(self, wanted: int) -> int:
+        """1; with a warning, once, where more were wanted or would have been before the fork."""
+        if not self._told and torch.utils.data.get_worker_info() is None:
+            self._told = True
+            reason = "this process was forked from one that had started threads, which it has not got"
+            remedy = "start processes with multiprocessing's 'spawn' method to use more"
+            warnings.warn(f"dyngs and torch run on one thread: {reason}; {remedy}", RuntimeWarning, stacklevel=2)
+        return min(wanted, 1)
+
+
+def _native_threads() -> int:
+    """Threads of this process that Python did not start; those of OpenMP stay once started. 0 without Linux's /proc:
+    elsewhere processes are not forked, or the OpenMP library starts anew."""
+    try:
+        return len(os.listdir("/proc/self/task")) - threading.active_count()
+    except OSError:
+        return 0
+
+
+_fork = Fork()
+if sys.platform != "win32":
+    os.register_at_fork(before=_fork.remember, after_in_child=_fork.begin_child)
 
 
 @contextmanager

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.ops.limits import check_memory, check_size
 from dyngs.ops.native import array, core, num_threads
 from dyngs.ops.options import check_near_and_far, check_number
 
@@ -67,6 +68,7 @@ class Projection:
 
 
 def _settings(width: int, height: int, limits: list[float], antialiased: bool):
+    check_size(width, height)
     eps2d, near, far, alpha_min, radius_clip = limits
     return core.ProjectSettings(width, height, eps2d, near, far, alpha_min, radius_clip, antialiased, num_threads())
 
@@ -89,11 +91,13 @@ def _project(
     antialiased: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     rows = (viewmats.shape[0], means.shape[0])
+    settings = _settings(size[0], size[1], limits, antialiased)
+    per_splat = 7 * means.element_size() + 8
+    check_memory(rows[0] * rows[1] * per_splat, f"the splats of {rows[1]} Gaussians in {rows[0]} view(s)")
     means2d, depths = means.new_empty(*rows, 2), means.new_empty(rows)
     factors, compensations = means.new_empty(*rows, 3), means.new_empty(rows)
     radii = torch.empty(*rows, 2, dtype=torch.int32)
     arrays = _arrays(means, quats, scales, opacities, viewmats, intrinsics)
-    settings = _settings(size[0], size[1], limits, antialiased)
     core.project_forward(arrays, settings, *(array(x) for x in (means2d, depths, factors, compensations, radii)))
     return means2d, depths, factors, compensations, radii
 
@@ -181,7 +185,11 @@ def project(
         opacities: (N,) in [0, 1]; they only set the extents.
         cameras: V cameras.
         options: see ``ProjectionOptions``.
+
+    Raises:
+        DyngsError: a picture with sides above 2^23 px, or more splats than memory holds.
     """
+    check_size(cameras.width, cameras.height)  # before torch, which takes no integers from 2^63 on
     limits = [options.eps2d, options.near, options.far, options.alpha_min, options.radius_clip]
     outputs = _project(
         means,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -9,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
+from dyngs.ops.limits import REMEDY, check_memory, check_size
 from dyngs.ops.native import array, core, num_threads
 from dyngs.ops.options import check_number
 from dyngs.ops.projection import Projection
@@ -18,6 +21,7 @@ MAX_CHANNELS = 40
 MAX_ENTRIES = 2**31 - 1
 LARGEST_ALPHA = 1 - 2.0**-20
 """Beyond it nothing of what lies behind would be left in float32, from which the backward pass restores the rest."""
+MOMENTS = 6  # that the backward pass holds per (Gaussian, tile) pair, beside the gradients of colours
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,8 @@ class BlendOptions:
         alpha_max: alpha is clamped here, and the clamp stops the gradient.
         transmittance_min: a pixel stops before the Gaussian that would take it below.
         absgrad: also sum the absolute gradients of the 2D means into the probe.
-        max_entries: refuse renders with more (Gaussian, tile) pairs, before allocating them.
+        max_entries: refuse renders with more (Gaussian, tile) pairs, before allocating them; also refused are more than
+            memory holds, at 20 bytes each.
 
     Raises:
         DyngsError: numbers out of [0, 1] or NaN, an ``alpha_max`` that float32 cannot tell from 1, a negative count.
@@ -71,6 +76,18 @@ class TileEntries:
     def tensors(self) -> list[Tensor]:
         return [self.tile_offsets, self.slot_ranges, self.gaussians, self.slots]
 
+    def check(self) -> None:
+        """Nothing, if the tensors are what the kernels take; those look at lengths and indices themselves.
+
+        Raises:
+            DyngsError: another dtype, device or number of axes.
+        """
+        for name, x in vars(self).items():
+            dtype = torch.int64 if name == "tile_offsets" else torch.int32
+            if x.dtype != dtype or x.ndim != 1 or x.device.type != "cpu":
+                got = f"{x.dtype} {tuple(x.shape)} on {x.device}"
+                raise DyngsError(f"rasterize: entries.{name} must be {dtype} with one axis on the CPU, got {got}")
+
     @property
     def tiles_per_gaussian(self) -> Tensor:
         """(V N,) int32."""
@@ -92,12 +109,22 @@ class Blended:
 
 
 def _settings(size: list[int], thresholds: list[float]):
+    check_size(*size)
     return core.BlendSettings(size[0], size[1], thresholds[0], thresholds[1], thresholds[2], num_threads())
 
 
 def _arrays(means2d: Tensor, factors: Tensor, opacities: Tensor, radii: Tensor):
     kind = core.SplatArraysF32 if means2d.dtype == torch.float32 else core.SplatArraysF64
     return kind(*(array(x) for x in (means2d, factors, opacities, radii)))
+
+
+@contextmanager
+def _refusals(kernel: str) -> Iterator[None]:
+    """What the kernels say of lengths and indices, as the one line that users see."""
+    try:
+        yield
+    except ValueError as error:
+        raise DyngsError(f"{kernel}: {error}") from None
 
 
 @torch.library.custom_op("dyngs::bin_tiles", mutates_args=(), device_types="cpu")
@@ -109,7 +136,7 @@ def _bin_tiles(
             _arrays(*splats), array(depths), _settings(size, thresholds), min(max_entries, MAX_ENTRIES)
         )
     except ValueError as error:  # std::length_error
-        raise DyngsError(f"render refused: {error}; lower the resolution, the scales or the number of views") from None
+        raise DyngsError(f"render refused: {error}; {REMEDY}") from None
     tile_offsets, slot_ranges, gaussians, slots = (torch.from_numpy(x) for x in entries)
     return tile_offsets, slot_ranges, gaussians, slots
 
@@ -127,6 +154,16 @@ def _(splats, depths, size, thresholds, max_entries):
     )
 
 
+def _picture(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Room for colours, transmittances and stops of V pictures."""
+    check_size(*size)
+    views, channels = colors.shape[0], colors.shape[2]
+    needed = views * size[0] * size[1] * ((channels + 1) * colors.element_size() + 4)
+    check_memory(needed, f"{views} picture(s) of {size[0]}x{size[1]} px with {channels} channels")
+    shape = (views, size[1], size[0])
+    return colors.new_empty(*shape, channels), colors.new_empty(shape), torch.empty(shape, dtype=torch.int32)
+
+
 @torch.library.custom_op("dyngs::blend", mutates_args=(), device_types="cpu")
 def _blend(
     means2d: Tensor,
@@ -141,18 +178,17 @@ def _blend(
     thresholds: list[float],
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    shape = (colors.shape[0], size[1], size[0])
-    color, transmittance = colors.new_empty(*shape, colors.shape[2]), colors.new_empty(shape)
-    stop = torch.empty(shape, dtype=torch.int32)
-    core.rasterize_forward(
-        _arrays(means2d, factors, opacities, radii),
-        array(colors),
-        None if background is None else array(background),
-        tuple(array(x) for x in entries),
-        _settings(size, thresholds),
-        (array(color), array(transmittance), array(stop), None),
-        0,
-    )
+    color, transmittance, stop = _picture(colors, size)
+    with _refusals("rasterize"):
+        core.rasterize_forward(
+            _arrays(means2d, factors, opacities, radii),
+            array(colors),
+            None if background is None else array(background),
+            tuple(array(x) for x in entries),
+            _settings(size, thresholds),
+            (array(color), array(transmittance), array(stop), None),
+            0,
+        )
     return color, transmittance, stop
 
 
@@ -179,18 +215,21 @@ def _blend_backward(
     with_probe: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     means2d, factors, opacities, colors, radii = splats
+    pairs, fields = len(entries[3]), MOMENTS + colors.shape[2] + 2 * absgrad
+    check_memory(pairs * fields * colors.element_size(), f"the gradients of {pairs} (Gaussian, tile) pairs")
     out = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means2d, factors, opacities, colors)]
     probe = means2d.new_empty(*opacities.shape, 4) if with_probe else means2d.new_empty(0)
-    core.rasterize_backward(
-        _arrays(means2d, factors, opacities, radii),
-        array(colors),
-        None if background is None else array(background),
-        tuple(array(x) for x in entries),
-        _settings(size, thresholds),
-        tuple(array(x) for x in (*grads, *image)),
-        (*(array(x) for x in out), array(probe) if with_probe else None),
-        absgrad,
-    )
+    with _refusals("rasterize, backward"):
+        core.rasterize_backward(
+            _arrays(means2d, factors, opacities, radii),
+            array(colors),
+            None if background is None else array(background),
+            tuple(array(x) for x in entries),
+            _settings(size, thresholds),
+            tuple(array(x) for x in (*grads, *image)),
+            (*(array(x) for x in out), array(probe) if with_probe else None),
+            absgrad,
+        )
     return out[0], out[1], out[2], out[3], probe
 
 
@@ -239,6 +278,7 @@ def bin_tiles(
     projection: Projection, opacities: Tensor, size: tuple[int, int], options: BlendOptions = BlendOptions()
 ) -> TileEntries:
     """Which splats each 16x16 tile shows, nearest first; arguments as for ``rasterize``."""
+    check_size(*size)  # before torch, which takes no integers from 2^63 on
     with torch.no_grad():
         splats = [projection.means2d, projection.factors, opacities, projection.radii]
         thresholds = options.thresholds
@@ -272,11 +312,16 @@ def rasterize(
         entries: what ``bin_tiles`` returned for the same splats, size and options, to save doing it again.
 
     Raises:
-        DyngsError: too many channels, or more (Gaussian, tile) pairs than ``options.max_entries``.
+        DyngsError: too many channels, sides above 2^23 px, more (Gaussian, tile) pairs than ``options.max_entries`` or
+            than memory holds, a picture larger than memory, or ``entries`` of another shape or with indices out of
+            range.
     """
     if not 1 <= colors.shape[-1] <= MAX_CHANNELS:
         raise DyngsError(f"colors have {colors.shape[-1]} channels; 1 to {MAX_CHANNELS} can be blended in one call")
-    entries = entries or bin_tiles(projection, opacities, size, options)
+    check_size(*size)
+    if entries is None:
+        entries = bin_tiles(projection, opacities, size, options)
+    entries.check()
     color, transmittance, _ = _blend(
         projection.means2d,
         projection.factors,
@@ -322,11 +367,9 @@ def tally(
     Other arguments as for ``rasterize``; colours and background matter to ``SQUARED_SLOPES`` only.
     """
     entries = bin_tiles(projection, opacities, size, options)
-    shape = (opacities.shape[0], size[1], size[0])
     colors = torch.zeros_like(opacities)[..., None] if colors is None else colors
     sums = torch.empty_like(opacities, memory_format=torch.contiguous_format)
-    color, transmittance = colors.new_empty(*shape, colors.shape[2]), colors.new_empty(shape)
-    image = (color, transmittance, torch.empty(shape, dtype=torch.int32), sums)
+    image = (*_picture(colors, list(size)), sums)
     splats = _arrays(projection.means2d, projection.factors, opacities, projection.radii)
     lists = tuple(array(x) for x in entries.tensors())
     settings = _settings(list(size), options.thresholds)

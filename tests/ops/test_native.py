@@ -96,3 +96,62 @@ def test_formulas_in_cpp(tmp_path: Path) -> None:
     done = subprocess.run([str(program)], capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stdout
     assert "all passed" in done.stdout
+
+
+# --- after a fork -----------------------------------------------------------------------------------------------------
+
+FORKED = """
+import os, signal, sys, warnings
+import torch
+from dyngs.camera import Cameras
+from dyngs.gaussians import Gaussians
+from dyngs.ops.native import kernel_threads, num_threads
+from dyngs.rendering import render
+
+def draw(count):
+    fields = torch.zeros(count, 3) + torch.tensor([0.0, 0, 3]), torch.ones(count, 4), torch.full((count, 3), -2.0)
+    gaussians = Gaussians(*fields, torch.zeros(count), torch.zeros(count, 1, 3))
+    intrinsics = torch.tensor([[[200.0, 0, 100], [0, 200, 100], [0, 0, 1]]])
+    return render(gaussians, Cameras(torch.eye(4)[None], intrinsics, 200, 200)).rgb
+
+before = draw(5000) if "threads" in sys.argv else None
+child = os.fork()
+if child == 0:
+    signal.alarm(100)  # ends a child that hangs
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        after = draw(5000)
+        with kernel_threads(4):
+            again = draw(5000)
+            threads = num_threads()
+    same = torch.equal(after, again) and (before is None or torch.equal(before, after))
+    print(same, torch.get_num_threads(), threads, *[w.message for w in caught], flush=True)
+    os._exit(0)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+def drawn_after_fork(*arguments: str, threads: int = 2) -> str:
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+        "OMP_NUM_THREADS": str(threads),
+    }
+    command = [sys.executable, "-c", FORKED, *arguments]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert run.returncode == 0, run.stderr[-2000:]
+    return run.stdout.strip()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks")
+def test_a_fork_of_a_process_with_threads_draws_on_one_and_says_so() -> None:
+    """It used to wait for ever for threads that only the parent has."""
+    assert drawn_after_fork("threads") == (
+        "True 1 1 dyngs and torch run on one thread: this process was forked from one that had started threads, which "
+        "it has not got; start processes with multiprocessing's 'spawn' method to use more"
+    )
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks")
+def test_a_fork_of_a_process_without_threads_may_start_some() -> None:
+    assert drawn_after_fork() == "True 2 4"
+    assert drawn_after_fork("threads", threads=1) == "True 1 4"

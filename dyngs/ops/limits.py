@@ -1,0 +1,38 @@
+"""How large a render may be: what the kernels can count, and what memory holds."""
+
+from __future__ import annotations
+
+from dyngs.errors import DyngsError
+from dyngs.ops.native import core
+
+MAX_SIDE: int = core.MAX_SIDE
+"""px; float32 has no pixel centres beyond 2^23"""
+
+UNASKED = 1 << 26
+"""Bytes that are allocated without asking how many are left, which takes 0.1 ms."""
+
+REMEDY = "lower the resolution, the scales or the number of views"
+
+
+def check_size(width: int, height: int) -> None:
+    """Nothing, if pictures of this size can be drawn.
+
+    Raises:
+        DyngsError: a side below 1 or above ``MAX_SIDE``.
+    """
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise DyngsError(f"render refused: a picture of {width}x{height} px; its sides can be 1 to {MAX_SIDE} px")
+
+
+def check_memory(size: int, what: str) -> None:
+    """Nothing, if ``size`` bytes for ``what`` fit what the machine, control groups and RLIMIT_AS leave this process.
+
+    Raises:
+        DyngsError: with both figures. (Where the system does not say, more than 16 GiB at once is refused.)
+    """
+    if size <= UNASKED:
+        return
+    available = core.available_memory()
+    if size > available:
+        needed, left = (f"{x / 1e9:.1f} GB" for x in (size, available))
+        raise DyngsError(f"render refused: {what} take {needed}; {left} of memory are available; {REMEDY}")

@@ -1,0 +1,196 @@
+"""Renders that are too large are refused in one line with the figures: no process ends, no bare MemoryError."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import dyngs
+from dyngs.camera import Cameras
+from dyngs.errors import DyngsError
+from dyngs.ops.limits import MAX_SIDE, check_memory, check_size
+from dyngs.ops.native import core
+from dyngs.ops.projection import Projection, project
+from dyngs.ops.rasterization import Tally, bin_tiles, rasterize, tally
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def veils(count: int = 1) -> Projection:
+    """Splats that cover any picture."""
+    return Projection(
+        means2d=torch.full((1, count, 2), 32.0),
+        depths=torch.ones(1, count),
+        factors=torch.tensor([1e-9, 0, 1e-9]).repeat(1, count, 1),
+        compensations=torch.ones(1, count),
+        radii=torch.full((1, count, 2), 10**9, dtype=torch.int32),
+    )
+
+
+@pytest.mark.parametrize("side", [-1, 0, MAX_SIDE + 1, 10**9, 2**31 - 8, 2**31, 2**63, 10**30])
+def test_sides_that_cannot_be_are_refused(side: int) -> None:
+    """2^31 - 8 + 15 overflowed an int; 2^63 does not reach the kernels at all."""
+    message = f"^render refused: a picture of {side}x5 px; its sides can be 1 to 8388608 px$"
+    with pytest.raises(DyngsError, match=message):
+        check_size(side, 5)
+    with pytest.raises(DyngsError, match=message):
+        bin_tiles(veils(), torch.ones(1, 1), (side, 5))
+    with pytest.raises(DyngsError, match=message):
+        tally(veils(), torch.ones(1, 1), (side, 5), Tally.WEIGHTS)
+    if side > 0:
+        cameras = Cameras(torch.eye(4)[None], torch.eye(3)[None], side, 5)
+        with pytest.raises(DyngsError, match=message):
+            project(torch.ones(1, 3), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1), cameras)
+
+
+def test_the_kernels_refuse_them_too() -> None:
+    for width, height, threads in ((0, 5, 1), (5, MAX_SIDE + 1, 1), (5, 5, 0), (5, 5, -3), (5, 5, 10**9)):
+        with pytest.raises(ValueError, match=r"is .*, expected 1 to"):
+            core.BlendSettings(width, height, 0.0, 0.99, 0.0, threads)
+        with pytest.raises(ValueError, match=r"is .*, expected 1 to"):
+            core.ProjectSettings(width, height, 0.3, 0.2, 1e10, 0.0, 0.0, False, threads)
+
+
+def test_a_picture_larger_than_memory_is_refused() -> None:
+    side = MAX_SIDE
+    with pytest.raises(
+        DyngsError, match=r"^render refused: .* 8388608x8388608 px have tiles .* GB of memory are available"
+    ):
+        bin_tiles(veils(), torch.ones(1, 1), (side, side))
+    nothing = bin_tiles(veils(), torch.zeros(1, 1), (16, 16))
+    with pytest.raises(
+        DyngsError, match=r"^render refused: 1 picture\(s\) .* 3 channels take 1407374.9 GB; .* available"
+    ):
+        rasterize(veils(), torch.ones(1, 1), torch.ones(1, 1, 3), (side, side), entries=nothing)
+
+
+def test_pairs_beyond_counting_are_refused_soon() -> None:
+    """A million veils on 8 million tiles: 8e12 pairs, of which some are counted."""
+    count = 10**6
+    with pytest.raises(DyngsError, match=r"meet at least \d+ tiles, more than the limit of 2147483647"):
+        bin_tiles(veils(count), torch.ones(1, count), (2**14, 2**17))
+
+
+def test_memory_that_is_there_is_not_asked_for() -> None:
+    check_memory(10**6, "this")
+    with pytest.raises(
+        DyngsError, match=r"^render refused: this take 1000000000.0 GB; \d+\.\d GB of memory are available"
+    ):
+        check_memory(10**18, "this")
+
+
+# --- what the system says ---------------------------------------------------------------------------------------------
+
+
+def system(folder: Path, files: dict[str, str]) -> str:
+    files = {"proc/meminfo": "MemTotal: 9 kB\nMemAvailable:    8000000 kB\n"} | files
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return str(folder)
+
+
+def test_memory_of_the_machine(tmp_path: Path) -> None:
+    assert core.available_memory(system(tmp_path, {})) == 8_192_000_000
+
+
+@pytest.mark.parametrize("limit", ["max", "9223372036854771712", "99999999999999999999"])
+def test_control_groups_without_a_limit(tmp_path: Path, limit: str) -> None:
+    files = {"proc/self/cgroup": "0::/a\n", "sys/fs/cgroup/a/memory.max": limit, "sys/fs/cgroup/a/memory.current": "5"}
+    assert core.available_memory(system(tmp_path, files)) == 8_192_000_000
+
+
+def test_the_narrowest_control_group_counts(tmp_path: Path) -> None:
+    """Files that the kernel can drop are not used up."""
+    group = "sys/fs/cgroup/user.slice"
+    files = {
+        "proc/self/cgroup": "1:name=systemd:/x\n0::/user.slice/app\n",
+        f"{group}/memory.max": "3000000000\n",
+        f"{group}/memory.current": "2000000000\n",
+        f"{group}/memory.stat": "anon 1\ninactive_file 500000000\n",
+        f"{group}/app/memory.max": "max\n",
+    }
+    assert core.available_memory(system(tmp_path, files)) == 1_500_000_000
+
+
+def test_control_groups_of_version_1(tmp_path: Path) -> None:
+    group = "sys/fs/cgroup/memory"
+    files = {
+        "proc/self/cgroup": "9:cpu:/\n4:memory:/job\n0::/\n",
+        f"{group}/memory.limit_in_bytes": "9223372036854771712\n",
+        f"{group}/job/memory.limit_in_bytes": "2000000000\n",
+        f"{group}/job/memory.usage_in_bytes": "2500000000\n",
+        f"{group}/job/memory.stat": "total_inactive_file 100000000\n",
+    }
+    assert core.available_memory(system(tmp_path, files)) == 0
+
+
+def test_nothing_is_known_of_the_system(tmp_path: Path) -> None:
+    assert core.available_memory(str(tmp_path)) == 2**63 - 1
+
+
+# --- in a process with little memory ----------------------------------------------------------------------------------
+
+CHILD = """
+import resource, torch
+from dyngs.camera import Cameras
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.ops.native import core
+from dyngs.rendering import render
+
+def draw(count, side):
+    means = torch.tensor([[0.0, 0, 3]]).repeat(count, 1).requires_grad_()
+    veils = Gaussians(means, torch.ones(count, 4), torch.full((count, 3), 9.0), torch.full((count,), 9.0),
+                      torch.zeros(count, 1, 3))
+    intrinsics = torch.tensor([[[30.0, 0, side / 2], [0, 30, side / 2], [0, 0, 1]]])
+    return render(veils, Cameras(torch.eye(4)[None], intrinsics, side, side)).rgb.sum()
+
+def refusal(megabytes, act):
+    pages, hard = int(open("/proc/self/statm").read().split()[0]), resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + megabytes * 10**6, hard))
+    try:
+        act()
+    except DyngsError as error:
+        print(error)
+    resource.setrlimit(resource.RLIMIT_AS, (hard, hard))
+
+torch.set_num_threads(2)
+drawn = draw(300, 2048)
+refusal(1000, lambda: draw(2000, 4096))
+refusal(500, lambda: draw(1, 8192))
+refusal(100, drawn.backward)
+x, params = torch.zeros(9216, 1), torch.zeros(3 * 2**19 + 1)
+refusal(150, lambda: core.perceptron_forward(x, params, torch.zeros(9216, 1), None, [1, 2**19, 1], 0, 2))
+print(float(draw(3, 64)))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_AS")
+def test_what_memory_does_not_hold_is_refused() -> None:
+    """Pairs, a picture, gradients, and scratch memory that threads used to allocate; after which all is well."""
+    path = os.pathsep.join([str(Path(dyngs.__file__).parents[1]), *(p for p in sys.path if p)])
+    environment = os.environ | {"PYTHONPATH": path}
+    run = subprocess.run([sys.executable, "-c", CHILD], env=environment, capture_output=True, text=True, timeout=300)
+    assert run.returncode == 0, run.stderr[-2000:]
+    pairs, picture, gradients, scratch, drawn = run.stdout.splitlines()
+    left, remedy = r"\d\.\d\d?\d? GB of memory are available", "lower the resolution, the scales or the number of views"
+    assert re.fullmatch(
+        r"render refused: 2000 Gaussians in 1 view\(s\) of 4096x4096 px meet 131072000 tiles, "
+        rf"whose lists take 2\.6 GB; {left}; {remedy}",
+        pairs,
+    )
+    assert re.fullmatch(
+        rf"render refused: 1 picture\(s\) of 8192x8192 px with 3 channels take 1\.3 GB; {left}; {remedy}", picture
+    )
+    assert re.fullmatch(
+        rf"render refused: the gradients of 4915200 \(Gaussian, tile\) pairs take 0\.2 GB; {left}; {remedy}", gradients
+    )
+    assert re.fullmatch(r"out of memory: \d\.\d* GB are available; ask for less at once", scratch)
+    assert float(drawn) > 0
