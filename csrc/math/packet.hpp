@@ -40,7 +40,7 @@ struct Mask {
 };
 
 template <class S>
-struct alignas(64) Packet {
+struct Packet {  // aligned as its vector is
   using Vec = typename LaneTypes<S>::Vec;
   Vec v;
 
