@@ -285,7 +285,7 @@ int main(int argc, char** argv) {
   for (int channels : {1, 3, 4, 7, kMaxChannels}) test_small(channels);
   test_thresholds();
   test_threads<float>(3000, 0.05), test_threads<double>(500, 0.05);  // spans are shared out beyond 2048
-  if (argc > 1 && std::string(argv[1]) == "large") test_threads<float>(600000, 0.003);
+  if (argc > 1 && std::string(argv[1]) == "large") test_threads<float>(300000, 0.003);
   test_limit_of_entries();
   test_nothing_to_draw();
   return report();
