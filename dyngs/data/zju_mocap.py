@@ -253,6 +253,6 @@ def _by_name(path: Path) -> dict[str, dict[str, object]]:
 
 def _items(where: object, fields: object, key: str) -> list[object]:
     value = entry(where, fields, key)
-    if not isinstance(value, (list, tuple, np.ndarray)):
+    if not isinstance(value, (list, tuple, np.ndarray)) or (isinstance(value, np.ndarray) and not value.ndim):
         raise DyngsError(f"{where}: '{key}' must be a list; export it again")
     return list(value)

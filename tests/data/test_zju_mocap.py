@@ -228,6 +228,8 @@ def test_missing_files(tmp_path: Path) -> None:
         (lambda a: a["cams"]["K"].pop(), "one K, D, R and T per camera, got {'K': 3"),
         (lambda a: a["cams"].pop("R"), "cams: the key 'R' is missing"),
         (lambda a: a["cams"].update(R=3), "cams: 'R' must be a list"),
+        (lambda a: a["cams"].update(R=np.array({}, dtype=object)), "cams: 'R' must be a list"),
+        (lambda a: a["ims"][0]["ims"].__setitem__(0, "9" * 3000 + ".jpg"), "no frame number in the name"),
         (lambda a: a.update(cams=[]), "cams: must be a dictionary"),
         (lambda a: a["cams"]["K"].__setitem__(1, [[1], [2, 3]]), "camera 1: the intrinsics must hold 3x3 finite"),
         (lambda a: a["cams"]["K"].__setitem__(1, np.diag([-1.0, 1, 1])), "camera 1: fl_x must be positive"),

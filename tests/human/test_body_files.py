@@ -258,6 +258,19 @@ def test_wrong_objs(old: str, new: str, words: str, tmp_path: Path) -> None:
     assert re.search(words, refusal(file, obj))
 
 
+def test_an_obj_of_another_body_is_not_read_to_its_end(tmp_path: Path) -> None:
+    file = write_npz(tmp_path / "model.npz", model("smpl"))
+    for line in ("v 0 0 0", "vt 0 0", "v 0 0 0\nvt 0 0\nf 1/1 1/1 1/1"):
+        (tmp_path / "uv.obj").write_text(f"{line}\n" * 50_000 + "f that would be a fault\n")
+        assert "the body has 30 and 40; give the .obj made for this body" in refusal(file, tmp_path / "uv.obj")
+
+
+def test_templates_of_many_vertices_are_refused_before_they_become_larger(tmp_path: Path) -> None:
+    """Weights of 55 joints: 300,000 vertices in a megabyte would become 130 MB."""
+    arrays = model("smplx") | {"v_template": np.zeros((300_000, 3), np.int8)}
+    assert "asks for 300,000 vertices, of which 250,000 are read" in refusal(write_npz(tmp_path / "m.npz", arrays))
+
+
 def test_an_obj_that_is_not_there_or_no_text(tmp_path: Path) -> None:
     file = write_npz(tmp_path / "model.npz", model("smpl"))
     assert "No such file" in refusal(file, tmp_path / "none.obj")
