@@ -23,8 +23,9 @@ _MOST_REMEMBERED = 1 << 20
 _MOST_NUMBER_KEYS = 1 << 16
 _LARGEST_KEY = 1 << 31
 """Of keys that are no text: a file can choose large numbers, or fractions, that a dictionary finds slowly."""
-_MOST_ENTRIES = 1 << 24
-"""Values with shared ones counted wherever they are, beside two for each byte of the file."""
+_MOST_ENTRIES = 1 << 20
+"""Values with shared ones counted wherever they are, beside two for each byte of the file and those of its sparse
+matrices."""
 _DEEPEST = 100
 _LONGEST_KEY = 4096
 _LONGEST_LINE = 1000
@@ -63,7 +64,7 @@ class Machine:
                 raise ValueError(f"its instruction {code!r} is not one of numbers, text and arrays")
             step(self)
         found = self.pop()
-        require_tree(self._path, found, 2 * self._size)
+        require_tree(self._path, found, 2 * self._size + self._arrays.sparse_entries)
         return found
 
     # --- the file -----------------------------------------------------------------------------------------------------

@@ -89,12 +89,15 @@ class Arrays:
         path: the file, for messages.
         size: bytes of it.
         read: returns the next bytes of the file, as many as it is told.
+
+    Attributes:
+        sparse_entries: of the sparse matrices so far, zeros included.
     """
 
     def __init__(self, path: Path, size: int, read: Callable[[int], bytes]) -> None:
         self._path, self._read = path, read
         self._bytes_left = _BYTES_PER_BYTE * size + (1 << 16)
-        self._entries = 0
+        self.sparse_entries = 0
 
     def named(self, module: object, name: object) -> Name:
         """What the file calls ``module.name``. Raises ValueError for what is not known."""
@@ -184,8 +187,8 @@ class Arrays:
         fits = data.ndim == row.ndim == pointers.ndim == 1 and len(pointers) == width + 1
         if not fits or not len(data) == len(row) or row.dtype.kind not in "iu":
             raise ValueError("a sparse matrix in it is damaged")
-        self._entries += entries
-        require_at_most(self._path, self._entries, _MOST_ENTRIES, "entries of sparse matrices")
+        self.sparse_entries += entries
+        require_at_most(self._path, self.sparse_entries, _MOST_ENTRIES, "entries of sparse matrices")
         counts = np.diff(pointers.astype(np.int64))
         if counts.min(initial=0) < 0 or counts.sum() != len(data) or ((row < 0) | (row >= height)).any():
             raise ValueError("a sparse matrix in it is damaged")

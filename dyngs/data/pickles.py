@@ -19,8 +19,8 @@ def read_pickle(path: Path) -> object:
 
     Pickles of Python 2 and uncompressed ones of joblib are read, too. Sparse matrices of SciPy and arrays of chumpy
     (none of which is needed for it) become plain arrays. What is returned never contains itself and is at most 100
-    containers deep; with shared parts counted wherever they are, it has about as many entries as the file has bytes, or
-    17 million (``dyngs.data.limits``).
+    containers deep; with shared parts counted wherever they are, it has two entries for each byte of the file and a
+    million more at most, beside those of sparse matrices (``dyngs.data.limits``).
 
     Raises:
         DyngsError: the file is missing or damaged, or holds anything else, or asks for too much.
