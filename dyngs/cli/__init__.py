@@ -92,7 +92,7 @@ class _Parser(argparse.ArgumentParser):
     """A parser whose complaints are one line."""
 
     def error(self, message: str) -> NoReturn:
-        raise DyngsError(f"{message} (see `{self.prog} --help`)")
+        raise DyngsError(f"{printable(message, 400)} (see `{self.prog} --help`)")
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -29,9 +31,10 @@ from dyngs.rendering import RenderOptions, render
 from dyngs.static.densify import EditResult
 from dyngs.static.model import Drawn
 from dyngs.train.assemble import assemble
-from dyngs.train.checkpoint import stored_scene
+from dyngs.train.checkpoint import _KIND, load_checkpoint, stored_scene
 from dyngs.train.scene import moment_of, num_colour_values
 from dyngs.train.step import Trainer
+from dyngs.train.tensor_file import write_tensors
 
 
 @pytest.fixture(scope="module")
@@ -326,3 +329,35 @@ def test_a_checkpoint_of_another_model_is_refused(capture: Path) -> None:
     del checkpoint.tensors["sampler.order"]
     with pytest.raises(DyngsError, match="lacks 'order'"):
         trainer.restore(checkpoint)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("exp_avg.means", lambda x: x[1:], r"'exp_avg.means' is float32 \(49, 3\), not float32 \(50, 3\)"),
+        ("exp_avg_sq.sh", lambda x: x[:, :1], "'exp_avg_sq.sh' is float32"),
+        ("exp_avg.quats", lambda x: x.double(), "'exp_avg.quats' is float64"),
+        ("exp_avg_sq.means", lambda x: x / 0, "'exp_avg_sq.means' holds NaN"),
+        ("gaussians.quats", lambda x: x[:, :3], "quats must be"),
+        ("sampler.order", lambda x: torch.tensor([7]), "'order' names something beyond the 2"),
+        ("sampler.position", lambda x: x + 99, "'position' names something beyond"),
+        ("strategy.seen", lambda x: x.long(), "'seen' is int64"),
+        ("rng", lambda x: x[:9], "cannot be read"),
+        ("rng", lambda x: x.float(), "cannot be read"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_one_line(
+    capture: Path, tmp_path: Path, name: str, change: Callable[[Tensor], Tensor], said: str
+) -> None:
+    trainer = _trainer(capture)
+    trainer.step()
+    whole = trainer.checkpoint()
+    path = tmp_path / "checkpoints" / "step_0000001.safetensors"
+    path.parent.mkdir()
+    tensors = whole.tensors | {name: change(whole.tensors[name])}
+    write_tensors(path, _KIND, {name: x.contiguous() for name, x in tensors.items()}, asdict(whole.info))
+    with pytest.raises(DyngsError, match=said) as caught:
+        trainer.restore(load_checkpoint(path))
+    assert str(caught.value).startswith(str(path))
+    trainer.restore(whole)
+    trainer.step()

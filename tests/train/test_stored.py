@@ -80,6 +80,42 @@ def test_a_file_that_changes_pictures_more_than_allowed_is_not_written(
     assert not (tmp_path / "small").exists()
 
 
+@pytest.mark.parametrize("moves", [True, False])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"logit_opacities": 3e38},
+        {"logit_opacities": -3e38},
+        {"sh": 3e38},
+        {"quats": 0.0},
+        {"quats": 1e-30},
+        {"log_scales": 80.0},
+        {"log_scales": -1e38},
+        {"means": 3e38, "quats": 3e38},
+    ],
+)
+def test_extremes_are_stored_as_they_are_drawn(tmp_path: Path, values: dict[str, float], moves: bool) -> None:
+    run_dir = write_moving_run(tmp_path, moves=moves)
+    with_outlier(run_dir, **values)
+    change = write_compact(run_dir, tmp_path / "small", 1.0).precision.change
+    assert change is not None
+    assert change <= 1.0
+    assert len(load_run(tmp_path / "small").scene) == 5
+
+
+@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("degree", range(5))
+def test_no_gaussian_and_one_of_any_degree_are_stored(tmp_path: Path, count: int, degree: int) -> None:
+    run_dir = write_moving_run(tmp_path, moves=False)
+    checkpoint = latest_checkpoint(run_dir)
+    tensors = {name: x[:count].clone() for name, x in checkpoint.tensors.items()}
+    tensors["gaussians.sh"] = torch.ones(count, (degree + 1) ** 2, 3)
+    save_checkpoint(run_dir, replace(checkpoint, tensors=tensors), 1.0)
+    write_compact(run_dir, tmp_path / "small", 1.0)
+    assert tuple(load_run(tmp_path / "small").scene.gaussians.sh.shape) == (count, (degree + 1) ** 2, 3)
+
+
 def test_without_its_capture_steps_are_assumed(tmp_path: Path) -> None:
     run_dir = write_moving_run(tmp_path)
     shutil.rmtree(tmp_path / "capture")
