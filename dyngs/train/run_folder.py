@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,8 +20,8 @@ SMALL_FOLDER = "small"
 """In a run folder: the run as a file of at most ``budget.max_mb``."""
 _BEGUN = (RESOLVED_NAME, LOG_NAME, TIMING_NAME)
 """What a run that was stopped before its first checkpoint may have written."""
-_OLD_LEFTOVER = re.compile(r"\.step_\d+\.\d+\.safetensors")
-"""Earlier versions called a checkpoint so while they wrote it."""
+_OLD_LEFTOVER = re.compile(r"\.step_\d+\.\d+\.safetensors|\.tmp[A-Za-z0-9]{6}")
+"""Earlier versions, and the library that they let write there, called a checkpoint so while they wrote it."""
 
 
 def require_no_run(folder: Path) -> None:
@@ -54,6 +55,8 @@ def require_empty(folder: Path) -> None:
             pass
     if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
         raise DyngsError(f"{folder}: exists already; give another --out")
+    if folder.exists() and not os.access(folder, os.W_OK):
+        raise DyngsError(f"{folder}: cannot be written; give another --out or change its permissions")
 
 
 @contextmanager
@@ -151,7 +154,7 @@ def tidy(folder: Path, *, sole_writer: bool) -> None:
         if not inner.is_symlink():
             remove_leftovers(inner, (lambda _: True) if sole_writer else None)
     if sole_writer and not checkpoints.is_symlink():
-        for path in checkpoints.glob(".step_*"):
+        for path in checkpoints.glob(".*"):
             if _OLD_LEFTOVER.fullmatch(path.name):
                 remove_quietly(path)
 

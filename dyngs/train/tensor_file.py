@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from dyngs.data.temporary import remove_quietly, temporary_folder_beside
 from dyngs.data.write import whole_file
 from dyngs.errors import DyngsError, reason
 
@@ -51,11 +53,16 @@ def write_tensors(
     full = {"format": kind.version, **header}
     full["digest"] = _digest(tensors, full)
     with whole_file(path, durable=True) as temporary:
+        # The library begins a file under a name of its own, which a kill would leave: so in a folder known as ours.
+        folder = temporary_folder_beside(path.with_suffix(""))
         try:
             # One key only: the library writes several in random order.
-            save_file(dict(tensors), temporary, metadata={kind.key: json.dumps(full, sort_keys=True)})
+            save_file(dict(tensors), folder / path.name, metadata={kind.key: json.dumps(full, sort_keys=True)})
+            os.replace(folder / path.name, temporary)
         except SafetensorError as error:
             raise DyngsError(f"cannot write {path}: {error}; free some space{advice}") from None
+        finally:
+            remove_quietly(folder)
 
 
 def read_tensors(path: Path, kind: FileKind, advice: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
