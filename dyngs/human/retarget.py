@@ -204,12 +204,14 @@ def _alignments(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> d
 
 def least_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """(3, 3) the smallest rotation that takes one unit vector to another; half a turn about any axis for opposites."""
-    axis, cos = np.cross(start, end), float(start @ end)
-    if cos < -1 + 1e-9:
+    axis = np.cross(start, end)
+    angle = np.arctan2(np.linalg.norm(axis), start @ end)  # exact near half a turn, where the cosine says nothing
+    if not axis.any():
         axis = np.cross(start, np.eye(3)[np.abs(start).argmin()])
-        return Rotation.from_rotvec(np.pi * axis / np.linalg.norm(axis)).as_matrix()
-    cross = np.cross(np.eye(3), axis)  # rows e_i x axis: the matrix of axis x
-    return np.eye(3) + cross + cross @ cross / (1 + cos)
+    axis = axis / np.abs(axis).max()  # first, as squares of 1e-200 vanish
+    axis = axis / np.linalg.norm(axis)
+    axis = axis - start * (start @ axis)  # of nearly opposite vectors the product is not quite across them
+    return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
 
 
 def _leg_length(at: dict[str, np.ndarray]) -> float:

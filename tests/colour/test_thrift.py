@@ -102,7 +102,7 @@ def test_the_fewest_that_are_worth_nearly_everything(seed: int, count: int, tole
     changes, worths = torch.rand(count, generator=g), torch.randn(count, generator=g)
     without = float(worths.clamp_min(0).sum()) + 1
     keeps = first_worthwhile(changes, worths, without, tolerance)
-    order = changes.argsort(descending=True)
+    order = changes.argsort(descending=True, stable=True)
     errors = [without - float(worths[order[:k]].double().sum()) for k in range(count + 1)]
     limit = min(errors) * 10 ** (tolerance / 10) * (1 + 1e-9)
     chosen = int(keeps.sum())

@@ -13,8 +13,9 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 from dyngs.ops.loss import _l1_ssim, _ssim_map, l1_ssim_loss, reference_l1_ssim, ssim
 
-# float32 blurs of 121 taps: about 1e-7 per pixel relative to the largest; the issue asks for 1e-5.
-TOLERANCE = 2e-6
+# Two blurs along two axes, of 11 additions of half a unit each, for the value and again for its gradient; the pictures
+# have contrast everywhere, so nothing cancels after that. Of 3,300 draws none had more than 4 units.
+TOLERANCE = 44 * 0.5 * torch.finfo(torch.float32).eps
 
 
 def make_pictures(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
