@@ -395,7 +395,7 @@ class RunConfig(Section):
     name: str = "static"
     dir: Path | None = Field(default=None, description="run folder; default runs/NAME")
     seed: int = Field(default=42, ge=0)
-    threads: int = Field(default=0, ge=0, description="0 = all cores")
+    threads: int = Field(default=0, ge=0, le=1024, description="0 = all cores")
 
 
 class Config(Section):

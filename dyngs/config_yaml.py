@@ -6,7 +6,6 @@ the text that it was written as; the schema says what it must be.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ import yaml
 from yaml.composer import ComposerError
 from yaml.reader import ReaderError
 
-from dyngs.errors import DyngsError, printable, reason
+from dyngs.errors import DyngsError, printable, reason, require_name
 
 MAX_BYTES = 2**20
 """Of a preset or an override; the longest that we know has 5 KB."""
@@ -198,9 +197,6 @@ def require_usable(leaf: Leaf) -> None:
     """Nothing, if a text can name a file: no NUL, nothing that is no character. Raises DyngsError."""
     if isinstance(leaf.value, str):
         try:
-            if b"\0" not in os.fsencode(leaf.value):
-                return
-        except UnicodeEncodeError:
-            pass
-        dotted = printable(".".join(leaf.keys), _SHOWN)
-        raise DyngsError(f"{leaf.origin}: {dotted} holds a character that no name or path may hold; remove it")
+            require_name(leaf.value)
+        except DyngsError as error:
+            raise DyngsError(f"{leaf.origin}: {printable('.'.join(leaf.keys), _SHOWN)}: {error}") from None

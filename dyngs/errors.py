@@ -42,6 +42,16 @@ def reading(path: str | os.PathLike[str], advice: str = "copy or export it again
         raise DyngsError(f"{where}: cannot be read ({reason(cause).removesuffix(f': {where}')}); {advice}") from cause
 
 
+def require_name(text: str) -> None:
+    """Nothing, if ``text`` may name a file: no NUL, nothing that is no character. Raises DyngsError."""
+    try:
+        if b"\0" not in os.fsencode(text):
+            return
+    except UnicodeEncodeError:
+        pass
+    raise DyngsError(f"{printable(text, _MAX_REASON)!r} holds a character that no name or path may hold; remove it")
+
+
 def reason(error: BaseException) -> str:
     """What ``error`` says, on one short line of printable characters; its type where it does not say much."""
     if isinstance(error, OSError) and error.strerror:

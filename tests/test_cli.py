@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from moving_scene import moved_x, write_moving_run
 
 import dyngs
@@ -496,3 +497,26 @@ def test_one_openmp_runtime() -> None:
     code = "import dyngs.ops.native\nfrom dyngs.cli.doctor import openmp_runtimes\nprint(len(openmp_runtimes() or [1]))"
     done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "1"
+
+
+@pytest.mark.parametrize("text", ["-1", "1.5", "x", "9" * 30, "²", "2000"])
+@pytest.mark.parametrize("command", [("render", "."), ("eval", "."), ("compact", ".", "--out", "x"), ("demo",)])
+def test_threads_are_counted(capsys: pytest.CaptureFixture[str], command: tuple[str, ...], text: str) -> None:
+    assert "is not a number of threads" in error_line(capsys, *command, "--threads", text)
+
+
+@pytest.mark.parametrize("text", ["a\0b", "\ud800"])
+def test_words_that_can_name_nothing_are_refused(capsys: pytest.CaptureFixture[str], text: str) -> None:
+    for words in (("render", ".", "--out", text), ("export", text), ("train", f"run.dir={text}")):
+        assert "holds a character that no name or path may hold" in error_line(capsys, *words)
+
+
+def test_memory_that_torch_cannot_have_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("dyngs.cli.render.run", lambda _: torch.empty(2**60))
+    assert "out of memory" in error_line(capsys, "render", ".")
+
+
+def test_long_words_are_cut_in_messages(capsys: pytest.CaptureFixture[str]) -> None:
+    assert len(error_line(capsys, "render", ".", "--time", "9" * 5000)) < 600

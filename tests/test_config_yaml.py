@@ -94,7 +94,7 @@ def test_odd_values_are_named_with_what_is_allowed(text: str, said: str) -> None
 
 @pytest.mark.parametrize("text", [f"/a/{chr(0)}b", '"/a/\\x00"', '"\\ud800"'])
 def test_paths_hold_no_nul_and_no_half_characters(text: str) -> None:
-    assert "data.root holds a character that no name or path may hold" in refused(None, f"data.root={text}")
+    assert "holds a character that no name or path may hold; remove it" in refused(None, f"data.root={text}")
 
 
 def test_a_path_that_is_not_utf8_is_kept(tmp_path: Path) -> None:

@@ -21,11 +21,12 @@ from typing import NoReturn
 
 from dyngs import __version__
 from dyngs.cli import bench, compact, data, demo, doctor, evaluate, export, predict, render, tradeoff, train
-from dyngs.errors import DyngsError, printable
+from dyngs.errors import DyngsError, printable, require_name
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
 _OUT_OF_MEMORY = "out of memory; use smaller pictures (data.longest_side) or a smaller cache (data.cache_mb)"
+_TORCH_OUT_OF_MEMORY = "DefaultCPUAllocator: can't allocate memory"
 _OVERRIDE = re.compile(r"[a-z]\w*(\.\w+)+=.*", re.DOTALL)
 
 
@@ -37,7 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         code = _dispatch(arguments)
         sys.stdout.flush()
         return code
-    except (DyngsError, MemoryError) as error:
+    except (DyngsError, MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and _TORCH_OUT_OF_MEMORY not in str(error):
+            raise
         if debug:
             traceback.print_exception(error)
         return _fail(str(error) if isinstance(error, DyngsError) else _OUT_OF_MEMORY)
@@ -65,6 +68,8 @@ def _show_any_name() -> None:
 
 
 def _dispatch(arguments: list[str]) -> int:
+    for word in arguments:
+        require_name(word)
     parser = make_parser()
     try:
         parsed = _parsed(parser, arguments)

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dyngs.cli.render import threads
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -45,7 +47,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument("--masks", metavar="K", help="key times of masks of what is seen (default none)")
     parser.add_argument("--steps", metavar="N", help="of fine-tuning (default 2000)")
-    parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
+    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="0 = all cores")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="any other key of the run (docs/cli.md)")
     parser.set_defaults(run=run)
 

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dyngs.cli.render import threads
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
     parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
     parser.add_argument("--frames", type=int, default=100, metavar="N", help="taken from a video (default 100)")
-    parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
+    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="0 = all cores")
     parser.add_argument("overrides", nargs="*", metavar="data.key=value", help="data.follow_links, data.max_megapixels")
     parser.set_defaults(run=run_sfm)
 

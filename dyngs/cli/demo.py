@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dyngs.cli.render import threads
 from dyngs.errors import DyngsError
 
 
@@ -17,7 +18,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument("--out", type=Path, default=Path("dyngs-demo"), metavar="DIR", help="default dyngs-demo")
     parser.add_argument("--steps", type=int, default=3000, metavar="N", help="of training (default 3000)")
-    parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
+    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="0 = all cores")
     parser.set_defaults(run=run)
 
 

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dyngs.cli.render import threads
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -22,7 +24,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("run_dir", type=Path, metavar="RUN", help="folder that `dyngs train` wrote")
     parser.add_argument("--split", choices=("test", "val", "train", "pose"), default="test")
     parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
-    parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
+    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="0 = all cores")
     parser.set_defaults(run=run)
 
 

@@ -14,6 +14,8 @@ from dyngs.errors import DyngsError
 if TYPE_CHECKING:
     from dyngs.view.frames import Shot
 
+MAX_THREADS = 1024
+
 _EPILOG = """\
 examples:
   dyngs render runs/bench --out pictures                          the test views and a contact sheet
@@ -66,7 +68,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="z", help="of a .ply; --up=-y suits many COLMAP ones"
     )
-    parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
+    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="0 = all cores")
     parser.set_defaults(run=run)
 
 
@@ -190,6 +192,15 @@ def moment(text: str) -> float:
     return time
 
 
+def threads(text: str) -> int:
+    """The number of threads that ``text`` names, 0 for all cores."""
+    if not (text.isascii() and text.isdigit() and len(text) < 5 and int(text) <= MAX_THREADS):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a number of threads; write a whole number up to {MAX_THREADS}, 0 for all cores"
+        )
+    return int(text)
+
+
 def _size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.lower())
     if not match or "0" in match.groups():
@@ -198,6 +209,6 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _count(text: str) -> int:
-    if not text.isdigit() or not int(text):
+    if not (text.isdecimal() and len(text) < 10 and int(text)):
         raise argparse.ArgumentTypeError(f"{text!r} is not a number of frames; write a whole number above 0")
     return int(text)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dyngs.cli.render import threads
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     goal = parser.add_mutually_exclusive_group()
     goal.add_argument("--minimize", metavar="FIGURE", help="what is best: psnr, ssim, lpips, fps, mb, memory_mb, ...")
     goal.add_argument("--maximize", metavar="FIGURE", help="(default psnr)")
-    parser.add_argument("--threads", type=int, default=0, metavar="N", help="0 = all cores")
+    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="0 = all cores")
     parser.set_defaults(run=run)
 
 

@@ -147,7 +147,7 @@ def view_to_show(capture: Capture, name: str | None = None, split: str | None = 
             if name in (view.name, stem):
                 return view
     first = candidates[0]
-    if name.isascii() and name.isdigit() and int(name) < len(first):
+    if name.isascii() and name.isdigit() and len(name) < 10 and int(name) < len(first):
         return first[int(name)]
     raise DyngsError(
         f"{capture.root}: no view {name!r}; the split {order[0]} has {len(first)} views: {first[0].name} (0) to "
