@@ -34,6 +34,7 @@ MANY_PARAMETERS = {
 
 HEAVY = ("pycolmap", "trimesh", "kornia", "OpenImageIO", "skimage", "av", "rich", "tensorboard", "lpips")
 WITHOUT_MIRROR = {
+    "test_fuzz.py": "about all readers, by the folder fuzz beside the tests",
     "test_layout.py": "about the repository, not one module",
     "test_numerics.py": "the table of docs/numerics.md",
 }
@@ -109,7 +110,9 @@ def test_no_drawer_for_odds_and_ends() -> None:
 def test_no_paths_of_one_machine() -> None:
     homes = "|".join(("work", "home", "root", "opt", "mnt", "Users"))
     pattern = re.compile(rf"[\"'(\s=](/({homes})/|[A-Z]:\\Users)")
-    folders = [f for f in ("dyngs", "csrc", "tests", "configs", "docs", "benchmarks", ".ci") if (ROOT / f).is_dir()]
+    folders = [
+        f for f in ("dyngs", "csrc", "tests", "fuzz", "configs", "docs", "benchmarks", ".ci") if (ROOT / f).is_dir()
+    ]
     files = [f for folder in folders for f in (ROOT / folder).rglob("*") if f.is_file() and f.stat().st_size < 2**20]
     files += [ROOT / f for f in ("README.md", "pyproject.toml", "CMakeLists.txt") if (ROOT / f).is_file()]
     found = [relative(f) for f in files if f != Path(__file__) and pattern.search(f.read_text("utf-8", "ignore"))]

@@ -1,0 +1,325 @@
+"""What is fuzzed: every reader of files or texts from others, with its seeds and what a user does with what it read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fuzz import seed_files as files
+from fuzz.seeds import (
+    Seed,
+    write_blender,
+    write_body_json,
+    write_camera_folders,
+    write_colmap_binary,
+    write_colmap_text,
+    write_llff,
+    write_llff_videos,
+    write_nerfstudio,
+    write_neuman,
+    write_neuman_aligned,
+    write_people_snapshot,
+    write_small_nerfies,
+    write_zju,
+    write_zju_single,
+)
+
+if TYPE_CHECKING:
+    from dyngs.human.body import Body
+    from dyngs.rendering import Rendering
+    from dyngs.train.scene import Scene
+
+Read = Callable[[Path], object]
+"""Reads what is in a folder and uses it; returns what must be finite."""
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader under test.
+
+    Attributes:
+        seeds: name to what writes it.
+        read: reads the folder.
+        writes: it is a run folder, in which may be written.
+        names_file: errors must name the file; those about words of the command line name the word.
+        needs: package without which it cannot be tried.
+    """
+
+    seeds: Mapping[str, Seed]
+    read: Read
+    writes: bool = False
+    names_file: bool = True
+    needs: str | None = None
+
+
+def read_whole_capture(root: Path) -> object:
+    """As ``dyngs data inspect --deep`` and the first steps of ``dyngs train``: report, views, points, pictures."""
+    from dyngs.config import DataConfig
+    from dyngs.data.inspect import format_report, inspect_capture
+    from dyngs.data.loader import PictureLoader
+    from dyngs.data.read import read_capture
+    from dyngs.errors import DyngsError
+    from dyngs.human.clips import footage
+
+    options = DataConfig.model_validate({"root": root})
+    try:
+        capture = read_capture(options)
+    except DyngsError:
+        report = inspect_capture(options)
+        if not report.problems:
+            raise AssertionError("refused, but nothing suspicious in its report") from None
+        require_lines(format_report(report))
+        raise
+    require_lines(format_report(inspect_capture(options, deep=True)))
+    views = capture.splits["train"]
+    found: list[object] = [capture.points, capture.world_offset, *capture.splits.values()]
+    if capture.body is not None:
+        body = small_body(24)
+        found += [
+            footage(root, own, capture.splits[split], body.joints)
+            for split, own in capture.body.items()
+            if capture.splits.get(split)
+        ]
+    loader = PictureLoader(views, options)
+    found += [loader[i] for i in range(min(len(loader), 2))]
+    return found
+
+
+def require_lines(report: str) -> None:
+    """Nothing, if no line of the report can steer a terminal."""
+    bad = [line for line in report.splitlines() if any(ord(c) < 32 or 0x7F <= ord(c) < 0xA0 for c in line)]
+    assert not bad, f"control characters in a report: {bad[0]!r}"
+
+
+def read_a_picture(root: Path) -> object:
+    """Header, check and pixels."""
+    from dyngs.data.images import check_picture, read_picture
+
+    path = only(root)
+    return check_picture(path), read_picture(path)
+
+
+def read_a_video(root: Path) -> object:
+    """What it says of itself, and its frames."""
+    from dyngs.data.video import probe_video, read_frames
+
+    path = only(root)
+    info = probe_video(path)
+    return info, [frame for _, frame in zip(range(5), read_frames(path), strict=False)]
+
+
+def read_a_pickle(root: Path) -> object:
+    """Its values; what a pickle of numbers may hold is checked by those who use it, so that NaN is no failure."""
+    from dyngs.data.pickles import read_pickle
+
+    read_pickle(only(root))
+    return None
+
+
+def read_a_body(root: Path) -> object:
+    """The body, posed."""
+    import torch
+
+    from dyngs.human.body import posed_vertices
+    from dyngs.human.body_files import load_body
+
+    uv = root / "uv.obj"
+    body = load_body(
+        next((p for p in sorted(root.iterdir()) if p.suffix in (".npz", ".pkl")), root / "a.npz"),
+        uv if uv.is_file() else None,
+    )
+    poses = torch.full((1, len(body.joints), 3), 0.1)
+    return body, posed_vertices(body, poses, torch.zeros(1, 3), None, None)
+
+
+def read_a_motion(root: Path) -> object:
+    """The motion, as a clip on a small body."""
+    from dyngs.human.clips import clip_of_motion
+    from dyngs.human.motion import read_motion
+
+    motion = read_motion(only(root), small_body(55))
+    return motion, clip_of_motion(motion).at(0.3)
+
+
+def read_splats(root: Path) -> object:
+    """The Gaussians, drawn."""
+    from dyngs.export.ply import read_ply
+    from dyngs.view.frames import splat_options
+
+    splat = read_ply(only(root))
+    return splat, drawn(splat.gaussians, splat_options(splat))
+
+
+def read_a_run(root: Path) -> object:
+    """The scene of a run at two moments, drawn, and its times."""
+    from dyngs.train.checkpoint import load_run, seconds_at
+    from dyngs.train.evaluate import render_options
+
+    run = load_run(root)
+    return seconds_at(root, 7), run.info, played(run.scene, render_options(run.config.model))
+
+
+def read_a_person(root: Path) -> object:
+    """The avatar, drawn."""
+    from dyngs.export.avatar import read_avatar
+    from dyngs.train.evaluate import render_options
+
+    run = read_avatar(only(root))
+    return run.info, played(run.scene, render_options(run.config.model))
+
+
+def read_a_preset(root: Path) -> object:
+    """The configuration, with what it lacks, and as it comes back from a run folder."""
+    from dyngs.config_io import load_config, load_resolved, save_config
+
+    config = load_config(only(root))
+    save_config(config, root.parent / "out" / "config.yaml")
+    load_resolved(root.parent / "out")
+    return config.model_dump()
+
+
+def read_override_lines(root: Path) -> object:
+    """The configuration that they make."""
+    from dyngs.config_io import load_config, save_config
+
+    config = load_config(None, words(root))
+    save_config(config, root.parent / "out" / "config.yaml")
+    return config.model_dump()
+
+
+def read_a_path(root: Path) -> object:
+    """The cameras."""
+    from dyngs.view.paths import read_path
+
+    path = read_path(only(root))
+    return path.cameras, path.fps, path.times
+
+
+def read_a_point(root: Path) -> object:
+    """The point and its row of the report."""
+    from dyngs.tradeoff.points import read_point
+    from dyngs.tradeoff.report import rows_of
+
+    point = read_point(only(root))
+    return rows_of([point]), point
+
+
+def read_option_values(root: Path) -> object:
+    """Values of options of the command line; each must be read or refused."""
+    from dyngs.data.frame_selection import parse_frames
+    from dyngs.tradeoff.knobs import parse_settings
+    from dyngs.tradeoff.requirements import parse_requirements
+    from dyngs.view.paths import parse_times
+
+    parsers: tuple[Callable[[str], object], ...]
+    parsers = (parse_requirements, lambda word: parse_settings([word], trains=True), parse_frames, parse_times)
+    return [parse(word) for parse, word in zip(parsers, words(root), strict=False)]
+
+
+def read_a_log(root: Path) -> object:
+    """Log and times of an interrupted run, taken up again."""
+    from dyngs.train.checkpoint import seconds_at
+    from dyngs.train.log import RunLog
+
+    seconds = seconds_at(root, 7)
+    with RunLog(root, 2):
+        return seconds
+
+
+def read_a_load(root: Path) -> object:
+    """The workload of a benchmark."""
+    from dyngs.bench.rasterize import garden_workload
+
+    return garden_workload(only(root))
+
+
+def only(root: Path) -> Path:
+    """The file of the folder."""
+    return next((path for path in sorted(root.iterdir()) if path.stem == "a"), root / "a")
+
+
+def words(root: Path) -> list[str]:
+    """Words of a command line, as Python hands them over."""
+    return only(root).read_bytes().decode("utf-8", "surrogateescape").split("\n")
+
+
+def drawn(gaussians: object, options: object) -> Rendering:
+    """A small picture."""
+    from moving_scene import camera
+
+    from dyngs.rendering import render
+
+    return render(gaussians, camera(8, 6), options)  # type: ignore[arg-type]
+
+
+def played(scene: Scene, options: object) -> object:
+    """Pictures of two moments."""
+    from moving_scene import camera
+
+    from dyngs.train.scene import moment_of
+
+    return [moment_of(scene, time).seen_by(camera(8, 6), options) for time in (None, 0.6)]  # type: ignore[arg-type]
+
+
+@cache
+def small_body(joints: int) -> Body:
+    """A body of few vertices."""
+    from motion_files import tiny_body
+
+    return tiny_body(joints)
+
+
+def _captures() -> dict[str, Reader]:
+    own: dict[str, dict[str, Seed]] = {
+        "blender": {"still": write_blender},
+        "nerfstudio": {"moving": write_nerfstudio},
+        "colmap_bin": {"binary": write_colmap_binary},
+        "colmap_txt": {"text": write_colmap_text},
+        "nerfies": {"nerfies": write_small_nerfies},
+        "llff": {"still": write_llff, "videos": write_llff_videos},
+        "camera_folders": {"mixed": write_camera_folders},
+        "zju_mocap": {"annotated": write_zju, "single": write_zju_single},
+        "neuman": {"fitted": write_neuman, "aligned": write_neuman_aligned},
+        "body_json": {"smplx": write_body_json},
+    }
+    found = {name: Reader(seeds, read_whole_capture) for name, seeds in own.items()}
+    found["people_snapshot"] = Reader({"video": write_people_snapshot}, read_whole_capture, needs="h5py")
+    return found
+
+
+_RUNS: dict[str, Seed] = {
+    kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "skeleton", "trajectory")
+}
+_PICTURES: dict[str, Seed] = {"png": files.write_png, "png16": files.write_png16, "jpeg": files.write_jpeg}
+_PICTURES |= {"exr": files.write_exr, "tiff": files.write_tiff}
+_BODIES: dict[str, Seed] = {
+    "npz": files.write_smpl_npz,
+    "pickle": files.write_smpl_pickle,
+    "uv": files.write_smplx_with_uv,
+}
+
+READERS: dict[str, Reader] = {
+    **_captures(),
+    "pictures": Reader(_PICTURES, read_a_picture),
+    "video": Reader({"mp4": files.write_mp4}, read_a_video),
+    "pickles": Reader({"new": files.write_fits, "old": files.write_old_fits}, read_a_pickle),
+    "bodies": Reader(_BODIES, read_a_body),
+    "amass": Reader({"smplh": files.write_amass, "own": files.write_own_motion}, read_a_motion),
+    "bvh": Reader({"walk": files.write_walk_bvh}, read_a_motion),
+    "gltf": Reader({"linear": files.write_walk_glb, "cubic": files.write_cubic_glb}, read_a_motion),
+    "ply": Reader({"splats": files.write_splats}, read_splats),
+    "checkpoints": Reader({"still": files.write_still_run, **_RUNS}, read_a_run),
+    "scenes": Reader({"still": files.write_compact_still, "moving": files.write_compact_moving}, read_a_run),
+    "avatars": Reader({"person": files.write_person}, read_a_person),
+    "presets": Reader({"preset": files.write_preset}, read_a_preset),
+    "overrides": Reader({"lines": files.write_overrides}, read_override_lines, names_file=False),
+    "camera_paths": Reader({"frames": files.write_frames_path, "keyframes": files.write_keyframes}, read_a_path),
+    "points": Reader({"point": files.write_point}, read_a_point),
+    "options": Reader({"words": files.write_words}, read_option_values, names_file=False),
+    "logs": Reader({"log": files.write_log}, read_a_log, writes=True),
+    "bench": Reader({"load": files.write_load}, read_a_load),
+}
+"""By name, as the command line takes it."""

@@ -1,0 +1,285 @@
+"""Small valid files of all other kinds: pictures, bodies, motions, runs, configurations, texts."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import torch
+from motion_files import Clip, as_local, glb_of, random_motion, skeleton, tiny_body, write_bvh
+from moving_scene import camera, row_of_balls
+from synthetic_bodies import model, write_npz, write_obj, write_pickle
+from tiny_captures import random_pixels, write_picture, write_video
+from tiny_fields import stirred_field, tiny_setup
+
+from dyngs.camera import Cameras
+from dyngs.config import Config, DataConfig, DynamicModel, StaticModel
+from dyngs.config_io import RESOLVED_NAME, save_config
+from dyngs.deform.fields import field_state
+from dyngs.export.avatar import _KIND as AVATAR_KIND
+from dyngs.export.ply import write_ply
+from dyngs.human.motion import JOINTS, save_motion
+from dyngs.storage.file import SceneInfo, encoded
+from dyngs.train.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
+from dyngs.train.tensor_file import write_tensors
+from dyngs.view.paths import CameraPath, write_path
+
+_INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
+
+
+def write_png(root: Path) -> None:
+    """With alpha."""
+    write_picture(root / "a.png", random_pixels(5, 7, 4))
+
+
+def write_png16(root: Path) -> None:
+    """16 bits, grey."""
+    write_picture(root / "a.png", random_pixels(5, 7, 1).astype(np.uint16) * 257)
+
+
+def write_jpeg(root: Path) -> None:
+    """Colour."""
+    write_picture(root / "a.jpg", random_pixels(9, 17, 3))
+
+
+def write_exr(root: Path) -> None:
+    """Floats with alpha."""
+    write_picture(root / "a.exr", random_pixels(5, 7, 4).astype(np.float32) / 255)
+
+
+def write_tiff(root: Path) -> None:
+    """Colour."""
+    write_picture(root / "a.tif", random_pixels(5, 7, 3))
+
+
+def write_mp4(root: Path) -> None:
+    """Three frames."""
+    write_video(root / "a.mp4", 3)
+
+
+def write_fits(root: Path) -> None:
+    """A pickle of arrays in a dictionary, as today's NumPy writes it."""
+    (root / "a.pkl").write_bytes(
+        pickle.dumps({"pose": np.ones((2, 72)), "names": ["a", "b"], "scale": 1.5, 3: (1, None)})
+    )
+
+
+def write_old_fits(root: Path) -> None:
+    """The same with protocol 0, an array of objects, and text."""
+    fits = {
+        "pose": np.ones((2, 3), np.float32),
+        "o": np.array([1, "x", None], dtype=object),
+        "b": b"ab",
+        "t": "caf\u00e9",
+    }
+    (root / "a.pkl").write_bytes(pickle.dumps(fits, 0))
+
+
+def write_smpl_npz(root: Path) -> None:
+    """SMPL."""
+    write_npz(root / "a.npz", model("smpl", directions=2))
+
+
+def write_smpl_pickle(root: Path) -> None:
+    """SMPL, with a sparse regressor as in the real files."""
+    import scipy.sparse
+
+    arrays = model("smpl", directions=2)
+    write_pickle(root / "a.pkl", arrays | {"J_regressor": scipy.sparse.csc_matrix(arrays["J_regressor"])})
+
+
+def write_smplx_with_uv(root: Path) -> None:
+    """SMPL-X, and an OBJ with its texture coordinates."""
+    arrays = model("smplx", directions=2)
+    write_npz(root / "a.npz", arrays)
+    write_obj(root / "uv.obj", arrays["f"].astype(np.int64), arrays["vt"], arrays["ft"].astype(np.int64))
+
+
+def write_amass(root: Path) -> None:
+    """As AMASS has SMPL-H."""
+    motion = random_motion(3)
+    poses = motion.for_joints(52).poses.reshape(3, -1).numpy()
+    rest = {"betas": np.zeros(16), "gender": np.array("neutral"), "mocap_framerate": np.array(120.0)}
+    np.savez(root / "a.npz", poses=poses, trans=motion.trans.numpy(), **rest)
+
+
+def write_own_motion(root: Path) -> None:
+    """As dyngs writes it."""
+    save_motion(random_motion(3), root / "a.npz")
+
+
+def write_walk_bvh(root: Path) -> None:
+    """The joints of SMPL."""
+    own, motion = skeleton(JOINTS[:22]), random_motion(3)
+    write_bvh(root / "a.bvh", own, as_local(motion, own), motion.trans.double().numpy())
+
+
+def write_walk_glb(root: Path) -> None:
+    """The joints of SMPL, linear."""
+    own, motion = skeleton(JOINTS[:22]), random_motion(3)
+    glb_of(own, Clip(as_local(motion, own), motion.trans.double().numpy())).write(root / "a.glb")
+
+
+def write_cubic_glb(root: Path) -> None:
+    """The joints of SMPL, cubic splines, a node above."""
+    own, motion = skeleton(JOINTS[:22]), random_motion(3)
+    clip = Clip(as_local(motion, own), motion.trans.double().numpy(), interpolation="CUBICSPLINE", above=np.eye(4))
+    glb_of(own, clip).write(root / "a.glb")
+
+
+def write_splats(root: Path) -> None:
+    """Five Gaussians."""
+    write_ply(root / "a.ply", row_of_balls(), world_offset=(1.0, 2.0, 3.0))
+
+
+def write_still_run(root: Path) -> None:
+    """A run of a still scene."""
+    save_config(Config(data=DataConfig.model_validate({"root": "capture"}), model=StaticModel()), root / RESOLVED_NAME)
+    save_checkpoint(root, Checkpoint(_INFO, _gaussians()), 1.0)
+
+
+def write_moving_runs(kind: str, root: Path) -> None:
+    """A run whose scene moves by a field of ``kind``."""
+    config, tensors = _moving(kind)
+    save_config(config, root / RESOLVED_NAME)
+    save_checkpoint(root, Checkpoint(_INFO, tensors), 1.0)
+
+
+def write_compact_still(root: Path) -> None:
+    """A run that is only ``scene.dyngs``."""
+    model = StaticModel()
+    save_config(Config(data=DataConfig.model_validate({"root": "capture"}), model=model), root / RESOLVED_NAME)
+    (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _gaussians(), model, {}))
+
+
+def write_compact_moving(root: Path) -> None:
+    """The same of a scene that moves, with steps."""
+    config, tensors = _moving("trajectory")
+    save_config(config, root / RESOLVED_NAME)
+    steps = {f"gaussians.{name}": 0.01 for name in ("means", "quats", "log_scales", "logit_opacities", "sh_base")}
+    (root / "scene.dyngs").write_bytes(encoded(_scene_info(), tensors, config.model, steps))
+
+
+def write_person(root: Path) -> None:
+    """An avatar of three Gaussians on 24 joints."""
+    n, k = 3, 2
+    joints, parents = tiny_body(24).joints, tiny_body(24).parents
+    count = len(joints)
+    generator = torch.Generator().manual_seed(0)
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (1, 3)}
+    tensors = {f"gaussians.{name}": torch.rand(n, *shape, generator=generator) for name, shape in shapes.items()}
+    tensors |= {
+        f"anchors.{name}": torch.rand(n, width, generator=generator) for name, width in (("points", 3), ("uv", 2))
+    }
+    tensors |= {
+        "anchors.size": torch.ones(n),
+        "anchors.height": torch.zeros(n),
+        "anchors.barycentric": torch.ones(n, 3) / 3,
+    }
+    tensors |= {"anchors.weights": torch.full((n, k), 0.5), "anchors.joints": torch.tensor([[0, 1]] * n)}
+    tensors |= {"anchors.face": torch.zeros(n, dtype=torch.long), "pose_dirs": torch.zeros(n, 27)}
+    tensors |= {
+        "skeleton.joints": joints,
+        "skeleton.template_joints": joints,
+        "skeleton.parents": torch.tensor(parents),
+    }
+    tensors |= {"fit.turns": torch.zeros(count, 3), "fit.log_scale": torch.zeros(1)}
+    tensors |= {
+        "reference.poses": torch.zeros(count, 3),
+        "reference.trans": torch.zeros(3),
+        "reference.scale": torch.ones(1),
+    }
+    header = {
+        "step": 7,
+        "extent": 1.0,
+        "world_offset": [0.0, 0.0, 0.0],
+        "background": "white",
+        "near": 0.2,
+        "eps2d": 0.3,
+    }
+    template = {"file": "body.npz", "sha256": "0" * 64, "packaged": False}
+    own = {name: x.contiguous().clone() for name, x in tensors.items()}
+    write_tensors(
+        root / "a.safetensors", AVATAR_KIND, own, {**header, "rasterize_mode": "classic", "template": template}
+    )
+
+
+def write_preset(root: Path) -> None:
+    """Some keys of every kind."""
+    data = "data:\n  root: capture\n  downscale: 2\n"
+    model = "model:\n  kind: dynamic\n  sh_degree: 2\n  deform:\n    kind: hexplane\n    levels: [1, 2]\n"
+    text = data + model + "    lr_planes: 1e-3\ntrain:\n  steps: 30000\nrun:\n  name: night\n"
+    (root / "a.yaml").write_text(text)
+
+
+def write_overrides(root: Path) -> None:
+    """Some keys of every kind, one override a line."""
+    lines = ("data.root=capture", "train.steps=2000", "model.kind=dynamic", "model.deform.kind=mlp", "run.name=night")
+    lines += ("data.frames=0:10:2", "model.deform={kind: hexplane, levels: [1, 2]}", "data.cache_mb=1e3", "run.dir=~/x")
+    (root / "a.overrides").write_text("\n".join(lines))
+
+
+def write_frames_path(root: Path) -> None:
+    """A camera path of two frames."""
+    one = camera()
+    poses, intrinsics = one.cam_from_world.expand(2, 4, 4).clone(), one.intrinsics.expand(2, 3, 3).clone()
+    write_path(root / "a.json", CameraPath(Cameras(poses, intrinsics, one.width, one.height), 30.0, (0.0, 1.0)))
+
+
+def write_keyframes(root: Path) -> None:
+    """Key poses."""
+    frame = {"cam_from_world": np.eye(4).tolist(), "fl_x": 20.0, "fl_y": 20.0, "cx": 10.0, "cy": 7.0}
+    keys = [{**frame, "at": 0.0, "time": 0.0}, {**frame, "at": 0.2, "time": 1.0}]
+    document = {"width": 20, "height": 14, "fps": 10, "loop": False, "keyframes": keys}
+    (root / "a.json").write_text(json.dumps(document))
+
+
+def write_point(root: Path) -> None:
+    """A measured point of ``dyngs tradeoff``."""
+    from dyngs.tradeoff.knobs import Variant
+    from dyngs.tradeoff.points import Point, Speed, Spread
+    from dyngs.tradeoff.points import write_point as write
+
+    speed = Speed(Spread(3.0, 2.0, 4.0), Spread(1.0, 0.9, 1.1))
+    write(root / "a.json", Point(Variant(prune=0.5), 3, 30.0, 0.9, 0.1, 100, 1.5, 20.0, speed))
+
+
+def write_words(root: Path) -> None:
+    """Values of options, one a line: requirements, knobs, frames, times."""
+    lines = ("psnr>=30,fps>=20,mb<=5", "prune=0.5,0.7", "0:10:2", "0:1:5")
+    (root / "a.overrides").write_text("\n".join(lines))
+
+
+def write_log(root: Path) -> None:
+    """The log and the times of a run."""
+    (root / "log.jsonl").write_text('{"step": 1, "loss": 0.5}\n{"step": 2, "loss": 0.4}\n')
+    (root / "timing.json").write_text('{"seconds_train": {"7": 1.0}}\n')
+
+
+def write_load(root: Path) -> None:
+    """A workload of ``dyngs bench``."""
+    pose = np.eye(4)[None]
+    pose[0, 2, 3] = 3
+    k = np.array([[[20.0, 0, 10], [0, 20, 7], [0, 0, 1]]])
+    points = np.random.default_rng(0).uniform(-1, 1, (9, 3))
+    np.savez(root / "a.npz", means3d=points, colors=np.full((9, 3), 9), viewmats=pose, Ks=k, width=20, height=14)
+
+
+def _gaussians() -> dict[str, torch.Tensor]:
+    return {f"gaussians.{name}": x.contiguous() for name, x in row_of_balls().tensors().items()}
+
+
+def _scene_info() -> SceneInfo:
+    return SceneInfo(step=7, extent=1.0, world_offset=(1, 0, 0), background="white", rasterize_mode="classic")
+
+
+def _moving(kind: str) -> tuple[Config, dict[str, torch.Tensor]]:
+    from tiny_fields import tiny_options
+
+    config = Config(data=DataConfig.model_validate({"root": "capture"}), model=DynamicModel(deform=tiny_options(kind)))
+    state = field_state(stirred_field(kind, num_moving=2), tiny_setup(2))
+    tensors = _gaussians() | {f"model.field.{name}": x.contiguous() for name, x in state.items()}
+    tensors["model.rows"] = torch.tensor([1, 3])
+    return config, tensors | {"model.times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)}

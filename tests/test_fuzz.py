@@ -1,0 +1,103 @@
+"""Every reader under changed files: see ``python -m fuzz --help``."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import dyngs
+
+ROOT = Path(__file__).resolve().parents[1]
+READERS = (
+    *("blender", "nerfstudio", "colmap_bin", "colmap_txt", "nerfies", "llff", "camera_folders", "zju_mocap", "neuman"),
+    *("body_json", "people_snapshot", "pictures", "video", "pickles", "bodies", "amass", "bvh", "gltf", "ply"),
+    *("checkpoints", "scenes", "avatars", "presets", "overrides", "camera_paths", "points", "options", "logs", "bench"),
+)
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="its limits are those of Linux")
+
+
+def fuzz(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """``python -m fuzz`` in a process of its own, which is forked: threads of these tests would not survive that."""
+    environment = os.environ | {"PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])}
+    command = [sys.executable, "-m", "fuzz", *arguments, "--no-keep"]
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False)
+
+
+def test_the_readers_are_these() -> None:
+    assert f"or all: {', '.join(READERS)}" in " ".join(fuzz("--help").stdout.split())
+
+
+def test_what_harms_is_noticed(tmp_path: Path) -> None:
+    """Readers that do what they must not, each told by its verdict."""
+    script = tmp_path / "harm.py"
+    script.write_text(HARM)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(ROOT), os.environ.get("PYTHONPATH", "")))}
+    done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found == {
+        "quiet": "accepted: ",
+        "polite": "refused: ",
+        "unnamed": "failed: the error names no file outside dyngs",
+        "coloured": "failed: the error holds a control character outside dyngs",
+        "two_lines": "failed: the error holds a line break outside dyngs",
+        "traceback": "failed: KeyError outside dyngs",
+        "not_finite": "failed: not finite: result.a[]",
+        "writes": "failed: forbidden: open",
+        "removes": "failed: forbidden: shutil.rmtree",
+        "removes_below": "failed: outside the output folder: removed",
+        "leaves": "failed: forbidden: os.system",
+        "spins": "failed: takes too long",
+        "dies": "failed: ends the process by SIGSEGV",
+        "fills": "failed: MemoryError outside dyngs",
+        "swells": "failed: took much memory",
+    }
+
+
+HARM = """
+import ctypes, json, math, os, shutil, subprocess
+from pathlib import Path
+from dyngs.errors import DyngsError
+from fuzz.campaign import verdict_of
+from fuzz.case import Case
+from fuzz.readers import Reader
+from fuzz.worker import Limits
+
+def refuse(text): raise DyngsError(text)
+def swell(root): return None if bytes([1]) * (600 << 20) else None
+def unlink_in_c(root): ctypes.CDLL(None).unlink(str(root.parent / "precious/keep.txt").encode())
+def spin(root):
+    while True: pass
+
+harms = {
+    "quiet": lambda root: {"a": [1.0, (root / "a.txt").read_text()]},
+    "polite": lambda root: refuse(f"{root}/a.txt: is not it"),
+    "unnamed": lambda root: refuse("it is not it"),
+    "coloured": lambda root: refuse(f"{root}: \\x1b[31m"),
+    "two_lines": lambda root: refuse(f"{root}: a\\nb"),
+    "traceback": lambda root: {}["a"],
+    "not_finite": lambda root: {"a": [math.nan]},
+    "writes": lambda root: (root / "new").write_text("x"),
+    "removes": lambda root: shutil.rmtree(root.parent / "precious"),
+    "removes_below": unlink_in_c,
+    "leaves": lambda root: os.system("true"),
+    "spins": spin,
+    "dies": lambda root: ctypes.string_at(0),
+    "fills": lambda root: bytearray(1 << 40),
+    "swells": swell,
+}
+case = Case("seed", {"a.txt": b"text"})
+limits = Limits(seconds=2)
+found = {}
+for name, read in harms.items():
+    verdict = verdict_of(Reader({}, read), case, limits)
+    reason = "" if verdict.outcome == "refused" else verdict.reason
+    found[name] = f"{verdict.outcome.value}: {reason}"
+print(json.dumps(found))
+"""
