@@ -15,6 +15,10 @@ class DyngsError(Exception):
     The command line prints the message and exits with code 2; library callers catch it.
     """
 
+    def __str__(self) -> str:
+        """The message on one line without anything that a terminal would obey, whatever names and values it quotes."""
+        return printable(super().__str__())
+
 
 @contextmanager
 def reading(path: str | os.PathLike[str], advice: str = "copy or export it again") -> Iterator[None]:

@@ -68,7 +68,7 @@ def read_whole_capture(root: Path) -> object:
     try:
         capture = read_capture(options)
     except DyngsError:
-        report = inspect_capture(options)
+        report = inspect_capture(options, deep=True)
         if not report.problems:
             raise AssertionError("refused, but nothing suspicious in its report") from None
         require_lines(format_report(report))

@@ -72,9 +72,10 @@ def write_small_nerfies(root: Path) -> None:
 
 
 def write_llff(root: Path) -> None:
-    """Three pictures."""
+    """Three cameras with two pictures each."""
     write_poses_bounds(root, 3)
-    write_folder(root / "images", range(3))
+    for i in range(3):
+        write_folder(root / f"cam0{i}" / "images", range(2))
 
 
 def write_llff_videos(root: Path) -> None:

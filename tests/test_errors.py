@@ -64,3 +64,20 @@ def test_reason_of_an_error_without_words_is_its_type() -> None:
 def test_printable_keeps_letters_and_escapes_what_a_terminal_obeys() -> None:
     assert printable("Größe \x1b[2J\u202e\udce9\nnext") == "Größe \\x1b[2J\\u202e\\udce9 next"
     assert printable("abcdefgh", 6) == "abc..."
+
+
+def test_no_message_can_steer_a_terminal() -> None:
+    assert str(DyngsError("a\x1b[31m.png: no\nsuch\u2028file \ud800")) == "a\\x1b[31m.png: no such file \\ud800"
+
+
+@pytest.mark.parametrize("text", ["x" * 5000, "9" * 5000, "\x07" * 300, "prune=" + "1" * 5000])
+def test_what_the_command_line_quotes_is_short(text: str) -> None:
+    from dyngs.data.frame_selection import parse_frames
+    from dyngs.tradeoff.knobs import parse_settings
+    from dyngs.tradeoff.requirements import parse_requirements
+    from dyngs.view.paths import parse_times
+
+    for parse in (parse_frames, parse_times, parse_requirements, lambda word: parse_settings([word], trains=True)):
+        with pytest.raises(DyngsError) as caught:
+            parse(text)
+        assert len(str(caught.value)) < 500

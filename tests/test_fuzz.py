@@ -69,7 +69,8 @@ from fuzz.case import Case
 from fuzz.readers import Reader
 from fuzz.worker import Limits
 
-def refuse(text): raise DyngsError(text)
+class Raw(DyngsError): __str__ = Exception.__str__
+def refuse(text): raise Raw(text)
 def swell(root): return None if bytes([1]) * (600 << 20) else None
 def unlink_in_c(root): ctypes.CDLL(None).unlink(str(root.parent / "precious/keep.txt").encode())
 def spin(root):

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.data.archives import read_arrays
 from dyngs.data.write import write_text
-from dyngs.errors import DyngsError
+from dyngs.errors import reading
 from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, Tally, TileEntries, bin_tiles, rasterize, tally
@@ -97,16 +98,18 @@ def garden_workload(path: Path) -> Workload:
     Raises:
         DyngsError: the file is missing or holds something else.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            data = {name: file[name] for name in ("means3d", "colors", "viewmats", "Ks", "width", "height")}
-    except (OSError, ValueError, KeyError) as error:
-        raise DyngsError(f"{path}: cannot be read as a benchmark workload ({error})") from None
-    near = (np.abs(data["means3d"]) <= 2).all(axis=1)
-    means = torch.from_numpy(data["means3d"][near]).float()
-    colors = torch.from_numpy(data["colors"][near]).float()[None] / 255
-    view, intrinsics = (torch.from_numpy(data[name][:1]).float() for name in ("viewmats", "Ks"))
-    return _with_random_shapes(means, colors, Cameras(view, intrinsics, int(data["width"]), int(data["height"])))
+    keys = ("means3d", "colors", "viewmats", "Ks", "width", "height")
+    data = read_arrays(path, lambda names: [key for key in keys if key in names])
+    with reading(path, "give a workload of gsplat's benchmark"):
+        near = (np.abs(data["means3d"]) <= 2).all(axis=1)
+        means = torch.from_numpy(data["means3d"][near]).float()
+        colors = torch.from_numpy(data["colors"][near]).float()[None] / 255
+        view, intrinsics = (torch.from_numpy(data[name][:1]).float() for name in ("viewmats", "Ks"))
+        if means.shape[1:] != (3,) or colors.shape[2:] != (3,):
+            raise ValueError("means3d and colors must have rows of three")
+        if not all(bool(x.isfinite().all()) for x in (colors, view, intrinsics)):
+            raise ValueError("a number in it is not finite")
+        return _with_random_shapes(means, colors, Cameras(view, intrinsics, int(data["width"]), int(data["height"])))
 
 
 def random_workload(num_gaussians: int = 110_000) -> Workload:

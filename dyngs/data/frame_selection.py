@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dyngs.data.capture import Split, View
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, printable
 
 Splits = dict[Split, tuple[View, ...]]
 
@@ -24,11 +24,12 @@ def parse_frames(text: str) -> slice:
     Raises:
         DyngsError: anything else, or a step of 0.
     """
+    shown = printable(repr(text), 60)
     if not re.fullmatch(r"\s*([-+]?\d+)?\s*:\s*([-+]?\d+)?\s*(:\s*([-+]?\d+)?\s*)?", text, re.ASCII):
-        raise DyngsError(f"data.frames={text!r}: write start:stop or start:stop:step in whole numbers, such as 0:100:2")
+        raise DyngsError(f"data.frames={shown}: write start:stop or start:stop:step in whole numbers, such as 0:100:2")
     numbers = [int(part) if part.strip() else None for part in text.split(":")]
     if len(numbers) == 3 and numbers[2] == 0:
-        raise DyngsError(f"data.frames={text!r}: the step must not be 0")
+        raise DyngsError(f"data.frames={shown}: the step must not be 0")
     return slice(*numbers)
 
 

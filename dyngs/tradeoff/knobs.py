@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, printable
 
 Value = float | int | str
 SEVERAL = "several"
@@ -143,7 +143,7 @@ class Knob:
         except ValueError:
             value = float("nan")
         if not self.low <= value <= self.high:
-            raise DyngsError(f"--vary {self.name}={text}: give {self.allowed}")
+            raise DyngsError(f"--vary {self.name}={printable(text, 60)}: give {self.allowed}")
         return value
 
 
@@ -219,9 +219,11 @@ def parse_settings(words: Sequence[str], *, trains: bool) -> tuple[Setting, ...]
         name, equals, listed = word.partition("=")
         knob = next((k for k in KNOBS if k.name == name), None)
         if knob is None:
-            raise DyngsError(f"--vary {word}: no such knob; there are {', '.join(k.name for k in KNOBS)}")
+            raise DyngsError(
+                f"--vary {printable(word, 60)}: no such knob; there are {', '.join(k.name for k in KNOBS)}"
+            )
         if knob.trains and not trains:
-            raise DyngsError(f"--vary {word}: this trains the run anew, several times; add --train")
+            raise DyngsError(f"--vary {printable(word, 60)}: this trains the run anew, several times; add --train")
         if name in found:
             raise DyngsError(f"--vary {name} is given twice; write --vary {name}=VALUE,VALUE")
         values = tuple(knob.parsed(text) for text in re.split(r"\s*,\s*", listed.strip())) if equals else knob.values

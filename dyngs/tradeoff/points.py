@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from pydantic import TypeAdapter
+
 from dyngs.data.write import write_text
-from dyngs.errors import DyngsError
+from dyngs.errors import reading
 from dyngs.tradeoff.knobs import Variant
 
 
@@ -63,23 +66,33 @@ class Point:
         return 1.0 if self.speed is None else self.speed.gain.median
 
 
+_POINT = TypeAdapter(Point)
+
+
 def read_point(path: Path) -> Point:
     """The point in a file.
 
     Raises:
         DyngsError: it is not one.
     """
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
+    with reading(path, "it is no measured point: remove it to have it measured again"):
+        stored = json.loads(path.read_text(encoding="utf-8"), parse_float=_finite, parse_constant=_finite)
         variant, speed = Variant.from_json(stored.pop("variant")), stored.pop("speed")
         if speed is not None:
             speed = Speed(Spread(**speed["ms"]), Spread(**speed["gain"]))
-        return Point(variant=variant, speed=speed, **stored)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DyngsError(f"{path}: not a measured point ({error}); remove it to have it measured again") from None
+            if min(*speed.ms.__dict__.values(), *speed.gain.__dict__.values()) <= 0:
+                raise ValueError("a time that is not positive")
+        return _POINT.validate_python(asdict(Point(variant=variant, speed=speed, **stored)))
 
 
 def write_point(path: Path, point: Point) -> None:
     """Write it, atomically."""
     values = asdict(point) | {"variant": point.variant.to_json()}
     write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is not finite")
+    return value

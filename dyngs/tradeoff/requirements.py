@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, printable
 from dyngs.tradeoff.knobs import Variant
 
 _CONDITION = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*(\S+)\s*$")
@@ -109,18 +109,18 @@ def choose(points: Sequence[Figures], requirements: Sequence[Requirement], goal:
 
 
 def _requirement(part: str) -> Requirement:
-    match = _CONDITION.match(part)
+    match, shown = _CONDITION.match(part), printable(part.strip(), 60)
     if match is None:
-        raise DyngsError(f"--require {part.strip()!r} is no condition; write for instance psnr>=30,fps>=20,mb<=5")
+        raise DyngsError(f"--require {shown!r} is no condition; write for instance psnr>=30,fps>=20,mb<=5")
     name, sign, number = match.groups()
     if name not in NAMES:
-        raise DyngsError(f"--require {part.strip()}: no such figure; there are {', '.join(NAMES)}")
+        raise DyngsError(f"--require {shown}: no such figure; there are {', '.join(NAMES)}")
     try:
         bound = float(number)
     except ValueError:
         bound = math.nan
     if not math.isfinite(bound):
-        raise DyngsError(f"--require {part.strip()}: {number!r} is not a number")
+        raise DyngsError(f"--require {shown}: {printable(number, 30)!r} is not a number")
     return Requirement(name, sign == "<=", bound)
 
 

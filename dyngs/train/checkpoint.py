@@ -234,8 +234,9 @@ def seconds_at(run_dir: Path, step: int) -> float:
 def _read_seconds(run_dir: Path) -> dict[str, float]:
     try:
         stored = json.loads((run_dir / TIMING_NAME).read_text(encoding="utf-8"))
-        return {str(step): float(seconds) for step, seconds in stored["seconds_train"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        known = {str(int(step)): float(seconds) for step, seconds in stored["seconds_train"].items()}
+        return {step: seconds for step, seconds in known.items() if math.isfinite(seconds)}
+    except Exception:  # a lost or damaged file costs no more than the times
         return {}
 
 

@@ -98,7 +98,7 @@ def _lines_up_to(path: Path, step: int) -> list[str]:
         try:
             if json.loads(line)["step"] <= step:
                 kept.append(line + "\n")
-        except (ValueError, KeyError, TypeError):  # the torn last line of a killed run
+        except (ValueError, KeyError, TypeError, RecursionError):  # the torn last line of a killed run
             continue
     return kept
 

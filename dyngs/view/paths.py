@@ -16,7 +16,7 @@ from dyngs.camera import Cameras
 from dyngs.data.focus import focus_point, share_in_front
 from dyngs.data.poses import cam_from_opengl, checked_pose
 from dyngs.data.write import write_text
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, printable
 from dyngs.view.keyframes import Keyframes, interpolate_keyframes
 
 _MAX_FRAMES = 100_000
@@ -80,14 +80,15 @@ def parse_times(text: str) -> tuple[float, ...]:
         DyngsError: if ``text`` is anything else.
     """
     wanted = "write START:STOP:COUNT, for instance 0:1:60 for 60 evenly spaced times"
+    shown = printable(repr(text), 60)
     try:
         start, stop, count = (kind(part) for kind, part in zip((float, float, int), text.split(":"), strict=True))
     except ValueError:
-        raise DyngsError(f"{text!r} is no range of times; {wanted}") from None
+        raise DyngsError(f"{shown} is no range of times; {wanted}") from None
     if not (math.isfinite(start) and math.isfinite(stop)):
-        raise DyngsError(f"{text!r}: times must be finite; {wanted}")
+        raise DyngsError(f"{shown}: times must be finite; {wanted}")
     if not 1 <= count <= _MAX_FRAMES:
-        raise DyngsError(f"{text!r}: the count must be from 1 to {_MAX_FRAMES}; {wanted}")
+        raise DyngsError(f"{shown}: the count must be from 1 to {_MAX_FRAMES}; {wanted}")
     return tuple(np.linspace(start, stop, int(count)).tolist())
 
 
@@ -430,7 +431,7 @@ def _number(
     """The number at ``key``, checked to lie in [low, high]."""
     value = keys.get(key, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        problem = "is missing" if value is None else f"is {value!r}"
+        problem = "is missing" if value is None else f"is {printable(repr(value), 60)}"
         raise DyngsError(f"{where}: '{key}' {problem}; it must be a number from {low:g} to {high:g}")
     return float(value)
 

@@ -57,6 +57,22 @@ def test_points_beyond_two_units_are_left_out(tmp_path: Path) -> None:
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(DyngsError, match=r"missing\.npz"):
         garden_workload(tmp_path / "missing.npz")
+    path = tmp_path / "garden.npz"
+    right = {
+        "means3d": np.zeros((3, 3)),
+        "colors": np.zeros((3, 3)),
+        "viewmats": np.eye(4)[None],
+        "Ks": np.eye(3)[None],
+    }
+    right |= {"width": 8, "height": 6}
+    wrong = {"means3d": np.zeros(3), "colors": np.zeros((2, 3)), "viewmats": np.full((1, 4, 4), np.nan), "width": "x"}
+    for key, value in wrong.items():
+        np.savez(path, **(right | {key: np.asarray(value)}))
+        with pytest.raises(DyngsError, match=r"garden\.npz.*give a workload"):
+            garden_workload(path)
+    path.write_bytes(b"PK" + bytes(99))
+    with pytest.raises(DyngsError, match=r"garden\.npz"):
+        garden_workload(path)
     for arguments in (["bench"], ["bench", "x"], ["bench", "rasterize", "--threads", "0"]):
         assert main(arguments) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1

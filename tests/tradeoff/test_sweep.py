@@ -168,7 +168,16 @@ def test_a_stored_run_cannot_be_varied(points: list[Point], models: Models) -> N
 
 def test_a_damaged_point_says_what_to_do(tmp_path: Path) -> None:
     path = tmp_path / "x.json"
-    for text in ("", "[]", "{}", '{"variant": {"prine": 1}, "speed": null}'):
+    point = '{"variant": {}, "num_views": 3, "psnr": %s, "ssim": 0.9, "lpips": null, "num_gaussians": 5, "mb": 1.5'
+    point += ', "memory_mb": null, "speed": %s}'
+    path.write_text(point % (30.5, "null"))
+    assert read_point(path).psnr == 30.5
+    spread, zero = (f'{{"median": {n}, "low": 1, "high": 2}}' for n in (1.5, 0))
+    bad = [point % (psnr, "null") for psnr in ("NaN", "1e999", "[1]", '"x"', "[" * 5000 + "]" * 5000)]
+    bad += [
+        point % (30, f'{{"ms": {ms}, "gain": {gain}}}') for ms, gain in ((zero, spread), (spread, zero), (1, spread))
+    ]
+    for text in ("", "[]", "{}", '{"variant": {"prine": 1}, "speed": null}', *bad):
         path.write_text(text)
-        with pytest.raises(DyngsError, match=r"not a measured point .* remove it"):
+        with pytest.raises(DyngsError, match=r"x\.json: .* no measured point: remove it"):
             read_point(path)

@@ -343,3 +343,13 @@ def test_what_does_not_fit_is_named(
     write_tensors(path, checkpoint._KIND, tensors | {name: change(tensors[name]).contiguous()}, _header())
     with pytest.raises(DyngsError, match=rf"step_0000007\.safetensors: cannot be read \(ValueError: .*{said}"):
         load_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 5000, "[1]", '{"seconds_train": {"4": NaN, "x": 1}}', '{"seconds_train": {"4": 1e999}}']
+)
+def test_times_that_are_damaged_are_forgotten(tmp_path: Path, text: str) -> None:
+    (tmp_path / "timing.json").write_text(text)
+    assert seconds_at(tmp_path, 4) == 0
+    save_checkpoint(tmp_path, _checkpoint(5), 1.0)
+    assert json.loads((tmp_path / "timing.json").read_text()) == {"seconds_train": {"5": 1.0}}

@@ -37,6 +37,7 @@ def test_a_resumed_log_forgets_what_came_after_the_checkpoint(tmp_path: Path) ->
         for step in (10, 20, 30):
             log.write(_record(step))
     with log.path.open("a") as file:
+        file.write("[" * 5000 + "]" * 5000 + "\n")
         file.write('{"step": 4')  # killed while writing
     with RunLog(tmp_path, 20) as log:
         log.write(_record(30))
