@@ -87,7 +87,7 @@ def judge(reader: Reader, case: Case, folder: Path, guard: Guard, limits: Limits
     if changed is not None:
         return Verdict(Outcome.FAILED, f"outside the output folder: {changed.split()[0]}", changed)
     grown = (_peak() - peak) / 1024
-    if verdict.outcome is not Outcome.FAILED and grown > limits.memory_mb / 2:
+    if verdict.outcome is not Outcome.FAILED and grown > 0.75 * limits.memory_mb:
         return Verdict(Outcome.FAILED, "took much memory", f"{grown:.0f} MB")
     return verdict
 
