@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -150,7 +150,7 @@ def read_splats(root: Path) -> object:
     from dyngs.view.frames import splat_options
 
     splat = read_ply(only(root))
-    return splat, drawn(splat.gaussians, splat_options(splat))
+    return splat, drawn(splat.gaussians, replace(splat_options(splat), nonfinite="skip"))
 
 
 def read_a_run(root: Path) -> object:

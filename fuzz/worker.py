@@ -96,7 +96,7 @@ def _run(reader: Reader, capture: Path, case: Case) -> Verdict:
     try:
         found = reader.read(capture)
     except DyngsError as error:
-        names = {name.rpartition("/")[2] for name in case.files} if reader.names_file else None
+        names = {"data.root", *(name.rpartition("/")[2] for name in case.files)} if reader.names_file else None
         fault = fault_of_message(str(error), capture, names)
         if fault is None:
             return Verdict(Outcome.REFUSED, str(error))

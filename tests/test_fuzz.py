@@ -6,7 +6,9 @@ import json
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,6 +33,23 @@ def fuzz(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 def test_the_readers_are_these() -> None:
     assert f"or all: {', '.join(READERS)}" in " ".join(fuzz("--help").stdout.split())
+
+
+@pytest.fixture(scope="module")
+def tried(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """200 changed inputs for each reader: counts, and failures with what is known of them."""
+    report = tmp_path_factory.mktemp("fuzz") / "report.json"
+    fuzz("all", "--inputs", "200", "--seed", "0", "--json", str(report))
+    return json.loads(report.read_text())
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_changed_inputs_are_read_or_refused(reader: str, tried: dict[str, Any]) -> None:
+    if reader == "people_snapshot" and find_spec("h5py") is None:
+        pytest.skip("needs dyngs[people]")
+    assert tried[reader]["failures"] == {}
+    assert tried[reader]["inputs"] > 190  # of the few that cannot be made, none counts
+    assert tried[reader]["refused"] > 0
 
 
 def test_what_harms_is_noticed(tmp_path: Path) -> None:
@@ -71,7 +90,7 @@ from fuzz.worker import Limits
 
 class Raw(DyngsError): __str__ = Exception.__str__
 def refuse(text): raise Raw(text)
-def swell(root): return None if bytes([1]) * (600 << 20) else None
+def swell(root): return None if bytes([1]) * (900 << 20) else None
 def unlink_in_c(root): ctypes.CDLL(None).unlink(str(root.parent / "precious/keep.txt").encode())
 def spin(root):
     while True: pass
