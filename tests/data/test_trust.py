@@ -165,7 +165,7 @@ def test_a_folder_whose_name_begins_the_same_is_outside(tmp_path: Path) -> None:
 
 def test_sizes() -> None:
     check_size(Path("a.png"), 10_000, 10_000)
-    with pytest.raises(DyngsError, match=r"a\.png: 20000x20000 .*are 400 megapixels.*max_megapixels is 100;"):
+    with pytest.raises(DyngsError, match=r"a\.png: 20000x20000 .*are 400 megapixels.*max_megapixels is 150;"):
         check_size(Path("a.png"), 20_000, 20_000)
     with pytest.raises(DyngsError, match=r"of 1000 channels are 250 megapixels"):
         check_size(Path("a.exr"), 1000, 1000, 1000)
