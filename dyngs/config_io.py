@@ -84,6 +84,8 @@ def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
         )
     layers = _Layers()
     layers.add_file(file)
+    if not layers.tree.get("data"):
+        raise DyngsError(f"{file}: does not say which capture the run was trained on (data.root); restore the file")
     layers.add_overrides(overrides)
     return _validate(layers)
 

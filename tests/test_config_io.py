@@ -317,6 +317,13 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
         load_resolved(tmp_path / "nowhere")
 
 
+@pytest.mark.parametrize("text", ["", "train: {steps: 3}", "data:"])
+def test_an_emptied_config_of_a_run_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(DyngsError, match=r"config\.yaml: does not say which capture .*restore"):
+        load_resolved(tmp_path)
+
+
 def test_a_failed_save_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "config.yaml"
     config = load_config(None, [ROOT])
