@@ -26,6 +26,8 @@ _BITS = 63
 """Of a whole number."""
 _SHOWN = 100
 """Characters of an override that a message repeats."""
+_ODD_NUMBER = re.compile(r"[-+]?(0\d|\d[\d_]*:)")
+"""YAML 1.1 takes 010 for 8 and 1:30 for 90: nobody means that."""
 _EXACT_FLOAT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
 
 
@@ -125,6 +127,8 @@ class _PresetLoader(yaml.SafeLoader):
         try:
             value = super().construct_object(node, deep)  # type: ignore[no-untyped-call]
         except Exception:  # of int(), date() and the like, which YAML passes on
+            return node.value
+        if isinstance(value, (int, float)) and _ODD_NUMBER.match(node.value):
             return node.value
         return node.value if isinstance(value, int) and value.bit_length() > _BITS else value
 

@@ -180,3 +180,14 @@ def test_mutated_overrides_and_presets_end_in_a_configuration_or_one_line(tmp_pa
 def test_the_command_line_says_it_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     for text in ODD:
         assert len(error_line(capsys, "train", "data.root=/nowhere", f"train.steps={text}")) < 600
+
+
+@pytest.mark.parametrize("text", ["1:30", "0:90", "1:60:60", "-1:30"])
+def test_numbers_of_base_60_are_none(text: str) -> None:
+    assert "must be an integer" in refused(None, ROOT, f"train.steps={text}")
+
+
+def test_a_leading_zero_changes_no_number() -> None:
+    assert load_config(None, [ROOT, "train.steps=010"]).train.steps == 10
+    assert load_config(None, [ROOT, "optim.lr_means=0.5"]).optim.lr_means == 0.5
+    assert load_config(None, [ROOT, "run.name=007"]).run.name == "007"

@@ -24,6 +24,18 @@ _OLD_LEFTOVER = re.compile(r"\.step_\d+\.\d+\.safetensors|\.tmp[A-Za-z0-9]{6}")
 """Earlier versions, and the library that they let write there, called a checkpoint so while they wrote it."""
 
 
+def default_folder(name: str) -> Path:
+    """The run folder of a run that has only a name.
+
+    Raises:
+        DyngsError: the name leads out of ``runs``, or is none.
+    """
+    parts = Path(name).parts
+    if not parts or ".." in parts or Path(name).is_absolute():
+        raise DyngsError(f"run.name={name!r}: must name a folder below runs; for another place give run.dir=FOLDER")
+    return Path("runs", name)
+
+
 def require_no_run(folder: Path) -> None:
     """Nothing, if a new run can be written to ``folder`` without replacing anything.
 

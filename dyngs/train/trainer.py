@@ -34,7 +34,7 @@ from dyngs.train.interrupt import Interrupts
 from dyngs.train.log import LogRecord, Progress, RunLog
 from dyngs.train.metrics import psnr
 from dyngs.train.predictor import NetworkTrainer, assemble_network
-from dyngs.train.run_folder import begin, require_startable, tidy, was_only_begun
+from dyngs.train.run_folder import begin, default_folder, require_startable, tidy, was_only_begun
 from dyngs.train.run_lock import writing
 from dyngs.train.step import StepReport, Trainer
 
@@ -55,7 +55,7 @@ def train(config: Config, *, resume_from: Path | None = None) -> Path:
             cannot be kept, a loss that is not finite, a full disk.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how to go on.
     """
-    run_dir = resume_from or config.run.dir or Path("runs") / config.run.name
+    run_dir = resume_from or config.run.dir or default_folder(config.run.name)
     require_possible(config)
     if resume_from is not None and (not run_dir.is_dir() or _is_done_and_read_only(config, run_dir)):
         latest_checkpoint(run_dir)

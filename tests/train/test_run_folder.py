@@ -22,7 +22,7 @@ from dyngs.export.run import write_moments
 from dyngs.train.checkpoint import KEEP_CHECKPOINTS, checkpoint_paths, latest_checkpoint, load_run, save_checkpoint
 from dyngs.train.compacted import compact_run
 from dyngs.train.log import RunLog
-from dyngs.train.run_folder import new_folder, tidy
+from dyngs.train.run_folder import default_folder, new_folder, tidy
 from dyngs.train.run_lock import LOCK_NAME, InUseError, writing
 from dyngs.train.stored import write_compact
 from dyngs.train.trainer import train
@@ -302,3 +302,13 @@ def test_the_command_says_it_in_one_line(still: Path, run_dir: Path, capsys: pyt
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert "--resume" in told
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a/../..", "/a"])
+def test_a_name_that_is_no_folder_below_runs_is_refused(name: str) -> None:
+    with pytest.raises(DyngsError, match=r"run\.name=.* must name a folder below runs"):
+        default_folder(name)
+
+
+def test_a_name_may_have_folders() -> None:
+    assert default_folder("scans/bench") == Path("runs/scans/bench")
