@@ -18,7 +18,6 @@ The same seed makes the same choices, but not the same timing. Linux and macOS.
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
 import random
@@ -50,7 +49,6 @@ WRITES = os.O_WRONLY | os.O_RDWR
 PATIENCE = 300.0
 """Seconds after which a command counts as hung."""
 LOST_CODE = 70
-NUMBERS = itertools.count()
 COMMON = (
     "run.threads=1 run.seed=3 init.kind=random train.log_every=1 model.sh_degree=1 strategy.kind=default "
     "strategy.start=1 strategy.every=3 strategy.grad_threshold=1e-6 strategy.max_gaussians=300"
@@ -96,7 +94,7 @@ class End:
     def problem(self) -> str | None:
         """What is wrong with it, if it was not killed."""
         if self.code == LOST_CODE or "Traceback" in self.said:
-            return f"exit code {self.code}: {self.said.strip().splitlines()[-1]}"
+            return f"exit code {self.code}: {self.said.strip()[-200:]}"
         errors = [line for line in self.said.splitlines() if line.startswith("dyngs: error")]
         if self.code == 2 and len(errors) != 1:
             return f"{len(errors)} lines of error: {self.said[-200:]}"
@@ -150,7 +148,9 @@ def forked(words: str, out: Path, prepare: Callable[[], Trap | None], meet: Call
             wanted.
         meet: called in the parent with the child's number and the file at which those bytes arrive.
     """
-    errors, start = out.parent / f"stderr{next(NUMBERS)}", time.perf_counter()
+    opened, name = tempfile.mkstemp(prefix="soak-stderr-")  # not beside `out`, whose disk may be full
+    os.close(opened)
+    errors, start = Path(name), time.perf_counter()
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -162,8 +162,8 @@ def forked(words: str, out: Path, prepare: Callable[[], Trap | None], meet: Call
         counted = os.read(reading, 64) if select.select([reading], [], [], 0)[0] else b""
     finally:
         os.close(reading)
-    said = errors.read_text(errors="replace") if errors.exists() else ""
-    errors.unlink(missing_ok=True)
+    said = errors.read_text(errors="replace")
+    errors.unlink()
     number = counted.rpartition(b"#")[2]
     operations = int(number) if number.isdigit() else 0
     return End(os.waitstatus_to_exitcode(status), said, time.perf_counter() - start, operations)

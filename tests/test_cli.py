@@ -518,5 +518,12 @@ def test_memory_that_torch_cannot_have_is_one_line(
     assert "out of memory" in error_line(capsys, "render", ".")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_an_error_that_cannot_be_said_has_its_exit_code() -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-m", "dyngs", "nothing"], env=ENVIRONMENT, stderr=full, check=False)
+    assert done.returncode == 2
+
+
 def test_long_words_are_cut_in_messages(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(error_line(capsys, "render", ".", "--time", "9" * 5000)) < 600

@@ -17,7 +17,8 @@ import re
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import NoReturn
+from contextlib import suppress
+from typing import NoReturn, TextIO
 
 from dyngs import __version__
 from dyngs.cli import bench, compact, data, demo, doctor, evaluate, export, predict, render, tradeoff, train
@@ -48,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"\ndyngs: interrupted{_after_colon(interrupt)}", file=sys.stderr)
         return EXIT_INTERRUPTED
     except OSError as error:
-        _abandon_broken_stdout()
+        _abandon_if_broken(sys.stdout)
         if debug:
             traceback.print_exception(error)
         return _fail(_describe_os_error(error))
@@ -117,16 +118,18 @@ def _add_commands(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
 
 
 def _fail(message: str) -> int:
-    print(f"dyngs: error: {printable(message)}", file=sys.stderr)
+    with suppress(OSError):  # stderr may lie on a full disk
+        print(f"dyngs: error: {printable(message)}", file=sys.stderr)
+    _abandon_if_broken(sys.stderr)
     return EXIT_ERROR
 
 
-def _abandon_broken_stdout() -> None:
-    """Point stdout to nowhere if it takes no more, because the interpreter would complain about that at its end."""
+def _abandon_if_broken(stream: TextIO) -> None:
+    """Point a stream to nowhere if it takes no more, because the interpreter would complain about that at its end."""
     try:
-        sys.stdout.flush()
+        stream.flush()
     except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _after_colon(error: BaseException) -> str:
