@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -54,6 +55,20 @@ def require_name(text: str) -> None:
     except UnicodeEncodeError:
         pass
     raise DyngsError(f"{printable(text, _MAX_REASON)!r} holds a character that no name or path may hold; remove it")
+
+
+def require_regular(path: str | os.PathLike[str]) -> None:
+    """Nothing, if ``path`` is a file, a folder or not there: what reads a pipe or a device may never end.
+
+    Raises:
+        DyngsError: it is anything else.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise DyngsError(f"{os.fspath(path)}: is no file but a pipe, a device or the like; put a file there")
 
 
 def reason(error: BaseException) -> str:

@@ -131,7 +131,7 @@ def _prepare(folder: Path, limits: Limits) -> None:
     sys.dont_write_bytecode = True
     os.environ |= {
         "HOME": str(folder / "cache"),
-        "XDG_CACHE_HOME": str(folder / "cache"),
+        "DYNGS_CACHE_DIR": str(folder / "cache"),
         "TMPDIR": str(folder / "tmp"),
     }
     tempfile.tempdir = str(folder / "tmp")

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 
 import pytest
 
-from dyngs.errors import DyngsError, printable, reading, reason
+from dyngs.data.json_object import read_json_object
+from dyngs.errors import DyngsError, printable, reading, reason, require_regular
+from dyngs.storage.file import read_scene
+from dyngs.train.checkpoint import seconds_at
+from dyngs.train.tensor_file import FileKind, read_tensors
 
 
 @pytest.mark.parametrize(
@@ -81,3 +86,25 @@ def test_what_the_command_line_quotes_is_short(text: str) -> None:
         with pytest.raises(DyngsError) as caught:
             parse(text)
         assert len(str(caught.value)) < 500
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names here")
+def test_what_may_never_end_is_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("/dev/zero")
+    for name in ("pipe", "link"):
+        with pytest.raises(DyngsError, match=rf"{name}: is no file but a pipe"):
+            require_regular(tmp_path / name)
+    (tmp_path / "file").touch()
+    for name in ("file", "", "not there", "a\0b"):
+        require_regular(tmp_path / name)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names here")
+def test_pipes_in_captures_and_runs_stop_nobody(tmp_path: Path) -> None:
+    for name in ("transforms.json", "timing.json"):
+        os.mkfifo(tmp_path / name)
+    for read in (read_json_object, lambda path: read_tensors(path, FileKind("a", "a", 1), ""), read_scene):
+        with pytest.raises(DyngsError, match="is no file but a pipe"):
+            read(tmp_path / "transforms.json")
+    assert seconds_at(tmp_path, 1) == 0

@@ -52,6 +52,14 @@ def test_changed_inputs_are_read_or_refused(reader: str, tried: dict[str, Any]) 
     assert tried[reader]["refused"] > 0
 
 
+def test_what_was_found_stays_mended() -> None:
+    """The corpus: one small input for each kind of failure that was ever seen."""
+    done = fuzz("all", "--replay")
+    tried = [int(words[1]) for words in map(str.split, done.stdout.splitlines()) if words[2:3] == ["inputs"]]
+    assert done.returncode == 0, done.stdout
+    assert sum(tried) >= 70
+
+
 def test_what_harms_is_noticed(tmp_path: Path) -> None:
     """Readers that do what they must not, each told by its verdict."""
     script = tmp_path / "harm.py"
@@ -80,6 +88,7 @@ def test_what_harms_is_noticed(tmp_path: Path) -> None:
 
 
 HARM = """
+import fuzz  # first: finds the dyngs that is meant
 import ctypes, json, math, os, shutil, subprocess
 from pathlib import Path
 from dyngs.errors import DyngsError

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dyngs.config import DataConfig
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, require_regular
 
 MAX_MEGAPIXELS: float = DataConfig.model_fields["max_megapixels"].default
 _MAX_LISTED = 100_000
@@ -67,8 +67,9 @@ def inside(path: Path) -> Path:
     """``path``, if it may be opened: outside a block of ``staying_within`` any path may.
 
     Raises:
-        DyngsError: it lies outside the capture; says where.
+        DyngsError: it lies outside the capture, says where; it is a pipe or a device.
     """
+    require_regular(path)
     border = _border.get()
     if border is None:
         return path

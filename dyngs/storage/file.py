@@ -26,7 +26,7 @@ from torch import Tensor
 
 from dyngs.config import SceneModel
 from dyngs.data.write import whole_file
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, require_regular
 from dyngs.storage.coding import Packing, compressed, decompressed, packed, unpacked
 from dyngs.storage.drawable import completed, drawable, in_storage_order
 from dyngs.storage.tensors import (
@@ -128,6 +128,7 @@ def read_scene(path: Path) -> StoredScene:
     Raises:
         DyngsError: a file that is missing, truncated, altered, or of another version; one line that names it.
     """
+    require_regular(path)
     try:
         return decoded(path.read_bytes())
     except OSError as error:

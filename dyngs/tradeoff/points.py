@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from dyngs.data.write import write_text
-from dyngs.errors import reading
+from dyngs.errors import reading, require_regular
 from dyngs.tradeoff.knobs import Variant
 
 
@@ -76,6 +76,7 @@ def read_point(path: Path) -> Point:
         DyngsError: it is not one.
     """
     with reading(path, "it is no measured point: remove it to have it measured again"):
+        require_regular(path)
         stored = json.loads(path.read_text(encoding="utf-8"), parse_float=_finite, parse_constant=_finite)
         variant, speed = Variant.from_json(stored.pop("variant")), stored.pop("speed")
         if speed is not None:

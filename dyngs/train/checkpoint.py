@@ -23,7 +23,7 @@ from dyngs.config_io import load_resolved
 from dyngs.conventions import RasterizeMode
 from dyngs.data.write import write_text
 from dyngs.deform.trained import trained_scene
-from dyngs.errors import DyngsError, reading
+from dyngs.errors import DyngsError, reading, require_regular
 from dyngs.gaussians import Gaussians
 from dyngs.human.trained import trained_avatar
 from dyngs.storage.file import read_scene
@@ -233,6 +233,7 @@ def seconds_at(run_dir: Path, step: int) -> float:
 
 def _read_seconds(run_dir: Path) -> dict[str, float]:
     try:
+        require_regular(run_dir / TIMING_NAME)
         stored = json.loads((run_dir / TIMING_NAME).read_text(encoding="utf-8"))
         known = {str(int(step)): float(seconds) for step, seconds in stored["seconds_train"].items()}
         return {step: seconds for step, seconds in known.items() if math.isfinite(seconds)}

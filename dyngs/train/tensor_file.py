@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dyngs.data.temporary import remove_quietly, temporary_folder_beside
 from dyngs.data.write import whole_file
-from dyngs.errors import DyngsError, reason
+from dyngs.errors import DyngsError, reason, require_regular
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,7 @@ def read_tensors(path: Path, kind: FileKind, advice: str) -> tuple[dict[str, Any
     Raises:
         DyngsError: a file that is missing, truncated, altered, of another kind or version.
     """
+    require_regular(path)
     try:
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {}).get(kind.key, "null"))

@@ -16,7 +16,7 @@ from dyngs.camera import Cameras
 from dyngs.data.focus import focus_point, share_in_front
 from dyngs.data.poses import cam_from_opengl, checked_pose
 from dyngs.data.write import write_text
-from dyngs.errors import DyngsError, printable
+from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.view.keyframes import Keyframes, interpolate_keyframes
 
 _MAX_FRAMES = 100_000
@@ -246,6 +246,7 @@ def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
     Raises:
         DyngsError: names the file, the frame and the key that is missing or wrong.
     """
+    require_regular(file)
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
