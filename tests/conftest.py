@@ -1,9 +1,10 @@
 """How the tests draw their examples, and fixtures of the rasterizer's tests.
 
 Examples of property tests are fixed by default (profile ``ci``): a run passes or fails whoever starts it. The profile
-``long`` draws ten times as many at random, and says how to draw a failing one again::
+``random`` draws as many at random, ``long`` ten times as many; they say how to draw a failing one again::
 
-    HYPOTHESIS_PROFILE=long pytest tests/ops --hypothesis-seed=3
+    HYPOTHESIS_PROFILE=random pytest -m hypothesis --hypothesis-seed=3
+    HYPOTHESIS_PROFILE=long pytest tests/ops
 
 What it finds becomes an ``@example`` of its test.
 """
@@ -24,7 +25,9 @@ from dyngs.ops.native import core
 OPS_WITH_A_CORE = ("projection", "harmonics", "rasterization", "finite", "offsets", "shading")
 
 FEW, MANY = 100, 1000  # examples of a test that does not say how many
-settings.register_profile("ci", derandomize=True, max_examples=FEW)
+# No deadlines: whether a busy machine is slow says nothing about what is tested.
+settings.register_profile("ci", derandomize=True, max_examples=FEW, deadline=None)
+settings.register_profile("random", derandomize=False, max_examples=FEW, print_blob=True, deadline=None)
 settings.register_profile("long", derandomize=False, max_examples=MANY, print_blob=True, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
