@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 import unicodedata
 from collections.abc import Iterator
@@ -16,7 +17,8 @@ import torch
 from torch import Tensor
 
 LONGEST = 800
-"""Characters of an error, the case's folder counted as one; lists of our own keys take 600."""
+"""Characters of an error, names of files in the case's folder counted as one; lists of our own keys take 600."""
+_WAY = re.compile(r"F/\S*")
 
 
 class Outcome(str, Enum):
@@ -53,7 +55,7 @@ def fault_of_message(message: str, folder: Path, names: set[str] | None) -> str 
     odd = [c for c in message if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") or c in _BIDI]
     if odd:
         return "the error holds a line break" if odd[0] in "\n\r" else "the error holds a control character"
-    if len(message.replace(str(folder), "F")) > LONGEST:
+    if len(_WAY.sub("F", message.replace(str(folder), "F"))) > LONGEST:
         return "the error is too long"
     if not message.strip():
         return "the error is empty"

@@ -13,7 +13,7 @@ from dyngs.data.images import SUFFIXES, read_header
 from dyngs.data.intrinsics import match_size, pinhole_matrix, rescale_warning
 from dyngs.data.poses import checked_pose, repair_warning
 from dyngs.data.transforms import view_name
-from dyngs.data.trust import inside
+from dyngs.data.trust import check_size, inside
 from dyngs.errors import DyngsError, reading
 
 if TYPE_CHECKING:
@@ -132,6 +132,7 @@ def _stored_size(path: Path) -> tuple[int, int] | None:
         header = read_header(path)
     except DyngsError:
         return None
+    check_size(path, header.width, header.height, header.channels)
     return header.width, header.height
 
 

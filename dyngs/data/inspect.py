@@ -22,7 +22,7 @@ from dyngs.data.images import SUFFIXES, read_header, read_picture
 from dyngs.data.json_object import read_json_object
 from dyngs.data.poses import camera_center, inverse_rigid
 from dyngs.data.trust import leaving_links, pictures_up_to, staying_within
-from dyngs.errors import DyngsError, reading, reason
+from dyngs.errors import DyngsError, printable, reading, reason
 
 __all__ = ["InspectReport", "draw_cameras", "format_report", "inspect_capture", "report_on"]
 
@@ -94,7 +94,7 @@ def format_report(report: InspectReport) -> str:
         lines.append("nothing suspicious")
     else:
         lines.append(f"suspicious ({len(report.problems)}):")
-        lines += [f"  - {problem}" for problem in report.problems]
+        lines += [f"  - {printable(problem)}" for problem in report.problems]
     return "\n".join(lines)
 
 

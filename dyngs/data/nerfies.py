@@ -14,7 +14,7 @@ from dyngs.data.images import SUFFIXES, read_header
 from dyngs.data.json_object import read_json_object
 from dyngs.data.llff import read_number_array
 from dyngs.data.transforms import Frame, FrameFile, read_views
-from dyngs.data.trust import inside
+from dyngs.data.trust import check_size, inside
 from dyngs.errors import DyngsError
 
 
@@ -206,6 +206,7 @@ def _scaled_size(full: np.ndarray, factor: int, picture: Path) -> tuple[int, int
         header = read_header(picture)
     except DyngsError:
         return nominal
+    check_size(picture, header.width, header.height, header.channels)
     near = abs(header.width - full[0] / factor) <= 1 and abs(header.height - full[1] / factor) <= 1
     return (header.width, header.height) if near else nominal
 

@@ -15,7 +15,7 @@ from dyngs.data.images import SUFFIXES, PictureHeader, read_header
 from dyngs.data.intrinsics import MAX_SIDE, match_size, pinhole_matrix, rescale_warning
 from dyngs.data.json_object import read_json_object
 from dyngs.data.poses import cam_from_opengl, checked_pose, repair_warning
-from dyngs.data.trust import inside
+from dyngs.data.trust import check_size, inside
 from dyngs.errors import DyngsError
 
 _LARGEST = 1e300
@@ -192,9 +192,11 @@ def _header(path: Path) -> PictureHeader | None:
     """None where the file is missing or damaged: the loader refuses it, with its reason, when it is wanted."""
     inside(path)
     try:
-        return read_header(path)
+        header = read_header(path)
     except DyngsError:
         return None
+    check_size(path, header.width, header.height, header.channels)
+    return header
 
 
 def _described_size(frame: Frame) -> tuple[int, int] | None:

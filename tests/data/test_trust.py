@@ -118,6 +118,15 @@ def test_paths_that_name_no_file(written: str, follow: bool, tmp_path: Path) -> 
         read(tmp_path, follow_links=follow)
 
 
+@pytest.mark.parametrize("kind", ["nerfstudio", "nerfies", "colmap"])
+def test_a_huge_picture_is_refused_when_a_capture_is_read(kind: str, tmp_path: Path) -> None:
+    """Before the training, also where it is held out."""
+    WRITERS[kind](tmp_path)
+    read(tmp_path)
+    with pytest.raises(DyngsError, match=r"megapixels, but data\.max_megapixels is"):
+        read(tmp_path, max_megapixels=1e-5)
+
+
 @pytest.mark.parametrize("written", ["\ud800", "\udce9.png", "x" * 5000])
 def test_names_that_no_file_can_have(written: str, tmp_path: Path) -> None:
     """As a missing picture or in one line."""
