@@ -69,10 +69,14 @@ def inside(path: Path) -> Path:
     Raises:
         DyngsError: it lies outside the capture, says where; it is a pipe or a device.
     """
-    require_regular(path)
     border = _border.get()
-    if border is None:
-        return path
+    if border is not None:
+        _require_below(border, path)
+    require_regular(path)
+    return path
+
+
+def _require_below(border: _Border, path: Path) -> None:
     place = border.real_place(path)
     if not _is_below(place, border.real):
         leads = "" if place == str(path) else f" leads to {place}, which"
@@ -80,7 +84,6 @@ def inside(path: Path) -> Path:
             f"{path}:{leads} lies outside the capture {border.root}; copy the file into the capture, or, if you trust "
             "it to name files of yours, set data.follow_links=true"
         )
-    return path
 
 
 def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
