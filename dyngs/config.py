@@ -394,7 +394,7 @@ class RunConfig(Section):
 
     name: str = "static"
     dir: Path | None = Field(default=None, description="run folder; default runs/NAME")
-    seed: int = Field(default=42, ge=0)
+    seed: int = Field(default=42, ge=0, lt=2**63)
     threads: int = Field(default=0, ge=0, le=1024, description="0 = all cores")
 
 

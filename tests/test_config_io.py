@@ -290,7 +290,7 @@ configs = st.builds(
     strategy=st.builds(McmcStrategy, noise=rates) | st.builds(DefaultStrategy, prune_opacity=fractions),
     optim=st.builds(OptimConfig, lr_means=rates, eps=rates),
     train=st.builds(TrainConfig, steps=st.integers(1, 10**9), ssim_weight=fractions),
-    run=st.builds(RunConfig, name=st.text(max_size=20), seed=st.integers(0, 2**63)),
+    run=st.builds(RunConfig, name=st.text(max_size=20), seed=st.integers(0, 2**63 - 1)),
 )
 
 
