@@ -270,6 +270,7 @@ def test_any_text_gives_a_configuration_or_a_dyngs_error(text: str) -> None:
 
 rates = st.floats(min_value=1e-30, max_value=1e30)
 fractions = st.floats(min_value=0, max_value=1)
+names = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=20)
 configs = st.builds(
     Config,
     data=st.builds(
@@ -290,7 +291,7 @@ configs = st.builds(
     strategy=st.builds(McmcStrategy, noise=rates) | st.builds(DefaultStrategy, prune_opacity=fractions),
     optim=st.builds(OptimConfig, lr_means=rates, eps=rates),
     train=st.builds(TrainConfig, steps=st.integers(1, 10**9), ssim_weight=fractions),
-    run=st.builds(RunConfig, name=st.text(max_size=20), seed=st.integers(0, 2**63 - 1)),
+    run=st.builds(RunConfig, name=names, seed=st.integers(0, 2**63 - 1)),
 )
 
 
