@@ -14,10 +14,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dyngs.train.checkpoint import checkpoint_paths
-from dyngs.train.compacted import Cost, compact_run, compared
-from dyngs.train.evaluate import evaluate_run
-from dyngs.train.stored import write_compact
+from dyngs.evaluate.report import evaluate_run
+from dyngs.prune.run import Cost, compact_run, compared
+from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.storage.run import write_compact
 
 ONCE = "compact.steps=1"
 NO_MASKS, NO_PRUNING = "compact.masks=0", "compact.prune=0"

@@ -23,13 +23,13 @@ from statistics import fmean
 import torch
 
 from dyngs.config import Config, HumanNetModel
-from dyngs.config_io import load_config, packaged_preset
-from dyngs.human.person import template
-from dyngs.human.predict.fill import filled
-from dyngs.human.predict.sitter import spread_views
-from dyngs.human.synthetic import HumanOptions, write_human_capture
-from dyngs.train.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at
-from dyngs.train.evaluate import evaluate_run
+from dyngs.config.io import load_config, packaged_preset
+from dyngs.evaluate.report import evaluate_run
+from dyngs.human.prediction.fill import filled
+from dyngs.human.prediction.sitter import spread_views
+from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.human.template.person import template
+from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at
 from dyngs.train.predictor import filmed, human_options, load_network, new_network
 from dyngs.train.predictor_run import network_config, predict_person, write_run
 from dyngs.train.trainer import train

@@ -41,8 +41,8 @@ os.environ["OMP_NUM_THREADS"] = "1"  # before torch
 import torch
 
 from dyngs.cli import main as dyngs
-from dyngs.config_io import RESOLVED_NAME
-from dyngs.train.checkpoint import checkpoint_paths, is_compact, load_run
+from dyngs.config.io import RESOLVED_NAME
+from dyngs.runs.checkpoint import checkpoint_paths, is_compact, load_run
 
 OPERATIONS = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "fcntl.flock", "shutil.rmtree")
 WRITES = os.O_WRONLY | os.O_RDWR

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.config import Config
-from dyngs.config_io import load_config, packaged_preset
-from dyngs.data.synthetic import DynamicOptions, write_dynamic_capture
+from dyngs.config.io import load_config, packaged_preset
+from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.errors import DyngsError
+from dyngs.evaluate.report import EvalReport, evaluate_run
 from dyngs.export.run import export_ply
-from dyngs.train.evaluate import EvalReport, evaluate_run
-from dyngs.train.run_lock import LOCK_NAME, InUseError, writing
+from dyngs.runs.lock import LOCK_NAME, InUseError, writing
 from dyngs.train.trainer import train
 from dyngs.view.frames import OutputOptions, write_path_frames, write_split
 from dyngs.view.shots import ShotOptions, shot_of_run

@@ -28,9 +28,9 @@ from fuzz.seeds import (
 )
 
 if TYPE_CHECKING:
-    from dyngs.human.body import Body
+    from dyngs.human.template.body import Body
     from dyngs.rendering import Rendering
-    from dyngs.train.scene import Scene
+    from dyngs.scene import Scene
 
 Read = Callable[[Path], object]
 """Reads what is in a folder and uses it; returns what must be finite."""
@@ -62,7 +62,7 @@ def read_whole_capture(root: Path) -> object:
     from dyngs.data.loader import PictureLoader
     from dyngs.data.read import read_capture
     from dyngs.errors import DyngsError
-    from dyngs.human.clips import footage
+    from dyngs.human.motion.clips import footage
 
     options = DataConfig.model_validate({"root": root})
     try:
@@ -96,7 +96,7 @@ def require_lines(report: str) -> None:
 
 def read_a_picture(root: Path) -> object:
     """Header, check and pixels."""
-    from dyngs.data.images import check_picture, read_picture
+    from dyngs.data.pictures.images import check_picture, read_picture
 
     path = only(root)
     return check_picture(path), read_picture(path)
@@ -104,7 +104,7 @@ def read_a_picture(root: Path) -> object:
 
 def read_a_video(root: Path) -> object:
     """What it says of itself, and its frames."""
-    from dyngs.data.video import probe_video, read_frames
+    from dyngs.data.pictures.video import probe_video, read_frames
 
     path = only(root)
     info = probe_video(path)
@@ -113,7 +113,7 @@ def read_a_video(root: Path) -> object:
 
 def read_a_pickle(root: Path) -> object:
     """Its values; what a pickle of numbers may hold is checked by those who use it, so that NaN is no failure."""
-    from dyngs.data.pickles import read_pickle
+    from dyngs.files.pickles import read_pickle
 
     read_pickle(only(root))
     return None
@@ -123,8 +123,8 @@ def read_a_body(root: Path) -> object:
     """The body, posed."""
     import torch
 
-    from dyngs.human.body import posed_vertices
-    from dyngs.human.body_files import load_body
+    from dyngs.human.template.body import posed_vertices
+    from dyngs.human.template.body_files import load_body
 
     uv = root / "uv.obj"
     body = load_body(
@@ -137,8 +137,8 @@ def read_a_body(root: Path) -> object:
 
 def read_a_motion(root: Path) -> object:
     """The motion, as a clip on a small body."""
-    from dyngs.human.clips import clip_of_motion
-    from dyngs.human.motion import read_motion
+    from dyngs.human.motion.clips import clip_of_motion
+    from dyngs.human.motion.motion import read_motion
 
     motion = read_motion(only(root), small_body(55))
     return motion, clip_of_motion(motion).at(0.3)
@@ -155,8 +155,8 @@ def read_splats(root: Path) -> object:
 
 def read_a_run(root: Path) -> object:
     """The scene of a run at two moments, drawn, and its times."""
-    from dyngs.train.checkpoint import load_run, seconds_at
-    from dyngs.train.evaluate import render_options
+    from dyngs.evaluate.report import render_options
+    from dyngs.runs.checkpoint import load_run, seconds_at
 
     run = load_run(root)
     return seconds_at(root, 7), run.info, played(run.scene, render_options(run.config.model))
@@ -164,8 +164,8 @@ def read_a_run(root: Path) -> object:
 
 def read_a_person(root: Path) -> object:
     """The avatar, drawn."""
+    from dyngs.evaluate.report import render_options
     from dyngs.export.avatar import read_avatar
-    from dyngs.train.evaluate import render_options
 
     run = read_avatar(only(root))
     return run.info, played(run.scene, render_options(run.config.model))
@@ -173,7 +173,7 @@ def read_a_person(root: Path) -> object:
 
 def read_a_preset(root: Path) -> object:
     """The configuration, with what it lacks, and as it comes back from a run folder."""
-    from dyngs.config_io import load_config, load_resolved, save_config
+    from dyngs.config.io import load_config, load_resolved, save_config
 
     config = load_config(only(root))
     save_config(config, root.parent / "out" / "config.yaml")
@@ -183,7 +183,7 @@ def read_a_preset(root: Path) -> object:
 
 def read_override_lines(root: Path) -> object:
     """The configuration that they make."""
-    from dyngs.config_io import load_config, save_config
+    from dyngs.config.io import load_config, save_config
 
     config = load_config(None, words(root))
     save_config(config, root.parent / "out" / "config.yaml")
@@ -221,8 +221,8 @@ def read_option_values(root: Path) -> object:
 
 def read_a_log(root: Path) -> object:
     """Log and times of an interrupted run, taken up again."""
-    from dyngs.train.checkpoint import seconds_at
-    from dyngs.train.log import RunLog
+    from dyngs.runs.checkpoint import seconds_at
+    from dyngs.runs.log import RunLog
 
     seconds = seconds_at(root, 7)
     with RunLog(root, 2):
@@ -259,7 +259,7 @@ def played(scene: Scene, options: object) -> object:
     """Pictures of two moments."""
     from moving_scene import camera
 
-    from dyngs.train.scene import moment_of
+    from dyngs.scene import moment_of
 
     return [moment_of(scene, time).seen_by(camera(8, 6), options) for time in (None, 0.6)]  # type: ignore[arg-type]
 

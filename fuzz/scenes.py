@@ -190,7 +190,7 @@ def _tensors_changed(data: bytes, rng: Random) -> bytes:
     """Tensors or header changed, written as dyngs writes them."""
     from safetensors.torch import save
 
-    from dyngs.train.tensor_file import _digest
+    from dyngs.files.tensor_file import _digest
 
     size = int.from_bytes(data[:8], "little")
     metadata = json.loads(data[8 : 8 + size])["__metadata__"]

@@ -16,14 +16,14 @@ from tiny_fields import stirred_field, tiny_setup
 
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, StaticModel
-from dyngs.config_io import RESOLVED_NAME, save_config
+from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.deform.fields import field_state
 from dyngs.export.avatar import _KIND as AVATAR_KIND
 from dyngs.export.ply import write_ply
-from dyngs.human.motion import JOINTS, save_motion
+from dyngs.files.tensor_file import write_tensors
+from dyngs.human.motion.motion import JOINTS, save_motion
+from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.storage.file import SceneInfo, encoded
-from dyngs.train.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.train.tensor_file import write_tensors
 from dyngs.view.paths import CameraPath, write_path
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")

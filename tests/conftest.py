@@ -1,4 +1,4 @@
-"""How the tests draw their examples, and fixtures of the rasterizer's tests.
+"""How the tests draw their examples, and fixtures that several folders of tests share.
 
 Examples of property tests are fixed by default (profile ``ci``): a run passes or fails whoever starts it. The profile
 ``random`` draws as many at random, ``long`` ten times as many; they say how to draw a failing one again::
@@ -14,14 +14,20 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import settings
 from scenes import Scene, random_scene
+from tiny_captures import random_pixels, write_colmap, write_frames, write_picture
+from tiny_fields import write_tiny_capture
 
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.ops.native import core
 
+SHARED = Path(__file__).parents[1] / "../shared/data"
 OPS_WITH_A_CORE = ("projection", "harmonics", "rasterization", "finite", "offsets", "shading")
 
 FEW, MANY = 100, 1000  # examples of a test that does not say how many
@@ -84,3 +90,60 @@ def set_threads() -> Iterator[Callable[[int], None]]:
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four pictures of 16 px; nothing moves."""
+    folder = tmp_path_factory.mktemp("capture")
+    write_still_capture(folder, StillOptions(size=16, num_train=4, num_test=1, samples=1))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Something moves."""
+    return write_tiny_capture(tmp_path_factory.mktemp("capture"))
+
+
+@pytest.fixture(scope="session")
+def person(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three cameras, three frames of 32 px."""
+    folder = tmp_path_factory.mktemp("capture") / "person"
+    return write_human_capture(folder, HumanOptions(size=32, num_frames=3, num_new=2, num_cameras=3, num_test=1))
+
+
+@pytest.fixture
+def blender_root(tmp_path: Path) -> Path:
+    """16 train and 2 test RGBA pictures of 12x8."""
+    for split, count in (("train", 16), ("test", 2)):
+        names = [f"./{split}/r_{i}" for i in range(count)]
+        for i, name in enumerate(names):
+            write_picture(tmp_path / f"{name}.png", random_pixels(8, 12, 4, seed=i))
+        write_frames(tmp_path / f"transforms_{split}.json", names, {"camera_angle_x": 0.7})
+    return tmp_path
+
+
+@pytest.fixture
+def nerfstudio_root(tmp_path: Path) -> Path:
+    """10 JPEG pictures of 12x8 with OPENCV distortion."""
+    names = [f"images/{i:02d}.jpg" for i in range(10)]
+    for i, name in enumerate(names):
+        write_picture(tmp_path / name, random_pixels(8, 12, 3, seed=i))
+    fields = {"w": 12, "h": 8, "fl_x": 10.0, "fl_y": 11.0, "cx": 6.5, "cy": 3.5, "camera_model": "OPENCV"}
+    write_frames(tmp_path / "transforms.json", names, {**fields, "k1": 0.1, "p2": -0.01})
+    return tmp_path
+
+
+@pytest.fixture
+def colmap_root(tmp_path: Path) -> Path:
+    """Nine pictures in two subfolders, binary model."""
+    return write_colmap(tmp_path)
+
+
+@pytest.fixture
+def shared() -> Path:
+    """The folder of real captures."""
+    if not SHARED.is_dir():
+        pytest.skip("the real captures of ../shared/data are not here")
+    return SHARED

@@ -18,10 +18,10 @@ from dyngs.config import DcacColour, DynamicModel, SceneModel, StaticModel
 from dyngs.deform.fields import field_state
 from dyngs.deform.masks import KeyMasks
 from dyngs.rendering import RenderOptions
+from dyngs.scene import Scene, moment_of
 from dyngs.storage.coding import compressed
 from dyngs.storage.file import _DTYPES, MAGIC, MAX_HEADER, SceneInfo, _Header, _stored
 from dyngs.storage.tensors import Coding, Kind
-from dyngs.train.scene import Scene, moment_of
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]

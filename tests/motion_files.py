@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from dyngs.human.body import Body
-from dyngs.human.motion import JOINTS, ROWS, Motion
+from dyngs.human.motion.motion import JOINTS, ROWS, Motion
+from dyngs.human.template.body import Body
 
 ABOVE = {"pelvis": "", "spine1": "pelvis", "spine2": "spine1", "spine3": "spine2", "neck": "spine3", "head": "neck"}
 ABOVE |= {"jaw": "head"}

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, StaticModel, TrajectoryField
-from dyngs.config_io import RESOLVED_NAME, save_config
-from dyngs.data.synthetic import StillOptions, write_still_capture
+from dyngs.config.io import RESOLVED_NAME, save_config
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.field import FieldSetup, Offsets, chosen
 from dyngs.deform.fields import field_state, new_field
 from dyngs.deform.learned import LearnedTensors
 from dyngs.deform.trained import TrainedScene
 from dyngs.gaussians import Gaussians
-from dyngs.train.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
+from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 
 MOVING_ROWS = (1, 3)
 TRAIN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)

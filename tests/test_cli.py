@@ -21,7 +21,7 @@ from moving_scene import moved_x, write_moving_run
 import dyngs
 from dyngs.cli import doctor, main
 from dyngs.cli.train import parse_config
-from dyngs.config_io import load_config, save_config
+from dyngs.config.io import load_config, save_config
 from dyngs.errors import DyngsError, reading
 from dyngs.export.ply import read_ply
 

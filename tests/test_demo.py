@@ -9,7 +9,7 @@ import pytest
 
 from dyngs.cli import main
 from dyngs.demo import DemoOptions, claimed_folder, demo_config, run_demo, unused_folder
-from dyngs.train.run_lock import LOCK_NAME
+from dyngs.runs.lock import LOCK_NAME
 
 TINY = DemoOptions(steps=30, threads=1, size=24, num_points=300, num_frames=3)
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from dyngs.data.json_object import read_json_object
 from dyngs.errors import DyngsError, printable, reading, reason, require_regular
+from dyngs.files.json_object import read_json_object
+from dyngs.files.tensor_file import FileKind, read_tensors
+from dyngs.runs.checkpoint import seconds_at
 from dyngs.storage.file import read_scene
-from dyngs.train.checkpoint import seconds_at
-from dyngs.train.tensor_file import FileKind, read_tensors
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from dyngs.config import (
     TrainConfig,
     TrajectoryField,
 )
-from dyngs.data.synthetic import DynamicOptions, write_dynamic_capture
+from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.deform.field import DeformationField, FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.gaussians import Gaussians

@@ -7,8 +7,8 @@ from functools import cache
 from pathlib import Path
 
 from dyngs.config import DataConfig, HumanNetModel
-from dyngs.human.body import Body, default_body
-from dyngs.human.synthetic import HumanOptions, write_human_capture
+from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.human.template.body import Body, default_body
 from dyngs.train.predictor import Filmed, filmed
 
 TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)

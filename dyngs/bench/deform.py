@@ -11,16 +11,16 @@ from pathlib import Path
 
 import torch
 
+from dyngs.build import assemble
 from dyngs.config import Config, DataConfig, DynamicModel, RandomInit
-from dyngs.data.synthetic import DynamicOptions, write_dynamic_capture
-from dyngs.data.write import write_text
+from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.deform.model import NOBODY, DynamicScene
 from dyngs.errors import DyngsError
+from dyngs.files.write import write_text
 from dyngs.ops.native import active_isa, kernel_threads
-from dyngs.train.assemble import assemble
-from dyngs.train.checkpoint import latest_checkpoint, load_run
+from dyngs.runs.checkpoint import latest_checkpoint, load_run
 from dyngs.train.step import Trainer
 
 VARIANTS = ("nothing moves", "what moves, moves", "everything moves")

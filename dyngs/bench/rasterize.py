@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.archives import read_arrays
-from dyngs.data.write import write_text
 from dyngs.errors import reading
+from dyngs.files.archives import read_arrays
+from dyngs.files.write import write_text
 from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, Tally, TileEntries, bin_tiles, rasterize, tally

@@ -11,7 +11,7 @@ from dyngs.cli.render import threads
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dyngs.train.compacted import Cost
+    from dyngs.prune.run import Cost
 
 _EPILOG = """\
 examples:
@@ -57,8 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
     from dyngs.deform.trained import TrainedScene
-    from dyngs.train.checkpoint import load_run
-    from dyngs.train.compacted import compact_run, compared
+    from dyngs.prune.run import compact_run, compared
+    from dyngs.runs.checkpoint import load_run
 
     asked = {key: getattr(arguments, key) for key in ("prune", "score", "max_loss", "masks", "steps")}
     overrides = [f"compact.{key}={value}" for key, value in asked.items() if value is not None]

@@ -11,7 +11,7 @@ from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
     from dyngs.config import DataConfig
-    from dyngs.human.motion import Motion
+    from dyngs.human.motion.motion import Motion
 
 SYNTHETIC_SCENES = ("still", "spin", "wave", "merge", "room", "human")
 """The scenes of ``dyngs data synth``: named here because the parser must not import numpy."""
@@ -118,7 +118,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
 def _keys_of_data(overrides: list[str]) -> DataConfig:
     """What ``data.key=value`` say; the root is none."""
-    from dyngs.config_io import load_config
+    from dyngs.config.io import load_config
 
     other = [
         word for word in overrides if not word.startswith("data.") or word.startswith(("data.root=", "data.format="))
@@ -130,7 +130,7 @@ def _keys_of_data(overrides: list[str]) -> DataConfig:
 
 def run_sfm(arguments: argparse.Namespace) -> int:
     """Estimate poses and say how to train on them."""
-    from dyngs.data.sfm import SfmOptions, estimate_poses
+    from dyngs.data.prepare.sfm import SfmOptions, estimate_poses
 
     limits = _keys_of_data(arguments.overrides)
     options = SfmOptions(
@@ -149,9 +149,9 @@ def run_sfm(arguments: argparse.Namespace) -> int:
 
 def run_motion(arguments: argparse.Namespace) -> int:
     """Convert the motion and say what it is."""
-    from dyngs.human.body import default_body
-    from dyngs.human.body_files import load_body
-    from dyngs.human.motion import read_motion, save_motion
+    from dyngs.human.motion.motion import read_motion, save_motion
+    from dyngs.human.template.body import default_body
+    from dyngs.human.template.body_files import load_body
 
     out: Path = arguments.out
     if out.exists():
@@ -177,7 +177,7 @@ def _summary(motion: Motion) -> str:
 
 def run_synth(arguments: argparse.Namespace) -> int:
     """Write the capture and say how to train on it."""
-    from dyngs.data import synthetic
+    from dyngs.data.synthetic import captures as synthetic
 
     out: Path = arguments.out
     scene, size, seed = arguments.scene, arguments.size, arguments.seed
@@ -189,7 +189,7 @@ def run_synth(arguments: argparse.Namespace) -> int:
     cameras = 8 if arguments.cameras is None else arguments.cameras
     synthetic.require_new_folder(out)
     if scene == "human":
-        from dyngs.human.synthetic import HumanOptions, write_human_capture
+        from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
         write_human_capture(out, HumanOptions(size=size, num_frames=views, num_cameras=cameras, seed=seed))
     elif scene == "still":

@@ -11,7 +11,7 @@ from dyngs.cli.render import threads
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dyngs.train.evaluate import EvalReport
+    from dyngs.evaluate.report import EvalReport
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Evaluate and print."""
     from rich.console import Console
 
-    from dyngs.train.evaluate import evaluate_run, report_path
+    from dyngs.evaluate.report import evaluate_run, report_path
 
     report = evaluate_run(arguments.run_dir, arguments.split, lpips_net=arguments.lpips_net, threads=arguments.threads)
     Console().print(report_table(report))

@@ -11,7 +11,7 @@ from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
     from dyngs.export.run import Part
-    from dyngs.train.checkpoint import LoadedRun
+    from dyngs.runs.checkpoint import LoadedRun
 
 _EPILOG = """\
 examples:
@@ -62,7 +62,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def run(arguments: argparse.Namespace) -> int:
     """Write the files and say how large they are."""
     from dyngs.export.avatar import read_avatar
-    from dyngs.train.checkpoint import load_run
+    from dyngs.runs.checkpoint import load_run
 
     is_file = is_avatar(arguments.run_dir)
     if is_file and (arguments.out is None or arguments.format in ("compact", "avatar")):
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     times = _times(arguments)
     loaded = (read_avatar if is_file else load_run)(arguments.run_dir)
     if arguments.motion is not None:
-        from dyngs.train.playing import playing_motion
+        from dyngs.view.playing import playing_motion
 
         loaded = playing_motion(loaded, arguments.motion).run
         times = loaded.scene.times if times is None else times
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _export_compact(arguments: argparse.Namespace) -> int:
     """Write the run in little space, and say what that does to it."""
-    from dyngs.train.stored import SMALLEST_CHANGE, write_compact
+    from dyngs.storage.run import SMALLEST_CHANGE, write_compact
 
     options = ("time", "times", "motion", "static", "dynamic")
     given = [name for name in options if getattr(arguments, name) not in (None, False)]
@@ -122,7 +122,7 @@ def _export_compact(arguments: argparse.Namespace) -> int:
 def _export_avatar(arguments: argparse.Namespace) -> int:
     """Write the person of a run as one file."""
     from dyngs.export.avatar import write_avatar
-    from dyngs.train.checkpoint import load_run
+    from dyngs.runs.checkpoint import load_run
 
     given = ("motion", "time", "times", "static", "dynamic")
     unfit = [f"--{name}" for name in given if getattr(arguments, name) not in (None, False)]
@@ -135,7 +135,7 @@ def _export_avatar(arguments: argparse.Namespace) -> int:
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """The times asked for, within [0, 1]; None where none is."""
-    from dyngs.train.temporal import clamped_times
+    from dyngs.evaluate.temporal import clamped_times
     from dyngs.view.paths import parse_times
 
     if arguments.times is None and arguments.time is None:

@@ -70,8 +70,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure, print, write, choose; the first of several processes keeps others out of the folder."""
     from contextlib import nullcontext
 
+    from dyngs.runs.lock import writing
     from dyngs.tradeoff.ranks import Ranks
-    from dyngs.train.run_lock import writing
 
     for name, least in (("finetune", 0), ("combine", 0), ("rounds", 1), ("threads", 0)):
         if getattr(arguments, name) < least:
@@ -117,7 +117,7 @@ def _run(arguments: argparse.Namespace, ranks: Ranks) -> int:
 
 def _trained(arguments: argparse.Namespace, ranks: Ranks) -> Path:
     """The run folder of a config, trained to its end by the first process."""
-    from dyngs.config_io import find_preset, load_config
+    from dyngs.config.io import find_preset, load_config
     from dyngs.tradeoff.models import finished
 
     try:

@@ -60,7 +60,7 @@ def _next(folder: Path, config: Config) -> str:
 def _about_motion(folder: Path, config: Config) -> list[str]:
     """What a dynamic model found to move."""
     from dyngs.config import DynamicModel
-    from dyngs.train.checkpoint import load_run
+    from dyngs.runs.checkpoint import load_run
 
     if not isinstance(config.model, DynamicModel):
         return []
@@ -78,7 +78,7 @@ def parse_config(words: Sequence[str], resume: Path | None) -> Config:
     Raises:
         DyngsError: nothing to train, an override of a resumed run other than ``run.threads``, or a wrong key or value.
     """
-    from dyngs.config_io import load_config, load_resolved
+    from dyngs.config.io import load_config, load_resolved
 
     has_preset = bool(words) and "=" not in words[0]
     preset, overrides = (Path(words[0]), words[1:]) if has_preset else (None, words)

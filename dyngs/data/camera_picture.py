@@ -9,8 +9,8 @@ import numpy as np
 
 from dyngs.data.capture import Capture, View
 from dyngs.data.poses import checked_pose, inverse_rigid
-from dyngs.data.write import write_image
 from dyngs.errors import DyngsError
+from dyngs.files.write import write_image
 
 PAPER = np.array([24, 26, 30], np.uint8)
 SPLIT_COLORS = {"train": (255, 170, 60), "val": (120, 230, 120), "test": (80, 190, 255), "pose": (80, 190, 255)}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 if TYPE_CHECKING:
-    from dyngs.data.people import BodyFrames
+    from dyngs.data.readers.people import BodyFrames
 
 Split = Literal["train", "val", "test", "pose"]
 """A "pose" split shows a person in another clip than the others: with times and frame numbers of its own."""
@@ -42,7 +42,7 @@ class View:
 
     Attributes:
         name: unique within the capture (usually the path below the root, without extension).
-        image_path: picture file; of a ``video``'s frame where it lies or will lie, see ``dyngs.data.frame_cache``.
+        image_path: picture file; of a ``video``'s frame where it lies or will lie, see ``pictures.frame_cache``.
         cam_from_world: (4, 4) float64, OpenCV axes, in the capture's rebased world (see ``Capture.world_offset``).
         intrinsics: (3, 3) float64 in pixels of the *stored* picture size.
         width, height: stored picture size in pixels.

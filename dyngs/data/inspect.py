@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 
 from dyngs.config import DataConfig
-from dyngs.data.camera_folders import calibrated_fps, find_cameras
 from dyngs.data.camera_picture import draw_cameras, matrix_fault, pose_fault
 from dyngs.data.capture import Capture, View
 from dyngs.data.focus import focus_point, share_in_front
-from dyngs.data.frame_cache import planned_frames
 from dyngs.data.frame_selection import distinct_times
-from dyngs.data.images import SUFFIXES, read_header, read_picture
-from dyngs.data.json_object import read_json_object
+from dyngs.data.pictures.frame_cache import planned_frames
+from dyngs.data.pictures.images import SUFFIXES, read_header, read_picture
 from dyngs.data.poses import camera_center, inverse_rigid
-from dyngs.data.trust import leaving_links, pictures_up_to, staying_within
+from dyngs.data.readers.camera_folders import calibrated_fps, find_cameras
 from dyngs.errors import DyngsError, printable, reading, reason
+from dyngs.files.json_object import read_json_object
+from dyngs.files.trust import leaving_links, pictures_up_to, staying_within
 
 __all__ = ["InspectReport", "draw_cameras", "format_report", "inspect_capture", "report_on"]
 

@@ -8,25 +8,25 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.config import DataConfig
-from dyngs.data.blender import is_blender, read_blender
-from dyngs.data.body_json import is_body_json, read_body_json
-from dyngs.data.camera_folders import CALIBRATION, is_camera_folders, read_camera_folders
 from dyngs.data.capture import Capture, PointCloud, Split, View
-from dyngs.data.colmap import MODEL_FOLDERS, is_colmap, read_colmap
-from dyngs.data.frame_cache import decode_frames
 from dyngs.data.frame_selection import select_frames
-from dyngs.data.images import read_header
-from dyngs.data.llff import POSES, is_llff, read_llff
-from dyngs.data.nerfies import is_nerfies, read_nerfies
-from dyngs.data.nerfstudio import is_nerfstudio, read_nerfstudio
-from dyngs.data.neuman import is_neuman, read_neuman
-from dyngs.data.people import PersonView
-from dyngs.data.people_snapshot import is_people_snapshot, read_people_snapshot
+from dyngs.data.pictures.frame_cache import decode_frames
+from dyngs.data.pictures.images import read_header
+from dyngs.data.readers.blender import is_blender, read_blender
+from dyngs.data.readers.body_json import is_body_json, read_body_json
+from dyngs.data.readers.camera_folders import CALIBRATION, is_camera_folders, read_camera_folders
+from dyngs.data.readers.colmap import MODEL_FOLDERS, is_colmap, read_colmap
+from dyngs.data.readers.llff import POSES, is_llff, read_llff
+from dyngs.data.readers.nerfies import is_nerfies, read_nerfies
+from dyngs.data.readers.nerfstudio import is_nerfstudio, read_nerfstudio
+from dyngs.data.readers.neuman import is_neuman, read_neuman
+from dyngs.data.readers.people import PersonView
+from dyngs.data.readers.people_snapshot import is_people_snapshot, read_people_snapshot
+from dyngs.data.readers.zju_mocap import is_zju_mocap, read_zju_mocap
 from dyngs.data.rebase import rebase
 from dyngs.data.times import sequence_warnings, still_if_constant, unit_times
-from dyngs.data.trust import inside, pictures_up_to, staying_within
-from dyngs.data.zju_mocap import is_zju_mocap, read_zju_mocap
 from dyngs.errors import DyngsError, reading
+from dyngs.files.trust import inside, pictures_up_to, staying_within
 
 Splits = dict[Split, tuple[View, ...]]
 
@@ -58,7 +58,7 @@ def read_capture(options: DataConfig, decode_videos: bool = True) -> Capture:
 
     Args:
         options: where and how to read.
-        decode_videos: make picture files of the chosen frames of videos, see ``dyngs.data.frame_cache``; otherwise the
+        decode_videos: make picture files of the chosen frames of videos, see ``pictures.frame_cache``; otherwise the
             views may name files that do not exist yet.
 
     Raises:

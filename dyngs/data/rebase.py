@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.people import moved
 from dyngs.data.poses import camera_center
+from dyngs.data.readers.people import moved
 
 MAX_DISTANCE = 1e5
 MAX_DISTANCE_PER_SPREAD = 1e4

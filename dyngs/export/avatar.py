@@ -17,16 +17,16 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig, HumanModel
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
+from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar import Anchors, PoseShapes, Skeleton, skinning_weights
-from dyngs.human.clips import Clip, upright
-from dyngs.human.motion import ROWS
-from dyngs.human.person import template_file
-from dyngs.human.refine import Fit, corrected_clip
-from dyngs.human.skinning import check_tree
-from dyngs.human.trained import AvatarScene
-from dyngs.train.checkpoint import LoadedRun, info_of
-from dyngs.train.tensor_file import FileKind, read_tensors, write_tensors
+from dyngs.human.avatar.avatar import Anchors, PoseShapes, Skeleton, skinning_weights
+from dyngs.human.avatar.refine import Fit, corrected_clip
+from dyngs.human.avatar.trained import AvatarScene
+from dyngs.human.motion.clips import Clip, upright
+from dyngs.human.motion.motion import ROWS
+from dyngs.human.pose.skinning import check_tree
+from dyngs.human.template.person import template_file
+from dyngs.runs.checkpoint import LoadedRun, info_of
 
 SUFFIX = ".safetensors"
 
@@ -93,7 +93,7 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
 
 
 def read_avatar(path: Path) -> LoadedRun:
-    """The person of a file, upright and at rest; ``dyngs.train.playing`` moves it as it does one of a run.
+    """The person of a file, upright and at rest; ``dyngs.view.playing`` moves it as it does one of a run.
 
     The template of an avatar that is not built on the free one is looked for beside the file when a motion needs it.
 

@@ -22,9 +22,9 @@ import numpy as np
 import torch
 
 from dyngs.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
-from dyngs.data.write import whole_file
 from dyngs.errors import DyngsError, reading
 from dyngs.export.ply_header import PlyHeader, read_header
+from dyngs.files.write import whole_file
 from dyngs.gaussians import Gaussians
 
 _MODE_OF_NAME = {"default": RasterizeMode.CLASSIC, "mip": RasterizeMode.ANTIALIASED}

@@ -9,8 +9,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from dyngs.data.limits import require_at_most
 from dyngs.errors import DyngsError
+from dyngs.files.limits import require_at_most
 
 _SCALARS = {
     **dict.fromkeys(("char", "int8"), "i1"),

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Literal
 
 from dyngs.colour.bake import with_harmonics
-from dyngs.data.temporary import temporary_folder_beside
 from dyngs.errors import DyngsError
 from dyngs.export.ply import write_ply
-from dyngs.train.checkpoint import LoadedRun, load_run
-from dyngs.train.scene import Scene, moment_of
+from dyngs.files.temporary import temporary_folder_beside
+from dyngs.runs.checkpoint import LoadedRun, load_run
+from dyngs.scene import Scene, moment_of
 
 Part = Literal["all", "moving", "still"]
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dyngs.data.write import whole_file
 from dyngs.errors import DyngsError
 from dyngs.export.run import scene_part
-from dyngs.train.scene import Scene
+from dyngs.files.write import whole_file
+from dyngs.scene import Scene
 
 MAX_BYTES = 4_000_000_000
 """Of the positions, which are held in memory before they are written."""

@@ -25,8 +25,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from dyngs.config import SceneModel
-from dyngs.data.write import whole_file
 from dyngs.errors import DyngsError, require_regular
+from dyngs.files.write import whole_file
 from dyngs.storage.coding import Packing, compressed, decompressed, packed, unpacked
 from dyngs.storage.drawable import completed, drawable, in_storage_order
 from dyngs.storage.tensors import (
@@ -61,7 +61,7 @@ class _Part(BaseModel):
 
 
 class SceneInfo(_Part):
-    """What a checkpoint says of itself; see ``dyngs.train.checkpoint.CheckpointInfo``."""
+    """What a checkpoint says of itself; see ``dyngs.runs.checkpoint.CheckpointInfo``."""
 
     step: int
     extent: float

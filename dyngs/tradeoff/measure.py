@@ -16,12 +16,12 @@ from dyngs.config import SceneModel
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
+from dyngs.evaluate.metrics import Lpips, psnr, ssim
+from dyngs.evaluate.report import render_options
 from dyngs.rendering import RenderOptions
+from dyngs.scene import Scene, moment_of
 from dyngs.tradeoff.knobs import Variant
 from dyngs.tradeoff.points import Speed, Spread
-from dyngs.train.evaluate import render_options
-from dyngs.train.metrics import Lpips, psnr, ssim
-from dyngs.train.scene import Scene, moment_of
 
 
 @dataclass(frozen=True)

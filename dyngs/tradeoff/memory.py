@@ -19,9 +19,9 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.data.loader import Picture
 from dyngs.ops.native import kernel_threads
+from dyngs.runs.checkpoint import load_run
 from dyngs.tradeoff.knobs import Variant
 from dyngs.tradeoff.measure import Drawer, options_of
-from dyngs.train.checkpoint import load_run
 
 _STATUS = Path("/proc/self/status")
 

@@ -6,17 +6,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from dyngs.build import assemble
 from dyngs.config import BudgetConfig, CompactConfig, Config, DynamicModel, FieldSection, HumanNetModel, SceneModel
-from dyngs.config_io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.config_schema import section_class
+from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.config.schema import section_class
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
+from dyngs.evaluate.metrics import MAX_PSNR
 from dyngs.ops.native import kernel_threads
-from dyngs.storage.file import write_scene
-from dyngs.tradeoff.knobs import Traits, Variant
-from dyngs.tradeoff.measure import drawn_so
-from dyngs.train.assemble import assemble
-from dyngs.train.checkpoint import (
+from dyngs.prune.run import compact_run
+from dyngs.prune.stage import compact_
+from dyngs.runs.checkpoint import (
     COMPACT_NAME,
     Checkpoint,
     checkpoint_paths,
@@ -26,10 +26,10 @@ from dyngs.train.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.train.compacted import compact_run
-from dyngs.train.compaction import compact_
-from dyngs.train.metrics import MAX_PSNR
-from dyngs.train.stored import num_bytes_exact, write_compact
+from dyngs.storage.file import write_scene
+from dyngs.storage.run import num_bytes_exact, write_compact
+from dyngs.tradeoff.knobs import Traits, Variant
+from dyngs.tradeoff.measure import drawn_so
 from dyngs.train.trainer import num_cores, train
 
 FIELD_SIZE = {"skeleton": "nodes", "hexplane": "channels", "mlp": "width", "trajectory": "fourier"}

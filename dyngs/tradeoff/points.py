@@ -9,8 +9,8 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from dyngs.data.write import write_text
 from dyngs.errors import reading, require_regular
+from dyngs.files.write import write_text
 from dyngs.tradeoff.knobs import Variant
 
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
 
-from dyngs.data.write import write_image, write_text
+from dyngs.files.write import write_image, write_text
 from dyngs.tradeoff.front import Exchange, exchanges, on_front
 from dyngs.tradeoff.plot import plot
 from dyngs.tradeoff.points import Point

@@ -9,13 +9,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
-from dyngs.config_io import load_resolved
+from dyngs.config.io import load_resolved
 from dyngs.data.frame_selection import spread
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
-from dyngs.data.write import write_text
 from dyngs.errors import DyngsError
+from dyngs.evaluate.metrics import LpipsNet, load_lpips
+from dyngs.evaluate.report import scene_of_split, split_views
+from dyngs.files.write import write_text
 from dyngs.ops.native import kernel_threads
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.tradeoff.front import combinations
 from dyngs.tradeoff.knobs import Setting, Variant, single_changes
 from dyngs.tradeoff.measure import Drawer, options_of, quality, race
@@ -25,9 +28,6 @@ from dyngs.tradeoff.points import Point, read_point, write_point
 from dyngs.tradeoff.ranks import ALONE, Ranks
 from dyngs.tradeoff.requirements import Figures
 from dyngs.train.background import evaluation_background
-from dyngs.train.checkpoint import checkpoint_paths, load_run
-from dyngs.train.evaluate import scene_of_split, split_views
-from dyngs.train.metrics import LpipsNet, load_lpips
 from dyngs.train.trainer import num_cores
 
 TIMED_VIEWS = 8

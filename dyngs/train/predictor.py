@@ -12,20 +12,20 @@ from dyngs.config import Config, DataConfig, HumanModel, HumanNetModel
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, reading
-from dyngs.human.body import Body
-from dyngs.human.model import HumanScene
-from dyngs.human.person import template
-from dyngs.human.predict.fill import Avatar, filled, num_channels
-from dyngs.human.predict.maps import Maps, maps_of, to_atlas
-from dyngs.human.predict.network import AtlasNetwork
-from dyngs.human.predict.sitter import Sitter, sitter_of, spread_views
+from dyngs.evaluate.report import render_options
+from dyngs.human.avatar.model import HumanScene
+from dyngs.human.prediction.fill import Avatar, filled, num_channels
+from dyngs.human.prediction.maps import Maps, maps_of, to_atlas
+from dyngs.human.prediction.network import AtlasNetwork
+from dyngs.human.prediction.sitter import Sitter, sitter_of, spread_views
+from dyngs.human.template.body import Body
+from dyngs.human.template.person import template
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.rendering import render
+from dyngs.runs.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
 from dyngs.static.rates import Rates
 from dyngs.tensor_checks import require_tensor
 from dyngs.train.background import background_colour, evaluation_background
-from dyngs.train.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
-from dyngs.train.evaluate import render_options
 from dyngs.train.sampler import ViewSampler
 from dyngs.train.step import StepReport
 

@@ -8,19 +8,19 @@ from pathlib import Path
 
 import torch
 
+from dyngs.build import assemble
 from dyngs.config import Config, DataConfig, HumanModel, HumanNetModel
-from dyngs.config_io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
+from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
 from dyngs.errors import DyngsError
-from dyngs.human.model import HumanScene
-from dyngs.human.person import template
-from dyngs.human.predict.fill import Avatar, filled
-from dyngs.human.predict.sitter import Sitter, named_views, spread_views
+from dyngs.human.avatar.model import HumanScene
+from dyngs.human.prediction.fill import Avatar, filled
+from dyngs.human.prediction.sitter import Sitter, named_views, spread_views
+from dyngs.human.template.person import template
+from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
+from dyngs.runs.folder import new_folder, require_empty
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.rates import Rates
-from dyngs.train.assemble import assemble
-from dyngs.train.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.train.predictor import filmed, human_options, load_network, new_network
-from dyngs.train.run_folder import new_folder, require_empty
 
 _FAINT = 0.02
 """Opacity below which a predicted Gaussian is left out, as the preset for one person has it."""

@@ -19,13 +19,13 @@ from dyngs.errors import DyngsError, reading
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.rendering import RenderOptions, render
+from dyngs.runs.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, stored_scene
 from dyngs.static.densify import Densifier, EditResult
 from dyngs.static.model import Drawn
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.settled import Settled
 from dyngs.tensor_checks import require_tensor
 from dyngs.train.background import background_colour
-from dyngs.train.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, stored_scene
 from dyngs.train.sampler import ViewSampler
 from dyngs.train.schedule import active_sh_degree, means_rate, picture_divisor, rates_of
 

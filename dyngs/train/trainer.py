@@ -8,18 +8,20 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from dyngs.budget.count import CountLimit, count_limit_of
+from dyngs.budget.limits import require_possible
+from dyngs.budget.size import has_file, write_within
+from dyngs.budget.speed import SpeedLimit
+from dyngs.budget.time import Deadline, deadline_of, first_fit, refitted, with_steps
+from dyngs.build import assemble
 from dyngs.config import Config, HumanNetModel
-from dyngs.config_io import RESOLVED_NAME, save_config
+from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.errors import DyngsError
+from dyngs.evaluate.metrics import psnr
 from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
-from dyngs.train.assemble import assemble
-from dyngs.train.budget import require_possible
-from dyngs.train.budget_count import CountLimit, count_limit_of
-from dyngs.train.budget_size import has_file, write_within
-from dyngs.train.budget_speed import SpeedLimit
-from dyngs.train.budget_time import Deadline, deadline_of, first_fit, refitted, with_steps
-from dyngs.train.checkpoint import (
+from dyngs.prune.stage import compact_
+from dyngs.runs.checkpoint import (
     Checkpoint,
     checkpoint_paths,
     last_good,
@@ -29,13 +31,11 @@ from dyngs.train.checkpoint import (
     seconds_at,
     step_of,
 )
-from dyngs.train.compaction import compact_
+from dyngs.runs.folder import begin, default_folder, require_startable, tidy, was_only_begun
+from dyngs.runs.lock import writing
+from dyngs.runs.log import LogRecord, Progress, RunLog
 from dyngs.train.interrupt import Interrupts
-from dyngs.train.log import LogRecord, Progress, RunLog
-from dyngs.train.metrics import psnr
 from dyngs.train.predictor import NetworkTrainer, assemble_network
-from dyngs.train.run_folder import begin, default_folder, require_startable, tidy, was_only_begun
-from dyngs.train.run_lock import writing
 from dyngs.train.step import StepReport, Trainer
 
 COUNT, SPEED = "budget.count", "budget.speed"
@@ -259,7 +259,7 @@ class _Loop:
 
     def _evaluate(self, step: int) -> None:
         """Scores of the test split into the log, where there is one."""
-        from dyngs.train.evaluate import evaluate_run
+        from dyngs.evaluate.report import evaluate_run
 
         if not self.trainer.has_test_views:
             return

@@ -10,14 +10,14 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
+from dyngs.evaluate.report import evaluation_background, render_options
 from dyngs.export.avatar import read_avatar
-from dyngs.human.clips import up_of
-from dyngs.human.skinning import rotations
-from dyngs.human.trained import AvatarScene
-from dyngs.train.evaluate import evaluation_background, render_options
-from dyngs.train.playing import playing_motion
+from dyngs.human.avatar.trained import AvatarScene
+from dyngs.human.motion.clips import up_of
+from dyngs.human.pose.skinning import rotations
 from dyngs.view.frames import Shot
 from dyngs.view.paths import CameraPath, frame_orbit_for_points, frozen_path, read_path, spiral_path, with_times
+from dyngs.view.playing import playing_motion
 from dyngs.view.shots import DEFAULT_FRAMES, DEFAULT_SIZE, ShotOptions, path_file, resize_cameras
 
 _MOMENTS = 8

@@ -15,14 +15,14 @@ from dyngs.camera import Cameras
 from dyngs.data.capture import Capture
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
-from dyngs.data.write import to_uint8, write_image
 from dyngs.errors import DyngsError
+from dyngs.evaluate.metrics import psnr
+from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
 from dyngs.export.ply import SplatFile
+from dyngs.files.write import to_uint8, write_image
 from dyngs.rendering import RenderOptions
-from dyngs.train.checkpoint import load_run
-from dyngs.train.evaluate import evaluation_background, render_options, scene_of_split, split_views
-from dyngs.train.metrics import psnr
-from dyngs.train.scene import Moment, Scene, moment_of
+from dyngs.runs.checkpoint import load_run
+from dyngs.scene import Moment, Scene, moment_of
 from dyngs.view.paths import CameraPath
 from dyngs.view.sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
 from dyngs.view.video import VideoWriter

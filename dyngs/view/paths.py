@@ -15,8 +15,8 @@ import torch
 from dyngs.camera import Cameras
 from dyngs.data.focus import focus_point, share_in_front
 from dyngs.data.poses import cam_from_opengl, checked_pose
-from dyngs.data.write import write_text
 from dyngs.errors import DyngsError, printable, require_regular
+from dyngs.files.write import write_text
 from dyngs.view.keyframes import Keyframes, interpolate_keyframes
 
 _MAX_FRAMES = 100_000

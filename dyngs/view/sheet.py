@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyngs.data.write import to_uint8, write_image
+from dyngs.files.write import to_uint8, write_image
 
 __all__ = ["SheetRow", "color_map", "contact_sheet", "depth_limits", "depth_to_rgb", "write_image"]
 

@@ -8,17 +8,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dyngs.build import training_cameras
 from dyngs.camera import Cameras
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, View
 from dyngs.data.read import read_capture
 from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
+from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
 from dyngs.export.ply import read_ply
-from dyngs.train.assemble import training_cameras
-from dyngs.train.checkpoint import LoadedRun, load_run
-from dyngs.train.evaluate import evaluation_background, render_options, scene_of_split, split_views
-from dyngs.train.playing import at_rest, playing_motion
+from dyngs.runs.checkpoint import LoadedRun, load_run
 from dyngs.view.frames import Shot, file_stems, files_of, splat_options
 from dyngs.view.paths import (
     CameraPath,
@@ -29,6 +28,7 @@ from dyngs.view.paths import (
     spiral_path,
     with_times,
 )
+from dyngs.view.playing import at_rest, playing_motion
 
 DEFAULT_FRAMES = 120
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.data.temporary import temporary_beside
-from dyngs.data.video import read_frames
+from dyngs.data.pictures.video import read_frames
 from dyngs.errors import DyngsError
+from dyngs.files.temporary import temporary_beside
 
 __all__ = ["VideoWriter", "read_frames"]
 

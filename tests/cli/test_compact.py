@@ -9,7 +9,7 @@ from refused import error_line
 from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.cli import main
-from dyngs.config_io import load_resolved
+from dyngs.config.io import load_resolved
 from dyngs.train.trainer import train
 
 

@@ -14,13 +14,13 @@ from refused import error_line
 from dyngs.cli import data, main
 from dyngs.config import DataConfig
 from dyngs.data.read import read_capture
-from dyngs.human import body as body_module
-from dyngs.human.body_files import load_body
-from dyngs.human.motion import Motion, read_motion, save_motion
+from dyngs.human.motion.motion import Motion, read_motion, save_motion
+from dyngs.human.template import body as body_module
+from dyngs.human.template.body_files import load_body
 
 PrintedOutput = pytest.CaptureFixture[str]
 
-TEMPLATE = Path(body_module.__file__).parent / "templates" / "anny_smplx55.npz"
+TEMPLATE = Path(body_module.__file__).parent / "files" / "anny_smplx55.npz"
 
 
 def known_motion() -> Motion:

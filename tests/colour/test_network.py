@@ -17,7 +17,7 @@ from dyngs.colour.network import (
     network_of,
 )
 from dyngs.gaussians import Gaussians
-from dyngs.human.covariance import rotations_of
+from dyngs.human.pose.covariance import rotations_of
 from dyngs.ops.perceptron import Layer, reference_perceptron
 from dyngs.ops.shading import Sight, num_inputs, reference_inputs
 from dyngs.rendering import RenderOptions, render

@@ -16,9 +16,9 @@ from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.inspect import draw_cameras, format_report, inspect_capture, report_on
 from dyngs.data.poses import cam_from_opengl
-from dyngs.data.synthetic import StillOptions, hemisphere_cameras, write_still_capture
-from dyngs.data.write import write_image
+from dyngs.data.synthetic.captures import StillOptions, hemisphere_cameras, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.files.write import write_image
 
 
 def _capture(root: Path, count: int = 6) -> Capture:

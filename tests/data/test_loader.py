@@ -14,7 +14,7 @@ from tiny_captures import random_pixels, write_picture
 from dyngs.config import DataConfig
 from dyngs.data.capture import Lens, View
 from dyngs.data.loader import PictureLoader
-from dyngs.data.people import Silhouette, person_view
+from dyngs.data.readers.people import Silhouette, person_view
 from dyngs.errors import DyngsError
 
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from tiny_captures import opengl_pose
 
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.people import body_frames, of_one_clip
 from dyngs.data.poses import cam_from_opengl, camera_center, checked_pose, inverse_rigid
+from dyngs.data.readers.people import body_frames, of_one_clip
 from dyngs.data.rebase import rebase, shifted
 from dyngs.errors import DyngsError
 

@@ -13,6 +13,7 @@ from scenes import look_around, weights
 from tiny_fields import KINDS, busy_config, cloud, stir, stirred_field, tiny_field, tiny_options, write_tiny_capture
 from torch import Tensor
 
+from dyngs.build import assemble
 from dyngs.camera import Cameras
 from dyngs.config import DynamicModel, HexplaneField, SkeletonField, StaticModel, TrainConfig
 from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, Offsets, deformed
@@ -28,10 +29,9 @@ from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.ops.planes import PlaneLevel, hexplane_features
 from dyngs.rendering import render
+from dyngs.runs.checkpoint import stored_scene
 from dyngs.static.densify import EditResult
 from dyngs.static.model import StaticScene
-from dyngs.train.assemble import assemble
-from dyngs.train.checkpoint import stored_scene
 from dyngs.train.step import Trainer
 
 LONG = 10_000

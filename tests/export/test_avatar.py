@@ -18,13 +18,13 @@ from dyngs.config import Config, DataConfig, DefaultStrategy, HumanModel, RunCon
 from dyngs.errors import DyngsError
 from dyngs.export import avatar
 from dyngs.export.avatar import read_avatar, write_avatar
-from dyngs.human.motion import Motion, save_motion
-from dyngs.human.synthetic import HumanOptions, write_human_capture
-from dyngs.human.trained import AvatarScene
-from dyngs.train.checkpoint import checkpoint_paths, load_run
-from dyngs.train.playing import at_rest, playing_motion
-from dyngs.train.tensor_file import read_tensors, write_tensors
+from dyngs.files.tensor_file import read_tensors, write_tensors
+from dyngs.human.avatar.trained import AvatarScene
+from dyngs.human.motion.motion import Motion, save_motion
+from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.train.trainer import train
+from dyngs.view.playing import at_rest, playing_motion
 
 
 @pytest.fixture(scope="module")

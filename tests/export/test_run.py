@@ -13,7 +13,7 @@ from dyngs.errors import DyngsError
 from dyngs.export import run as export_run
 from dyngs.export.ply import read_ply
 from dyngs.export.run import export_ply, frame_names, scene_part, write_moment, write_moments
-from dyngs.train.checkpoint import LoadedRun, load_run
+from dyngs.runs.checkpoint import LoadedRun, load_run
 
 ALL = (0, 1, 2, 3, 4)
 STILL_ROWS = (0, 2, 4)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.deform.nodes import turned
-from dyngs.human.covariance import moved_axes, rotations_of
+from dyngs.human.pose.covariance import moved_axes, rotations_of
 from dyngs.ops.projection import project
 from dyngs.ops.quaternions import unit_quats
 from dyngs.ops.reference import rotation_matrices

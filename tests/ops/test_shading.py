@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.human.covariance import rotations_of
+from dyngs.human.pose.covariance import rotations_of
 from dyngs.ops.native import kernel_threads
 from dyngs.ops.shading import Sight, contracted, num_inputs, reference_inputs, shading_inputs, shortest_axes
 

@@ -10,10 +10,10 @@ from moving_scene import Sliding, camera, moving_scene, still_scene
 from dyngs.config import StaticModel
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Picture
+from dyngs.evaluate.metrics import Lpips
 from dyngs.rendering import RenderOptions
 from dyngs.tradeoff.knobs import Variant
 from dyngs.tradeoff.measure import Drawer, options_of, quality, race, shrunk, spread_of
-from dyngs.train.metrics import Lpips
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 BLACK = torch.zeros(3)

@@ -11,17 +11,17 @@ import pytest
 from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.config import DynamicModel
-from dyngs.config_io import load_resolved, save_config
+from dyngs.config.io import load_resolved, save_config
 from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
+from dyngs.evaluate.report import evaluate_run, render_options
+from dyngs.runs.checkpoint import is_compact, load_run
 from dyngs.tradeoff.knobs import Variant, parse_settings
 from dyngs.tradeoff.measure import options_of
 from dyngs.tradeoff.models import Models, field_changes, traits, write_chosen
 from dyngs.tradeoff.points import Point, read_point
 from dyngs.tradeoff.report import write_report
 from dyngs.tradeoff.sweep import Plan, figures_of, sweep
-from dyngs.train.checkpoint import is_compact, load_run
-from dyngs.train.evaluate import evaluate_run, render_options
 from dyngs.train.trainer import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -10,7 +10,7 @@ from tiny_people import NET, people
 
 from dyngs.config import Config, DataConfig
 from dyngs.errors import DyngsError
-from dyngs.train.checkpoint import checkpoint_paths, load_checkpoint
+from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint
 from dyngs.train.predictor import NetworkTrainer, assemble_network, captures_in, mean_colours, rate_at
 from dyngs.train.trainer import train
 

@@ -10,11 +10,11 @@ import torch
 from tiny_people import NET, TINY, people
 
 from dyngs.config import Config
-from dyngs.config_io import load_resolved, save_config
+from dyngs.config.io import load_resolved, save_config
 from dyngs.errors import DyngsError
-from dyngs.human.trained import AvatarScene
-from dyngs.train.checkpoint import load_run
-from dyngs.train.evaluate import evaluate_run
+from dyngs.evaluate.report import evaluate_run
+from dyngs.human.avatar.trained import AvatarScene
+from dyngs.runs.checkpoint import load_run
 from dyngs.train.predictor_run import Prediction, network_config, predict_person
 from dyngs.train.trainer import train
 

@@ -12,6 +12,7 @@ import torch
 from moving_scene import TRAIN_TIMES, write_timed_capture
 from torch import Tensor
 
+from dyngs.build import assemble
 from dyngs.config import (
     AutoColour,
     Config,
@@ -24,17 +25,16 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.data.loader import Picture
-from dyngs.data.synthetic import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.files.tensor_file import write_tensors
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.rendering import RenderOptions, render
+from dyngs.runs.checkpoint import _KIND, load_checkpoint, stored_scene
+from dyngs.scene import moment_of, num_colour_values
 from dyngs.static.densify import EditResult
 from dyngs.static.model import Drawn
-from dyngs.train.assemble import assemble
-from dyngs.train.checkpoint import _KIND, load_checkpoint, stored_scene
-from dyngs.train.scene import moment_of, num_colour_values
 from dyngs.train.step import Trainer
-from dyngs.train.tensor_file import write_tensors
 
 
 @pytest.fixture(scope="module")

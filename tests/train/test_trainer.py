@@ -14,6 +14,7 @@ from moving_scene import write_timed_capture
 from tiny_fields import KINDS, busy_config, write_tiny_capture
 from torch import Tensor
 
+from dyngs.build import assemble
 from dyngs.config import (
     Config,
     DataConfig,
@@ -24,12 +25,11 @@ from dyngs.config import (
     StaticModel,
     TrainConfig,
 )
-from dyngs.config_io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.data.synthetic import StillOptions, write_still_capture
+from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.model import DynamicScene
 from dyngs.errors import DyngsError
-from dyngs.train.assemble import assemble
-from dyngs.train.checkpoint import checkpoint_paths, load_checkpoint, load_run, save_checkpoint
+from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run, save_checkpoint
 from dyngs.train.step import StepReport, Trainer
 from dyngs.train.trainer import train
 

@@ -15,17 +15,17 @@ from moving_scene import Sliding, camera, moving_scene, still_scene, write_movin
 
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig
-from dyngs.config_io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import RasterizeMode
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.export.ply import SplatFile, read_ply, write_ply
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, render
-from dyngs.train.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.train.scene import Moment, moment_of
+from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
+from dyngs.scene import Moment, moment_of
 from dyngs.view.frames import (
     DEFAULT_OPTIONS,
     OutputOptions,

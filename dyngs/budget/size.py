@@ -1,0 +1,157 @@
+"""``budget.max_mb``: the file of a finished run, no larger than allowed, and what that costs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from dyngs.config import CompactConfig
+from dyngs.config.io import RESOLVED_NAME, save_config
+from dyngs.data.frame_selection import spread
+from dyngs.deform.trained import TrainedScene
+from dyngs.errors import DyngsError
+from dyngs.prune.score import worth
+from dyngs.prune.selection import best
+from dyngs.prune.stage import PROBED_VIEWS, quality_of, scores_of, survey_of
+from dyngs.runs.checkpoint import COMPACT_NAME, Checkpoint, stored_scene
+from dyngs.runs.folder import SMALL_FOLDER
+from dyngs.storage.drawable import drawable
+from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
+from dyngs.storage.quantize import step_below
+from dyngs.storage.run import precision_of
+from dyngs.storage.tensors import COARSENESS
+from dyngs.train.step import Trainer
+
+KEPT = 0.7
+"""Share of the Gaussians that each further trial keeps of those of the one before."""
+FINEST_CHANGE, LARGEST_CHANGE, COARSEST = 2**0.25, 2.0, 64.0
+"""By what steps are multiplied at once, and altogether."""
+_TRIALS = 40
+
+
+@dataclass(frozen=True)
+class SizeReport:
+    """What a file was made of.
+
+    Attributes:
+        asked, megabytes: 1e6 bytes.
+        before, after: mean PSNR of at most 16 training pictures, dB: as trained, and as read from the file.
+        num_gaussians, num_kept: as trained, and in the file.
+        coarser: than usual by this factor are the steps to which values are rounded.
+    """
+
+    asked: float
+    megabytes: float
+    before: float
+    after: float
+    num_gaussians: int
+    num_kept: int
+    coarser: float
+
+    def __str__(self) -> str:
+        how = [f"{self.coarser:.3g} times coarser than usual"] if self.coarser > 1 else []
+        if self.num_kept < self.num_gaussians:
+            how += [f"{self.num_kept:,} of {self.num_gaussians:,} Gaussians"]
+        return (
+            f"budget.max_mb: asked {self.asked:g}, got {self.megabytes:.3g} ({SMALL_FOLDER}/{COMPACT_NAME}"
+            f"{''.join(f', {x}' for x in how)}); {self.after - self.before:+.2f} dB on training views "
+            f"({self.before:.2f} -> {self.after:.2f})"
+        )
+
+
+@dataclass(frozen=True)
+class _File:
+    """One way to store a run."""
+
+    data: bytes
+    psnr: float
+    num_kept: int
+    coarser: float
+
+
+def has_file(run_dir: Path) -> bool:
+    """Whether the file of a run was written already."""
+    folder = run_dir / SMALL_FOLDER
+    return (folder / COMPACT_NAME).is_file() and (folder / RESOLVED_NAME).is_file()
+
+
+@torch.no_grad()
+def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeReport:
+    """What became of the file ``small/scene.dyngs`` in ``run_dir``, which is at most ``megabytes`` large.
+
+    Stored as exactly as is usual if that fits. Otherwise more coarsely, and with fewer Gaussians, as long as the latter
+    makes training pictures better than the former alone.
+
+    Args:
+        trainer: at the end of its run; its Gaussians are left as they are.
+        run_dir: of the run.
+        megabytes: 1e6 bytes.
+
+    Raises:
+        DyngsError: no way that was tried fits; the run itself is complete.
+    """
+    whole = trainer.checkpoint()
+    scene = stored_scene(whole, trainer.config.model)
+    pictures = [trainer.pictures[i] for i in spread(len(trainer.pictures), PROBED_VIEWS)]
+    before = quality_of(trainer, scene, pictures, None)
+    tensors, precision = precision_of(trainer.config, whole, None)
+
+    def stored(checkpoint: Checkpoint, coarseness: Tensor | None, num_kept: int) -> _File | None:
+        state = checkpoint.tensors | ({} if coarseness is None else {COARSENESS: coarseness})
+        info = SceneInfo(**asdict(checkpoint.info))
+        found = _fitted(trainer, info, state, precision.steps, int(1e6 * megabytes))
+        if found is None:
+            return None
+        data, coarser = found
+        read = stored_scene(Checkpoint(checkpoint.info, decoded(data).tensors), trainer.config.model)
+        return _File(data, quality_of(trainer, read, pictures, None), num_kept, coarser)
+
+    chosen = stored(whole, tensors.get(COARSENESS), len(scene))
+    if chosen is None or chosen.coarser > 1:
+        unmasked = scene.unmasked() if isinstance(scene, TrainedScene) else scene
+        scores = scores_of(worth(survey_of(trainer, unmasked), slopes=True), CompactConfig())
+        share = KEPT
+        while share * len(scene) >= 1:
+            kept = best(scores, 1 - share)
+            trainer.keep(kept)
+            coarseness = tensors[COARSENESS][kept] if COARSENESS in tensors else None
+            found = stored(trainer.checkpoint(), coarseness, int(kept.sum()))
+            trainer.restore(whole)
+            if chosen is not None and (found is None or found.psnr <= chosen.psnr):
+                break
+            chosen, share = found, share * KEPT
+    if chosen is None:
+        raise DyngsError(f"budget.max_mb={megabytes:g}: what is trained does not fit; the run itself is in {run_dir}")
+    write_scene(run_dir / SMALL_FOLDER / COMPACT_NAME, chosen.data)
+    save_config(trainer.config, run_dir / SMALL_FOLDER / RESOLVED_NAME)
+    got = 1e-6 * len(chosen.data)
+    return SizeReport(megabytes, got, before, chosen.psnr, len(scene), chosen.num_kept, chosen.coarser)
+
+
+def _fitted(
+    trainer: Trainer, info: SceneInfo, tensors: Mapping[str, Tensor], steps: Mapping[str, float], most: int
+) -> tuple[bytes, float] | None:
+    """The bytes of a file of at most ``most``, and the factor on ``steps`` that this took; None: none was found."""
+    num_values = sum(x.numel() for x in drawable(tensors).values())
+    factor, tried = 1.0, set()
+    fits: tuple[bytes, float] | None = None
+    too_fine = 0.0
+    while factor <= COARSEST and factor not in tried and len(tried) < _TRIALS:
+        tried.add(factor)
+        data = encoded(info, tensors, trainer.config.model, {n: step_below(factor * s) for n, s in steps.items()})
+        if len(data) <= most:
+            fits = data, factor
+        else:
+            too_fine = factor
+        if fits is None:
+            bits = 8 * (len(data) - most) / max(num_values, 1)
+            factor *= min(max(2**bits, FINEST_CHANGE), LARGEST_CHANGE)
+        elif too_fine and fits[1] / too_fine > FINEST_CHANGE:
+            factor = (fits[1] * too_fine) ** 0.5
+        else:
+            break
+    return fits

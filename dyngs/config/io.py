@@ -1,0 +1,310 @@
+"""Configurations from and to YAML: presets, ``a.b=c`` overrides, and errors that say what is allowed.
+
+A preset is a short YAML file; overrides are laid over it; ``dyngs.config.Config`` checks the result and fills in the
+rest. What was resolved is saved with every run and is all that later commands read.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from dyngs.config import Config
+from dyngs.config.schema import (
+    allowed_values,
+    choices_of,
+    config_keys,
+    keys_of_location,
+    kinds_of,
+    section_at,
+    section_class,
+    section_classes,
+)
+from dyngs.config.yaml import Leaf, read_file, read_override, require_usable
+from dyngs.errors import DyngsError, printable
+from dyngs.files.write import write_text
+
+RESOLVED_NAME = "config.yaml"
+"""Name of the resolved configuration inside a run folder."""
+
+MAX_WHOLE = 2**63 - 1
+"""The largest whole number of a configuration."""
+_ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
+
+
+# ---------------------------------------------------------------------------------------------------- loading
+
+
+def load_config(preset: Path | None, overrides: Iterable[str] = ()) -> Config:
+    """The configuration of a preset with overrides laid over it.
+
+    Args:
+        preset: a YAML file, or the name of a packaged preset (``static``, ``configs/static.yaml``) where no such file
+            exists; None starts from the defaults.
+        overrides: ``section.key=value`` with the value in YAML. A changed ``kind`` replaces its whole section and
+            nothing outside it, whatever the order of the overrides.
+
+    Returns:
+        the checked configuration; ``data.root`` is made absolute, so that later commands work from any folder.
+
+    Raises:
+        DyngsError: naming the file and line or the override, the key, and what is allowed.
+    """
+    layers = _Layers()
+    if preset is not None:
+        layers.add_file(find_preset(preset))
+    layers.add_overrides(overrides)
+    config = _validate(layers)
+    data = config.data.model_copy(update={"root": config.data.root.absolute()})
+    return config.model_copy(update={"data": data})
+
+
+def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
+    """The configuration of a finished or interrupted run.
+
+    Args:
+        path: a run folder, or the YAML file in it.
+        overrides: as in ``load_config``.
+
+    Raises:
+        DyngsError: if there is none, or it is broken.
+    """
+    file = path / RESOLVED_NAME if path.is_dir() else path
+    if not file.is_file():
+        raise DyngsError(
+            f"{path}: not a run folder (no {RESOLVED_NAME} there); give the folder that `dyngs train` wrote"
+        )
+    layers = _Layers()
+    layers.add_file(file)
+    if not layers.tree.get("data"):
+        raise DyngsError(f"{file}: does not say which capture the run was trained on (data.root); restore the file")
+    layers.add_overrides(overrides)
+    return _validate(layers)
+
+
+def save_config(config: Config, path: Path) -> None:
+    """Write every value of ``config`` as YAML, atomically: ``path`` is either the old file or the new one."""
+    values = config.model_dump(mode="json")
+    text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
+    if not _ODD_LINE_BREAKS.isdisjoint(text):
+        text = yaml.safe_dump(values, sort_keys=False, allow_unicode=False)  # escapes, where YAML would fold them
+    write_text(path, text, durable=True)
+
+
+def find_preset(path: Path) -> Path:
+    """The preset file meant by ``path``: itself if it exists, else the packaged preset of that name.
+
+    Only a bare name or one below ``configs/`` is looked for in the package, so that a mistyped path of the user's own
+    is an error. In a source checkout the package's presets are those in the repository's ``configs``.
+    """
+    if path.is_file():
+        return path
+    packaged = _packaged_presets()
+    if path.parent.name in ("", "configs") and path.suffix in ("", ".yaml", ".yml") and path.stem in packaged:
+        return packaged[path.stem]
+    if path.exists() and not path.is_dir():
+        raise DyngsError(f"{path}: not a regular file; give a YAML preset")
+    close = get_close_matches(path.stem, packaged, n=1)
+    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    raise DyngsError(f"{path}: no such preset{hint}; the packaged ones are {', '.join(sorted(packaged))}")
+
+
+def packaged_preset(name: str) -> Path:
+    """The file of the preset ``name`` that comes with dyngs, for instance ``static``.
+
+    Raises:
+        DyngsError: there is none of that name.
+    """
+    packaged = _packaged_presets()
+    if name not in packaged:
+        raise DyngsError(f"no packaged preset {name!r}; there are {', '.join(sorted(packaged))}")
+    return packaged[name]
+
+
+def _packaged_presets() -> dict[str, Path]:
+    package = Path(__file__).resolve().parents[1]
+    folder = next((f for f in (package / "configs", package.parent / "configs") if f.is_dir()), None)
+    return {f.stem: f for f in sorted(folder.glob("*.yaml"))} if folder else {}
+
+
+# ---------------------------------------------------------------------------------------------------- layers
+
+
+@dataclass
+class _Layers:
+    """The tree that is being put together, and for every value where it came from."""
+
+    tree: dict[str, Any] = field(default_factory=dict)
+    origins: dict[tuple[str, ...], str] = field(default_factory=dict)
+    written: dict[tuple[str, ...], str] = field(default_factory=dict)
+
+    def add_file(self, path: Path) -> None:
+        for leaf in read_file(path):
+            self._set(leaf)
+
+    def add_overrides(self, overrides: Iterable[str]) -> None:
+        leaves = [leaf for text in overrides for leaf in read_override(text)]
+        # what empties a section goes first, outer sections before inner ones
+        for leaf in sorted(leaves, key=lambda o: (o.keys[-1] != "kind" and o.value != {}, len(o.keys))):
+            if leaf.keys[-1] == "kind":
+                self._drop_other_kind(leaf.keys[:-1], leaf.value)
+            self._set(leaf)
+
+    def _drop_other_kind(self, keys: tuple[str, ...], kind: Any) -> None:
+        """Empty the section at ``keys`` if it is of another kind than ``kind``."""
+        section = self.value_at(keys)
+        info = section_at(self.tree, keys).model_fields.get(keys[-1]) if keys else None
+        if not isinstance(section, dict) or info is None or not kinds_of(info):
+            return
+        if section.get("kind", info.get_default().kind) != kind:
+            section.clear()
+            self.origins = {k: v for k, v in self.origins.items() if k[: len(keys)] != keys}
+
+    def _set(self, leaf: Leaf) -> None:
+        require_usable(leaf)
+        keys, value, section = leaf.keys, leaf.value, self.tree
+        for depth, key in enumerate(keys[:-1], start=1):
+            inner = section.setdefault(key, {})
+            if inner is None:
+                inner = section[key] = {}
+            if not isinstance(inner, dict):
+                raise DyngsError(f"{leaf.origin}: {'.'.join(keys[:depth])} is a value, it has no key {keys[depth]!r}")
+            section = inner
+        if isinstance(value, str) and value.startswith("~/"):
+            value = os.path.expanduser(value)
+        section[keys[-1]] = value
+        self.origins[keys], self.written[keys] = leaf.origin, leaf.text
+
+    def value_at(self, keys: tuple[str, ...]) -> Any:
+        """The value or section at ``keys``; None where there is none."""
+        node: Any = self.tree
+        for key in keys:
+            node = node.get(key) if isinstance(node, dict) else None
+        return node
+
+    def origin_of(self, keys: tuple[str, ...]) -> str:
+        """Where the value at ``keys``, or else the first one below it, was written; "" if nowhere."""
+        below = (origin for k, origin in self.origins.items() if k[: len(keys)] == keys)
+        return self.origins.get(keys) or next(below, "")
+
+
+# ---------------------------------------------------------------------------------------------------- checking
+
+
+def _fill_in_kinds(section: type[BaseModel], node: dict[str, Any]) -> None:
+    """Put an empty section where one is absent, and the default ``kind`` where a section with variants has none."""
+    for name, info in section.model_fields.items():
+        if section_classes(info):
+            inner = node[name] = {} if node.get(name) is None else node[name]
+            if isinstance(inner, dict):
+                if kinds_of(info):
+                    inner.setdefault("kind", info.get_default().kind)
+                _fill_in_kinds(section_class(info, inner.get("kind")), inner)
+
+
+def _validate(layers: _Layers) -> Config:
+    _fill_in_kinds(Config, layers.tree)
+    try:
+        config = Config.model_validate(layers.tree)
+        _require_countable(config.model_dump(), (), layers)
+        return config
+    except ValidationError as error:
+        problems = sorted(error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden")
+    if _take_as_text(layers, problems):
+        return _validate(layers)
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    raise DyngsError(_explain(layers, problems[0]) + more)
+
+
+def _require_countable(section: dict[str, Any], above: tuple[str, ...], layers: _Layers) -> None:
+    """Nothing, if no whole number needs more than 64 bits. Raises DyngsError."""
+    for key, value in section.items():
+        keys = (*above, key)
+        if isinstance(value, dict):
+            _require_countable(value, keys, layers)
+        elif any(isinstance(x, int) and abs(x) > MAX_WHOLE for x in (value if isinstance(value, tuple) else (value,))):
+            raise DyngsError(f"{layers.origin_of(keys)}: {'.'.join(keys)} must be below 2^63, not {_shorten(value)}")
+
+
+def _take_as_text(layers: _Layers, problems: list[ErrorDetails]) -> bool:
+    """Replace numbers, dates and such by what was written where the schema wants text; True if anything changed."""
+    changed = False
+    for problem in problems:
+        keys = keys_of_location(problem["loc"])
+        if problem["type"] in ("string_type", "path_type") and layers.written.get(keys):
+            section = layers.value_at(keys[:-1])
+            changed = changed or section[keys[-1]] != layers.written[keys]
+            section[keys[-1]] = layers.written[keys]
+    return changed
+
+
+def _explain(layers: _Layers, problem: ErrorDetails) -> str:
+    keys = keys_of_location(problem["loc"])
+    section = section_at(layers.tree, keys)
+    what, dotted = problem["type"], ".".join(keys)
+    origin = layers.origin_of((*keys, "kind") if what == "union_tag_invalid" else keys)
+    prefix = f"{origin}: " if origin else ""
+    if what == "extra_forbidden":
+        return prefix + _explain_unknown(layers, keys)
+    info = section.model_fields[keys[-1]]
+    if what == "missing":
+        example = "data.root=FOLDER" if dotted == "data.root" else f"{dotted}=..."
+        return f"{prefix}{dotted} is missing ({info.description}); give {example}"
+    if what in ("model_type", "model_attributes_type", "dict_type"):
+        inside = dict.fromkeys(key for variant in section_classes(info) for key in variant.model_fields)
+        return f"{prefix}{dotted} is a section, not a value; its keys: {', '.join(inside)}"
+    if what == "union_tag_invalid":
+        dotted, value, choices = f"{dotted}.kind", layers.value_at((*keys, "kind")), kinds_of(info)
+        allowed = f"one of {', '.join(choices)}"
+    else:
+        value, choices, allowed = layers.value_at(keys), choices_of(info.annotation), allowed_values(info)
+    close = get_close_matches(value[:100], choices, n=1) if isinstance(value, str) else []
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return f"{prefix}{dotted} must be {allowed}, not {_shorten(value)}{hint}"
+
+
+def _explain_unknown(layers: _Layers, keys: tuple[str, ...]) -> str:
+    """What to say of a key that its section does not have: that another kind has it, or what is near."""
+    above, dotted = keys[:-1], ".".join(keys)
+    holder = section_at(layers.tree, above).model_fields.get(above[-1]) if above else None
+    variants = section_classes(holder) if holder is not None else []
+    owners = [str(v.model_fields["kind"].default) for v in variants if keys[-1] in v.model_fields]
+    if owners:
+        present = layers.value_at((*above, "kind"))
+        return f"{dotted} belongs to {'.'.join(above)}.kind={' or '.join(owners)}, not to {present}"
+    full = next((k for k in layers.origins if k[: len(keys)] == keys), keys)
+    section = section_at(layers.tree, keys)
+    return f"unknown key {dotted!r}{_did_you_mean_key(full, section, inside=bool(above) and full == keys)}"
+
+
+def _shorten(value: object) -> str:
+    try:
+        return printable(repr(value), 60)
+    except (ValueError, RecursionError):  # a number of more digits than Python writes
+        return "something very long"
+
+
+def _did_you_mean_key(keys: tuple[str, ...], section: type[BaseModel], inside: bool) -> str:
+    """``; did you mean ...?`` with the nearest key: of ``section`` if ``inside``, else the same last word elsewhere."""
+    everything = list(dict.fromkeys(key.name for key in config_keys()))
+    dotted = ".".join(keys)
+    siblings = get_close_matches(keys[-1], list(section.model_fields), n=1)
+    if siblings and inside:
+        return f"; did you mean {'.'.join((*keys[:-1], siblings[0]))!r}?"
+    elsewhere = [name for name in everything if name.split(".")[-1] == keys[-1]]
+    if len(keys) > 1:
+        elsewhere = get_close_matches(dotted, elsewhere, n=1) or elsewhere
+    if elsewhere:
+        return f"; did you mean {' or '.join(repr(name) for name in elsewhere)}?"
+    close = get_close_matches(dotted, everything, n=1)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; known here: {', '.join(section.model_fields)}"

@@ -1,0 +1,1 @@
+"""Pictures and videos: decoding, lens distortion, the cache of video frames."""

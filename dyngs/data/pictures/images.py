@@ -1,0 +1,207 @@
+"""Picture files: size without decoding, decoding to 8-bit straight-alpha sRGB, exact area downscaling."""
+
+from __future__ import annotations
+
+import math
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.errors import DyngsError, reading
+from dyngs.files.picture_errors import picture_error
+from dyngs.files.trust import check_size, max_decoded_mb
+
+if TYPE_CHECKING:
+    import OpenImageIO
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp")
+_TAIL_BYTES = 4096
+_PNG_END = b"IEND"
+_END_MARKERS = {".png": _PNG_END, ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+
+
+@dataclass(frozen=True)
+class PictureHeader:
+    """What a file says about its picture before it is decoded.
+
+    Attributes:
+        width, height: pixels.
+        channels: stored channels.
+        has_alpha: one of them is alpha.
+    """
+
+    width: int
+    height: int
+    channels: int
+    has_alpha: bool
+
+
+def read_header(path: Path) -> PictureHeader:
+    """Size and channels of the picture, without decoding it.
+
+    Raises:
+        DyngsError: the file is missing or is no picture.
+    """
+    with _reading(path):
+        source = _open(path)
+        spec = source.spec()
+        source.close()
+        return PictureHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0)
+
+
+def read_picture(path: Path) -> Tensor:
+    """(H, W, 3) or, with alpha, (H, W, 4) uint8 picture: sRGB, straight alpha.
+
+    8-bit files come out bit for bit. 16-bit ones are rounded. Floating-point files (EXR) are linear with premultiplied
+    alpha: they are clamped to [0, 1] and encoded as sRGB. Grey becomes RGB.
+
+    Raises:
+        DyngsError: the file is missing, truncated, no picture, or larger than ``data.max_megapixels``.
+    """
+    with _reading(path):
+        return _decoded(path)
+
+
+def _reading(path: Path) -> AbstractContextManager[None]:
+    return reading(path, "the picture is damaged or of an unknown kind; copy or convert it again")
+
+
+def _decoded(path: Path) -> Tensor:
+    import OpenImageIO as oiio
+
+    source = _open(path)
+    spec = source.spec()
+    check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
+    is_linear = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+    pixels = source.read_image(oiio.FLOAT if is_linear else oiio.UINT8)
+    message = picture_error(source)
+    source.close()
+    # Half a JPEG decodes to a picture with a grey lower half and a message.
+    if pixels is None or "premature" in message.lower():
+        reason = message or "the data ends early"
+        raise DyngsError(f"{path}: the picture is truncated or damaged ({reason}); copy it again")
+    pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
+    alpha = pixels[..., spec.alpha_channel] if spec.alpha_channel >= 0 else None
+    colour_channels = [i for i in range(spec.nchannels) if i != spec.alpha_channel]
+    if not colour_channels:
+        raise DyngsError(f"{path}: the picture has no colour channel; use an RGB or RGBA picture")
+    colour_channels = colour_channels[:3] if len(colour_channels) >= 3 else colour_channels[:1] * 3
+    rgb = pixels[..., colour_channels]
+    if is_linear:
+        rgb, alpha = _encode_linear(rgb, alpha)
+    return torch.from_numpy(np.ascontiguousarray(rgb if alpha is None else np.dstack([rgb, alpha])))
+
+
+def read_mask(path: Path) -> Tensor:
+    """(H, W) bool mask, true = keep: the mean of the colour channels is at least one half.
+
+    Raises:
+        DyngsError: as ``read_picture``.
+    """
+    return read_picture(path)[..., :3].float().mean(dim=-1) >= 127.5
+
+
+def check_picture(path: Path) -> PictureHeader:
+    """Header of a picture that is very likely complete; a JPEG without its end marker is decoded to find out.
+
+    Raises:
+        DyngsError: the file is missing, truncated or no picture.
+    """
+    header = read_header(path)
+    check_size(path, header.width, header.height, header.channels)
+    marker = _END_MARKERS.get(path.suffix.lower())
+    if marker:
+        with _reading(path), path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+            complete = marker in file.read()
+        if not complete and marker == _PNG_END:  # not decoded: libpng would add lines of its own to the error
+            raise DyngsError(f"{path}: the picture is truncated or damaged (its end is missing); copy it again")
+        if not complete:
+            read_picture(path)
+    return header
+
+
+def target_size(width: int, height: int, downscale: float = 1.0, longest_side: int | None = None) -> tuple[int, int]:
+    """(width, height) after dividing by ``downscale`` and shrinking to at most ``longest_side``; never enlarged."""
+    factor = max(1.0, downscale)
+    if longest_side is not None:
+        factor = max(factor, max(width, height) / longest_side)
+    return max(1, math.floor(width / factor + 0.5)), max(1, math.floor(height / factor + 0.5))
+
+
+def area_downscale(pixels: Tensor, width: int, height: int) -> Tensor:
+    """(height, width, D) picture, each pixel the exact mean of the rectangle of ``pixels`` (H, W, D) that it covers.
+
+    Floating point; colours must be premultiplied. Non-integer factors weigh the border pixels by their covered share.
+    """
+    return _shrink_axis(_shrink_axis(pixels, 0, height), 1, width)
+
+
+def premultiplied(pixels: Tensor) -> Tensor:
+    """(H, W, 3 or 4) float32 in [0, 1] with the colours multiplied by alpha, from uint8 straight alpha."""
+    scaled = pixels.float() / 255
+    if scaled.shape[-1] == 4:
+        scaled[..., :3] *= scaled[..., 3:]
+    return scaled
+
+
+def straight_uint8(pixels: Tensor) -> Tensor:
+    """(H, W, 3 or 4) uint8 with straight alpha, from premultiplied float; the inverse of ``premultiplied``."""
+    if pixels.shape[-1] == 4:
+        alpha = pixels[..., 3:].clamp(0, 1)
+        rgb = torch.where(alpha > 0, pixels[..., :3] / alpha.clamp(min=1e-6), 0)
+        pixels = torch.cat([rgb, alpha], dim=-1)
+    return (pixels.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def _open(path: Path) -> OpenImageIO.ImageInput:
+    import OpenImageIO as oiio
+
+    if not path.is_file():
+        raise DyngsError(f"{path}: no such picture; restore it or remove it from the capture")
+    # Some of its readers allocate the picture when they open the file.
+    oiio.attribute("limits:imagesize_MB", max_decoded_mb())
+    config = oiio.ImageSpec()
+    config["oiio:UnassociatedAlpha"] = 1
+    source = oiio.ImageInput.open(str(path), config)
+    if source is None:
+        reason = picture_error(oiio) or "unknown format"
+        raise DyngsError(f"{path}: cannot be read as a picture ({reason}); copy or convert it again")
+    return source
+
+
+def _encode_linear(rgb: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """uint8 sRGB and alpha from linear premultiplied floats."""
+    rgb = np.nan_to_num(rgb, nan=0.0, posinf=1.0, neginf=0.0)
+    if alpha is not None:
+        alpha = np.clip(np.nan_to_num(alpha, nan=0.0), 0, 1)
+        rgb = np.where(alpha[..., None] > 0, rgb / np.maximum(alpha[..., None], 1e-6), 0)
+        alpha = np.round(alpha * 255).astype(np.uint8)
+    rgb = np.clip(rgb, 0, 1)
+    encoded = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * np.maximum(rgb, 0.0031308) ** (1 / 2.4) - 0.055)
+    return np.round(encoded * 255).astype(np.uint8), alpha
+
+
+def _shrink_axis(pixels: Tensor, axis: int, size: int) -> Tensor:
+    old = pixels.shape[axis]
+    if size == old:
+        return pixels
+    if size > old:
+        raise ValueError(f"area_downscale cannot enlarge {old} to {size}")
+    # Output i covers [i * old / size, (i + 1) * old / size): integer arithmetic keeps the shares exact.
+    first = torch.arange(size) * old // size
+    shape = [1] * pixels.ndim
+    shape[axis] = size
+    total = torch.zeros(1)
+    for tap in range(-(-old // size) + 1):
+        index = first + tap
+        begin = torch.maximum(index * size, torch.arange(size) * old)
+        end = torch.minimum((index + 1) * size, torch.arange(1, size + 1) * old)
+        share = ((end - begin).clamp(min=0).double() / old).to(pixels.dtype).reshape(shape)
+        total = total + pixels.index_select(axis, index.clamp(max=old - 1)) * share
+    return total

@@ -1,0 +1,166 @@
+"""Pictures out of video files, through PyAV."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from dyngs.errors import DyngsError, reading, reason
+from dyngs.files.trust import check_size
+
+if TYPE_CHECKING:
+    import av
+    from av.container import InputContainer
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
+MAX_FRAMES = 1_000_000
+"""Of one video: ten hours."""
+_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,m4v,flv,ogg,asf,dv,mxf,h264,hevc"
+"""FFmpeg's names for files that hold pictures themselves, whatever their suffix says."""
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What a video file says about itself.
+
+    Attributes:
+        width, height: pixels of a picture, turned as the rotation tag says.
+        num_frames: pictures that there should be; those of a truncated file may not all be readable.
+        fps: mean pictures per second, 0 if the file does not say.
+    """
+
+    width: int
+    height: int
+    num_frames: int
+    fps: float
+
+
+def read_frames(path: Path) -> Iterator[np.ndarray]:
+    """The pictures of a video file in order, (H, W, 3) uint8, turned as its rotation tag says.
+
+    Raises:
+        DyngsError: no such file, no video in it, or damage (at the damaged place).
+    """
+    for _, frame in _decoded(path, "AUTO"):
+        yield _turned_rgb(frame)
+
+
+def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
+    """The pictures of these ``numbers`` (0 is the first of the file) in rising order, as ``read_frames`` gives them.
+
+    One picture is in memory at a time. Nothing behind the last wanted one is decoded; unwanted ones before it are (each
+    picture builds on others), but not converted.
+
+    Raises:
+        DyngsError: as ``read_frames``; a wanted picture is damaged or missing: names its number.
+    """
+    wanted = set(numbers)
+    left = len(wanted)
+    index = -1
+    for index, frame in _decoded(path) if left else ():
+        if index not in wanted:
+            continue
+        if frame.is_corrupt:
+            raise _broken(path, index, "its data is damaged")
+        yield index, _turned_rgb(frame)
+        left -= 1
+        if left == 0:
+            return
+    if left:
+        raise _broken(path, index + 1, "the video ends there")
+
+
+def probe_video(path: Path) -> VideoInfo:
+    """Size, length and rate of a video file; the first picture is decoded, and the packets are counted.
+
+    Raises:
+        DyngsError: no such file, no video in it, or damage at its beginning.
+    """
+    from av.error import FFmpegError
+
+    first = next((frame for _, frame in _decoded(path)), None)
+    if first is None:
+        raise _broken(path, 0, "it holds no picture")
+    height, width = _turned_rgb(first).shape[:2]
+    counted = hidden = 0
+    with _reading(path), _opened(path) as container:
+        stream = container.streams.video[0]
+        promised, fps = stream.frames, float(stream.average_rate or 0)
+        try:
+            for packet in container.demux(stream):
+                counted += packet.size > 0
+                hidden += packet.size > 0 and packet.is_discard  # cut off by an edit list: never shown
+        except FFmpegError:
+            pass  # truncated: what the header promises is what there should be
+    count = max(promised, counted) - hidden
+    if count > MAX_FRAMES:
+        raise DyngsError(f"{path}: the video has {count:,} frames, of which {MAX_FRAMES:,} are read at most; cut it up")
+    return VideoInfo(width, height, count, fps if math.isfinite(fps) else 0.0)
+
+
+def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterator[tuple[int, av.VideoFrame]]:
+    """Number and frame, in order; damage ends it with an error that names the number reached.
+
+    With "AUTO", which is faster, several frames are decoded at once, and damage takes those before it along.
+    """
+    from av.error import FFmpegError
+
+    if not path.is_file():
+        raise DyngsError(f"no such video file: {path}")
+    index = 0
+    with _reading(path):
+        try:
+            with _opened(path) as container:
+                stream = container.streams.video[0]
+                stream.thread_type = threads
+                for frame in container.decode(stream):
+                    if (frame.width, frame.height) != (stream.width, stream.height):
+                        check_size(path, frame.width, frame.height)
+                    yield index, frame
+                    index += 1
+        except FFmpegError as error:
+            if index == 0:
+                raise DyngsError(f"cannot read the video {path}: {error.strerror or reason(error)}") from error
+            raise _broken(path, index, error.strerror or reason(error)) from error
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[InputContainer]:
+    """The file, which must be of a kind that holds pictures itself: playlists, which name other files, are refused.
+
+    Raises:
+        DyngsError: no video in it, or one larger than ``data.max_megapixels``.
+        FFmpegError: damage.
+    """
+    import av
+
+    options = {"protocol_whitelist": "file", "format_whitelist": _CONTAINERS}
+    # Titles may be in any encoding.
+    with av.open(f"file:{path}", options=options, metadata_errors="replace") as container:
+        if not container.streams.video:
+            raise DyngsError(f"{path} has no video stream")
+        stream = container.streams.video[0]
+        check_size(path, stream.width, stream.height)
+        yield container
+
+
+def _reading(path: Path) -> AbstractContextManager[None]:
+    return reading(path, "it must be a video; copy or convert it again")
+
+
+def _broken(path: Path, index: int, why: str) -> DyngsError:
+    return DyngsError(
+        f"the video {path} breaks at frame {index} ({why}); copy it again, or choose data.frames without that part"
+    )
+
+
+def _turned_rgb(frame: av.VideoFrame) -> np.ndarray:
+    rgb = frame.to_ndarray(format="rgb24")
+    quarter_turns = round(getattr(frame, "rotation", 0) / 90) % 4
+    return np.ascontiguousarray(np.rot90(rgb, quarter_turns))

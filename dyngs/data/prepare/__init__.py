@@ -1,0 +1,1 @@
+"""Preparation of captures: camera poses and sparse points by COLMAP."""

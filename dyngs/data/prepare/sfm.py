@@ -1,0 +1,286 @@
+"""Camera poses for a folder of photos or a video, by pycolmap's structure from motion on the CPU."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from dyngs.data.pictures.images import read_header
+from dyngs.data.pictures.video import read_frames
+from dyngs.errors import DyngsError, reading
+from dyngs.files.picture_errors import any_text, picture_error
+from dyngs.files.temporary import temporary_folder_beside
+from dyngs.files.trust import MAX_MEGAPIXELS, check_size, inside, pictures_up_to, staying_within
+from dyngs.files.write import write_image
+
+if TYPE_CHECKING:
+    import pycolmap
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+
+
+@dataclass(frozen=True)
+class SfmOptions:
+    """How poses are estimated.
+
+    Attributes:
+        camera_model: COLMAP's name of the lens model to fit.
+        single_camera: one camera took all pictures, so they share its lens; None = yes for a video, and for photos that
+            agree in size, camera model and focal length (EXIF); else every photo has a lens of its own.
+        matching: which pairs are compared; auto = all pairs up to 60 photos, neighbours by name beyond and for videos.
+        overlap: neighbours on either side in sequential matching.
+        max_features: SIFT features per picture.
+        longest_side: pictures are shrunk to this, in pixels, for finding features (poses refer to the full size).
+        num_frames: pictures to take from a video, evenly spaced, the sharpest around each place.
+        seed: of everything random.
+        num_threads: 0 = all cores; other numbers may give other last digits.
+        follow_links: photos may be links that lead out of their folder.
+        max_megapixels: larger pictures and videos are refused.
+    """
+
+    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
+        "SIMPLE_RADIAL"
+    )
+    single_camera: bool | None = None
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    overlap: int = 10
+    max_features: int = 8192
+    longest_side: int = 1600
+    num_frames: int = 100
+    seed: int = 0
+    num_threads: int = 0
+    follow_links: bool = False
+    max_megapixels: float = MAX_MEGAPIXELS
+
+
+@dataclass(frozen=True)
+class SfmResult:
+    """What was estimated.
+
+    Attributes:
+        root: the capture folder in COLMAP's layout, to be trained on.
+        num_images: pictures given.
+        num_registered: pictures with a pose.
+        unregistered: names of the others.
+        num_points: sparse points.
+        mean_error_px: mean reprojection error.
+    """
+
+    root: Path
+    num_images: int
+    num_registered: int
+    unregistered: tuple[str, ...]
+    num_points: int
+    mean_error_px: float
+
+    def summary(self) -> str:
+        """One or two lines for people."""
+        line = (
+            f"{self.num_registered} of {self.num_images} pictures registered, {self.num_points} points, "
+            f"mean error {self.mean_error_px:.2f} px: {self.root}"
+        )
+        if not self.unregistered:
+            return line
+        shown = ", ".join(self.unregistered[:5]) + (", ..." if len(self.unregistered) > 5 else "")
+        return f"{line}\nno pose for {shown}"
+
+
+def estimate_poses(source: Path, out: Path, options: SfmOptions = SfmOptions()) -> SfmResult:
+    """Poses of the pictures in ``source``, written as a COLMAP capture (``out/images``, ``out/sparse/0``).
+
+    All work is done in a folder beside ``out`` which is renamed at the end, so ``out`` is whole or absent. SIFT
+    features, matches, incremental mapping; of several models the one with most pictures is kept.
+
+    Args:
+        source: a folder of photos (subfolders included) or a video file.
+        out: a folder that does not exist, or is empty.
+        options: lens model, matching, effort.
+
+    Raises:
+        DyngsError: too few pictures, an ``out`` in use, or nothing could be registered, with advice.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise DyngsError(f"{out} exists already; name a new folder for the poses")
+    if not source.exists():
+        raise DyngsError(f"no such folder of photos or video: {source}")
+    work = temporary_folder_beside(out)
+    try:
+        with staying_within(source, options.follow_links or source.is_file()), pictures_up_to(options.max_megapixels):
+            result = _posed_in(work, source, options, out)
+        work.chmod(0o755)
+        if out.exists():
+            out.rmdir()
+        os.replace(work, out)
+        return result
+    except OSError as error:
+        raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _posed_in(work: Path, source: Path, options: SfmOptions, out: Path) -> SfmResult:
+    """What will be at ``out``, in ``work``."""
+    images, is_video = work / "images", source.is_file()
+    names = _extract_frames(source, images, options) if is_video else _gather_photos(source, images, out)
+    if len(names) < 3:
+        raise DyngsError(f"{source} has {len(names)} pictures; structure from motion needs at least 3, better 30")
+    return _run_colmap(work, names, is_video, options, out)
+
+
+def _run_colmap(work: Path, names: list[str], is_video: bool, options: SfmOptions, out: Path) -> SfmResult:
+    """Features, matches and mapping in ``work``; writes ``work/sparse/0`` and returns what will be at ``out``."""
+    import pycolmap
+
+    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
+    pycolmap.set_random_seed(options.seed)
+    try:
+        database, models = work / "database.db", work / "models"
+        models.mkdir()
+        _find_features(database, work / "images", names, is_video, options)
+        _match(database, len(names), is_video, options)
+        found = pycolmap.incremental_mapping(database, work / "images", models, _mapping_options(options))
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).strip().splitlines()
+        raise DyngsError(f"structure from motion failed: {reason[-1] if reason else error}") from error
+    finally:
+        pycolmap.logging.minloglevel = level
+    best = max(found.values(), key=lambda model: model.num_reg_images(), default=None)
+    if best is None or best.num_reg_images() < 2:
+        raise DyngsError(
+            f"no poses could be found for {len(names)} pictures: take sharper ones that overlap by two thirds, move "
+            "the camera sideways rather than only turning it, avoid bare or moving surfaces, or try matching=exhaustive"
+        )
+    sparse = work / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    best.write(sparse)
+    registered = {image.name for image in best.images.values() if image.has_pose}
+    shutil.rmtree(models)
+    database.unlink()
+    missing = tuple(name for name in names if name not in registered)
+    points, error_px = best.num_points3D(), float(best.compute_mean_reprojection_error())
+    return SfmResult(out, len(names), len(registered), missing, points, error_px)
+
+
+def _find_features(database: Path, images: Path, names: list[str], is_video: bool, options: SfmOptions) -> None:
+    import pycolmap
+
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu = False
+    extraction.num_threads = options.num_threads or -1
+    extraction.max_image_size = options.longest_side
+    extraction.sift.max_num_features = options.max_features
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = options.camera_model
+    single = options.single_camera
+    if single is None:
+        single = is_video or _same_camera([images / name for name in names])
+    mode = pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.AUTO
+    pycolmap.extract_features(
+        database, images, names, camera_mode=mode, reader_options=reader, extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )  # fmt: skip
+
+
+def _match(database: Path, num_images: int, is_video: bool, options: SfmOptions) -> None:
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.num_threads = options.num_threads or -1
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = options.seed
+    sequential = options.matching == "sequential" or (options.matching == "auto" and (is_video or num_images > 60))
+    if sequential:
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.overlap = options.overlap
+        pairing.num_threads = options.num_threads or -1
+        pycolmap.match_sequential(database, matching, pairing, verification, device=pycolmap.Device.cpu)
+    else:
+        pycolmap.match_exhaustive(
+            database, matching, verification_options=verification, device=pycolmap.Device.cpu
+        )  # fmt: skip
+
+
+def _mapping_options(options: SfmOptions) -> pycolmap.IncrementalPipelineOptions:
+    import pycolmap
+
+    mapping = pycolmap.IncrementalPipelineOptions()
+    mapping.num_threads = options.num_threads or -1
+    mapping.random_seed = options.seed
+    mapping.mapper.random_seed = options.seed
+    mapping.triangulation.random_seed = options.seed
+    mapping.min_model_size = 3
+    mapping.mapper.init_min_num_inliers = 50
+    mapping.ba_use_gpu = False
+    return mapping
+
+
+def _gather_photos(source: Path, images: Path, out: Path) -> list[str]:
+    """Copies (hard links where possible) of all photos below ``source``; their names below ``images``, sorted."""
+    result = out.resolve()
+    photos = sorted(
+        path for path in source.rglob("*")
+        if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() and result not in path.resolve().parents
+        and not any(part.startswith(".") for part in path.relative_to(source).parts)
+    )  # fmt: skip
+    names = []
+    for photo in photos:
+        header = read_header(inside(photo))
+        check_size(photo, header.width, header.height, header.channels)
+        name = photo.relative_to(source)
+        target = images / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(photo.resolve(), target)
+        except OSError:
+            shutil.copyfile(photo, target)
+        names.append(name.as_posix())
+    return names
+
+
+def _extract_frames(video: Path, images: Path, options: SfmOptions) -> list[str]:
+    """Pictures of a video: of ``num_frames`` equal windows the sharpest picture each; their names, in order.
+
+    Two passes, so that only one picture is held in memory: the first one measures.
+    """
+    sharpness = np.array([_sharpness(rgb) for rgb in read_frames(video)])
+    windows = np.array_split(np.arange(len(sharpness)), min(options.num_frames, max(len(sharpness), 1)))
+    chosen = {int(w[sharpness[w].argmax()]) for w in windows if len(w)}
+    names = []
+    for index, rgb in enumerate(read_frames(video)):
+        if index in chosen:
+            names.append(f"frame_{index:05d}.png")
+            write_image(images / names[-1], rgb)
+    return names
+
+
+def _same_camera(photos: list[Path]) -> bool:
+    """Whether all photos agree in size and in what EXIF says of camera and focal length."""
+    import OpenImageIO as oiio
+
+    kinds = set()
+    for photo in photos:
+        with reading(photo, "remove or replace it"):
+            picture = oiio.ImageInput.open(str(photo))
+            if picture is None:
+                raise DyngsError(f"cannot read the picture {photo.name}: {picture_error(oiio)}; remove or replace it")
+            spec = picture.spec()
+            model = any_text(partial(spec.get_string_attribute, "Model"))
+            kinds.add((spec.width, spec.height, model, spec.get_float_attribute("Exif:FocalLength")))
+            picture.close()
+    return len(kinds) == 1
+
+
+def _sharpness(rgb: np.ndarray) -> float:
+    """Variance of the Laplacian of the brightness: higher is sharper."""
+    grey = rgb[..., 1].astype(np.float32)
+    laplacian = (
+        4 * grey[1:-1, 1:-1] - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
+    )  # fmt: skip
+    return float(laplacian.var()) if laplacian.size else 0.0

@@ -1,0 +1,136 @@
+"""Sparse points for a capture that has poses but no points, by pycolmap's triangulation on the CPU."""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from dyngs.config import DataConfig
+from dyngs.data.capture import PointCloud, View
+from dyngs.data.frame_selection import spread
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.errors import DyngsError
+from dyngs.files.write import write_image
+
+if TYPE_CHECKING:
+    import pycolmap
+
+MIN_PICTURES = 3
+"""Two agree by accident too often."""
+MIN_POINTS = 30
+"""Fewer say less of a scene than random ones."""
+LONGEST_SIDE = 1000
+MAX_FEATURES = 2048
+"""SIFT features per picture."""
+GREY = torch.full((3,), 0.5)
+
+
+def views_of_a_moment(views: Sequence[View], limit: int) -> list[View]:
+    """At most ``limit`` of ``views``, evenly chosen, of one moment: that which most show, of several the middle one.
+
+    Without times all views show the same moment.
+    """
+    shown = Counter(view.time for view in views)
+    most = max(shown.values(), default=0)
+    moments = [time for time in shown if shown[time] == most]
+    of_moment = [view for view in views if moments and view.time == moments[len(moments) // 2]]
+    return [of_moment[i] for i in spread(len(of_moment), limit)]
+
+
+def triangulated_points(views: Sequence[View], options: DataConfig) -> PointCloud | None:
+    """Points that several of the views see, in order of their coordinates; None where there are hardly any.
+
+    SIFT features in pictures of at most ``LONGEST_SIDE`` px, matched between all pairs, triangulated from the given
+    poses. One thread, so that the same pictures give the same points.
+
+    Args:
+        views: of one moment, with poses.
+        options: of the capture; its picture sizes do not matter here.
+
+    Raises:
+        DyngsError: pictures that cannot be read.
+    """
+    if len({view.cam_from_world.tobytes() for view in views}) < MIN_PICTURES:
+        return None
+    import pycolmap
+
+    full_size = options.model_copy(update={"downscale": 1.0, "longest_side": LONGEST_SIDE, "cache_mb": 0.0})
+    pictures = PictureLoader(views, full_size)
+    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
+    pycolmap.set_random_seed(0)
+    try:
+        with tempfile.TemporaryDirectory(prefix="dyngs_points.") as folder:
+            return _triangulated(Path(folder), [pictures[i] for i in range(len(pictures))])
+    except (RuntimeError, ValueError, OSError) as error:
+        if isinstance(error, DyngsError):
+            raise
+        return None
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def _triangulated(folder: Path, pictures: Sequence[Picture]) -> PointCloud | None:
+    import pycolmap
+
+    images, database, model = folder / "images", folder / "database.db", folder / "model"
+    images.mkdir()
+    model.mkdir()
+    names = [f"{i:05d}.png" for i in range(len(pictures))]
+    for name, picture in zip(names, pictures, strict=True):
+        rgb = (picture.composite(GREY).clamp(0, 1) * 255).round().to(torch.uint8)
+        write_image(images / name, rgb.numpy())
+    _find_and_match(database, images, names)
+    posed = _posed(database, dict(zip(names, pictures, strict=True)))
+    found = pycolmap.triangulate_points(posed, database, images, model, clear_points=True)
+    points = [point for point in found.points3D.values() if point.track.length() >= MIN_PICTURES]
+    if len(points) < MIN_POINTS:
+        return None
+    xyz = np.array([point.xyz for point in points], dtype=np.float64)
+    rgb = np.array([point.color for point in points], dtype=np.uint8)
+    order = np.lexsort(xyz.T)
+    return PointCloud(xyz[order], rgb[order])
+
+
+def _find_and_match(database: Path, images: Path, names: list[str]) -> None:
+    """Features of all pictures and matches of all pairs, into ``database``."""
+    import pycolmap
+
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu, extraction.num_threads, extraction.max_image_size = False, 1, LONGEST_SIDE
+    extraction.sift.max_num_features = MAX_FEATURES
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "PINHOLE"
+    device, mode = pycolmap.Device.cpu, pycolmap.CameraMode.PER_IMAGE
+    pycolmap.extract_features(
+        database, images, names, camera_mode=mode, reader_options=reader, extraction_options=extraction, device=device
+    )
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu, matching.num_threads = False, 1
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    pycolmap.match_exhaustive(database, matching, verification_options=verification, device=device)
+
+
+def _posed(path: Path, pictures: dict[str, Picture]) -> pycolmap.Reconstruction:
+    """A model without points, in which every picture of the database has its camera and its pose."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(path) as database:
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        for image in database.read_all_images():
+            picture, camera = pictures[image.name].cameras, cameras[image.camera_id]
+            intrinsics = picture.intrinsics[0].double().numpy()
+            camera.params = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
+            database.update_camera(camera)
+            model.add_camera_with_trivial_rig(camera)
+            pose = pycolmap.Rigid3d(picture.cam_from_world[0, :3].double().numpy())
+            view = pycolmap.Image(name=image.name, camera_id=camera.camera_id, image_id=image.image_id)
+            model.add_image_with_trivial_frame(view, pose)
+    return model

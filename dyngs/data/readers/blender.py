@@ -1,0 +1,36 @@
+"""Reader for Blender captures: NeRF-synthetic, and with ``time`` per frame D-NeRF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dyngs.data.capture import Capture, Split, View
+from dyngs.data.readers.transforms import read_frame_file, read_views
+
+
+def is_blender(root: Path) -> bool:
+    """Whether the folder holds ``transforms_train.json``."""
+    return (root / "transforms_train.json").is_file()
+
+
+def read_blender(root: Path) -> Capture:
+    """The capture of ``transforms_{train,val,test}.json``, with OpenGL camera-to-world poses; val and test may lack.
+
+    Intrinsics: ``camera_angle_x``, or ``w, h, fl_x, fl_y, cx, cy`` of the file or the frame.
+
+    Raises:
+        DyngsError: see ``dyngs.data.readers.transforms.read_views``.
+    """
+    splits: dict[Split, tuple[View, ...]] = {}
+    warnings: list[str] = []
+    names: tuple[Split, ...] = ("train", "val", "test")
+    for name in names:
+        path = root / f"transforms_{name}.json"
+        if name != "train" and not path.is_file():
+            continue
+        views, notes = read_views(read_frame_file(path))
+        splits[name] = tuple(views.values())
+        warnings += [f"{path.name}: {note}" for note in notes]
+        if not views:
+            warnings.append(f"{path.name}: lists no frames")
+    return Capture(root, "blender", splits, warnings=tuple(warnings))

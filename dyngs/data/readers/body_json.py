@@ -1,0 +1,67 @@
+"""Reader for Blender captures of a person with body parameters: ``transforms_*.json`` and ``body_*.npz``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+from dyngs.data.capture import Capture, Split, View
+from dyngs.data.readers.blender import read_blender
+from dyngs.data.readers.people import BodyFrames, body_frames, read_npz, rows_of
+from dyngs.data.readers.transforms import read_frame_file, read_views
+from dyngs.errors import DyngsError, reading
+
+_TRAIN = "body_train.npz"
+_NEW_POSES = cast(Split, "pose")
+
+
+def is_body_json(root: Path) -> bool:
+    """Whether the folder holds ``transforms_train.json`` and some ``body_*.npz``."""
+    return (root / "transforms_train.json").is_file() and any(root.glob("body_*.npz"))
+
+
+def read_body_json(root: Path) -> Capture:
+    """The capture of ``transforms_{train,val,test,pose}.json``; all but the first may lack.
+
+    Each split has the parameters of its ``body_SPLIT.npz``: poses (T, 72, 156 or 165), trans (T, 3), betas and, if
+    there, scale; row n is for the frame whose ``frame`` is n. Without such a file, val and test show the frames of
+    train. ``pose`` is another clip, with frame numbers, times and parameters of its own. Parameters and cameras share
+    one world (unlike in AMASS files nothing is turned to make it y up).
+
+    Raises:
+        DyngsError: missing or bad parameters, and see ``dyngs.data.readers.transforms.read_views``.
+    """
+    with reading(root):
+        return _read(root)
+
+
+def _read(root: Path) -> Capture:
+    capture = read_blender(root)
+    splits, warnings = dict(capture.splits), capture.warnings
+    path = root / "transforms_pose.json"
+    if path.is_file():
+        views, notes = read_views(read_frame_file(path))
+        splits[_NEW_POSES] = tuple(views.values())
+        warnings = (*warnings, *(f"{path.name}: {note}" for note in notes))
+    train = _read_body(root / _TRAIN)
+    body: dict[Split, BodyFrames] = {name: _body_of(root, name, views, train) for name, views in splits.items()}
+    return capture.replace(
+        format="body_json", splits=splits, body={"val": train, "test": train, **body}, warnings=warnings
+    )
+
+
+def _body_of(root: Path, split: Split, views: tuple[View, ...], train: BodyFrames) -> BodyFrames:
+    path = root / f"body_{split}.npz"
+    if not path.is_file() and split == _NEW_POSES:
+        raise DyngsError(
+            f"{path}: no such file; transforms_pose.json shows another clip, which needs its own parameters"
+        )
+    body = _read_body(path) if path.is_file() and split != "train" else train
+    rows_of(path if path.is_file() else root / _TRAIN, body, views)
+    return body
+
+
+def _read_body(path: Path) -> BodyFrames:
+    found = read_npz(path, ("poses", "trans", "betas"), ("scale",))
+    frames = range(len(found["poses"]) if found["poses"].ndim else 0)
+    return body_frames(path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0))

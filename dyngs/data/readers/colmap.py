@@ -1,0 +1,173 @@
+"""Reader for COLMAP models, binary or text, through pycolmap."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from dyngs.data.capture import Capture, Lens, PointCloud, View
+from dyngs.data.intrinsics import match_size, pinhole_matrix, rescale_warning
+from dyngs.data.pictures.images import SUFFIXES, read_header
+from dyngs.data.poses import checked_pose, repair_warning
+from dyngs.data.readers.colmap_check import check_model_file
+from dyngs.data.readers.transforms import view_name
+from dyngs.errors import DyngsError, reading
+from dyngs.files.trust import check_size, inside
+
+if TYPE_CHECKING:
+    import pycolmap
+
+MODEL_FOLDERS = ("sparse/0", "sparse", ".")
+_EXTENSIONS = (".bin", ".txt")
+# Number of focal lengths and the formula, per camera model. COLMAP orders the coefficients as OpenCV does.
+_LENSES: dict[str, tuple[int, Literal["none", "opencv", "fisheye"]]] = {
+    "SIMPLE_PINHOLE": (1, "none"),
+    "PINHOLE": (2, "none"),
+    "SIMPLE_RADIAL": (1, "opencv"),
+    "RADIAL": (1, "opencv"),
+    "OPENCV": (2, "opencv"),
+    "FULL_OPENCV": (2, "opencv"),
+    "SIMPLE_FISHEYE": (1, "fisheye"),
+    "FISHEYE": (2, "fisheye"),
+    "SIMPLE_RADIAL_FISHEYE": (1, "fisheye"),
+    "RADIAL_FISHEYE": (1, "fisheye"),
+    "OPENCV_FISHEYE": (2, "fisheye"),
+}
+
+
+def find_model(root: Path) -> Path | None:
+    """The folder below ``root`` that holds ``cameras.bin`` or ``cameras.txt``, or None."""
+    for name in MODEL_FOLDERS:
+        if any((root / name / f"cameras{extension}").is_file() for extension in _EXTENSIONS):
+            return root / name
+    return None
+
+
+def is_colmap(root: Path) -> bool:
+    """Whether the folder holds a COLMAP model."""
+    return find_model(root) is not None
+
+
+def read_colmap(root: Path) -> Capture:
+    """The capture of a COLMAP model with pictures below ``images/`` and, if there, masks below ``masks/``.
+
+    All registered images become training views; distorted camera models are kept as ``View.lens``.
+
+    Raises:
+        DyngsError: incomplete or inconsistent model files, no ``images`` folder, an unsupported camera model, pictures
+            whose aspect is not their camera's.
+    """
+    folder = find_model(root)
+    if folder is None:
+        raise DyngsError(f"{root}: holds no COLMAP model (cameras.bin or cameras.txt in {', '.join(MODEL_FOLDERS)})")
+    model = _load_model(folder)
+    if not (root / "images").is_dir():
+        raise DyngsError(f"{root / 'images'}: no such folder; put the model's pictures there")
+    with reading(folder, "names of images must be UTF-8; rename the pictures and export the model again"):
+        posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    masks = _find_masks(root / "masks")
+    repaired: dict[str, float] = {}
+    rescaled: list[str] = []
+    views = []
+    for image in posed:
+        where = f"{folder}, image {image.name}"
+        camera = model.cameras[image.camera_id]
+        pose, repaired[where] = checked_pose(np.asarray(image.cam_from_world().matrix()), where)
+        intrinsics, lens = pinhole_and_lens(camera, where)
+        path = root / "images" / image.name
+        intrinsics, size, changed = match_size(intrinsics, (camera.width, camera.height), _stored_size(path), where)
+        if changed:
+            rescaled.append(where)
+        name, mask = view_name(path, root / "images"), _mask_of(image.name, masks)
+        views.append(View(name, path, pose, intrinsics, *size, lens, int(image.camera_id), mask_path=mask))
+    warnings = repair_warning(repaired) + rescale_warning(rescaled) + _warnings(folder, model, views, bool(masks))
+    return Capture(root, "colmap", {"train": tuple(views)}, _points(model), warnings=tuple(warnings))
+
+
+def pinhole_and_lens(camera: pycolmap.Camera, where: str) -> tuple[np.ndarray, Lens]:
+    """The (3, 3) matrix and the distortion of a COLMAP camera.
+
+    Args:
+        where: the image, for messages.
+
+    Raises:
+        DyngsError: the camera model is not one that OpenCV's formulas express, or a parameter is not usable.
+    """
+    model = camera.model.name
+    values = tuple(float(value) for value in camera.params)
+    if model not in _LENSES:
+        raise DyngsError(f"{where}: camera model {model} is not supported; run `colmap image_undistorter` first")
+    if not np.isfinite(values).all():
+        raise DyngsError(f"{where}: the parameters of camera {camera.camera_id} are not finite; export it again")
+    num_focal, kind = _LENSES[model]
+    fx, fy = values[0], values[num_focal - 1]
+    if fx <= 0 or fy <= 0 or camera.width < 1 or camera.height < 1:
+        raise DyngsError(f"{where}: camera {camera.camera_id} has no positive size and focal length; export it again")
+    cx, cy, *coefficients = values[num_focal:]
+    if kind == "none" or (kind == "opencv" and not any(coefficients)):
+        return pinhole_matrix(fx, fy, cx, cy), Lens()
+    return pinhole_matrix(fx, fy, cx, cy), Lens(kind, (*coefficients, *(0.0,) * (4 - len(coefficients))))
+
+
+def _load_model(folder: Path) -> pycolmap.Reconstruction:
+    import pycolmap
+
+    extension = next(e for e in _EXTENSIONS if (folder / f"cameras{e}").is_file())
+    optional = [name for name in ("rigs", "frames") if (folder / f"{name}{extension}").is_file()]
+    for name in ("cameras", "images", "points3D", *optional):
+        check_model_file(folder / f"{name}{extension}")
+    model = pycolmap.Reconstruction()
+    # pycolmap raises ValueError, IndexError and its own types for the same faults.
+    with reading(folder, "the COLMAP model is inconsistent; export it again"):
+        (model.read_binary if extension == ".bin" else model.read_text)(str(folder))
+    return model
+
+
+def _stored_size(path: Path) -> tuple[int, int] | None:
+    """(width, height), None where the picture is missing or damaged: the loader refuses it when it is wanted."""
+    inside(path)
+    try:
+        header = read_header(path)
+    except DyngsError:
+        return None
+    check_size(path, header.width, header.height, header.channels)
+    return header.width, header.height
+
+
+def _find_masks(folder: Path) -> dict[str, Path]:
+    """Masks by their path below ``folder``, both with and without the last extension."""
+    found: dict[str, Path] = {}
+    for path in sorted(inside(folder).rglob("*")) if folder.is_dir() else ():
+        if path.suffix.lower() in SUFFIXES:
+            relative = path.relative_to(folder)
+            found[relative.as_posix()] = path
+            found.setdefault(relative.with_suffix("").as_posix(), path)
+    return found
+
+
+def _mask_of(image_name: str, masks: dict[str, Path]) -> Path | None:
+    """Mask of ``a/b.jpg``: ``a/b.jpg.png``, else ``a/b.jpg``, else ``a/b`` with any picture extension."""
+    stem = image_name.rpartition(".")[0]
+    return masks.get(f"{image_name}.png") or masks.get(image_name) or masks.get(stem)
+
+
+def _points(model: pycolmap.Reconstruction) -> PointCloud | None:
+    """The points in the order of their ids, None where there are none."""
+    points = [model.points3D[point_id] for point_id in sorted(model.points3D)]
+    if not points:
+        return None
+    return PointCloud(np.array([p.xyz for p in points]), np.array([p.color for p in points], dtype=np.uint8))
+
+
+def _warnings(folder: Path, model: pycolmap.Reconstruction, views: list[View], has_masks: bool) -> list[str]:
+    warnings = []
+    if len(views) < len(model.images):
+        warnings.append(f"{folder}: {len(model.images) - len(views)} images have no pose and are ignored")
+    if (folder.parent / "1" / "cameras.bin").is_file() and folder.name == "0":
+        warnings.append(f"{folder.parent}: holds several models, which are not connected; only {folder.name} is read")
+    without = [view.name for view in views if view.mask_path is None]
+    if has_masks and without:
+        warnings.append(f"{len(without)} pictures have no mask, first {without[0]}")
+    return warnings

@@ -1,0 +1,220 @@
+"""Reader for Nerfies and HyperNeRF captures: ``dataset.json``, ``metadata.json``, ``camera/`` and ``rgb/Nx/``."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from dyngs.data.capture import Capture, PointCloud, Split, View
+from dyngs.data.pictures.images import SUFFIXES, read_header
+from dyngs.data.readers.camera_folders import OPENGL_FROM_OPENCV
+from dyngs.data.readers.llff import read_number_array
+from dyngs.data.readers.transforms import Frame, FrameFile, read_views
+from dyngs.errors import DyngsError
+from dyngs.files.json_object import read_json_object
+from dyngs.files.trust import check_size, inside
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """The frame in which the scene has about unit size: ``(x - center) * scale``."""
+
+    center: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    scale: float = 1.0
+
+    def apply(self, positions: np.ndarray) -> np.ndarray:
+        return (positions - self.center) * self.scale
+
+
+@dataclass(frozen=True)
+class _Pictures:
+    """The pictures of one resolution: their folder and by how much they are smaller than their cameras say."""
+
+    folder: Path
+    factor: int
+    files: dict[str, Path]
+
+
+def is_nerfies(root: Path) -> bool:
+    """Whether the folder holds ``dataset.json`` and the folder ``camera``."""
+    return (root / "dataset.json").is_file() and (root / "camera").is_dir()
+
+
+def read_nerfies(root: Path) -> Capture:
+    """The capture in the scaled frame of ``scene.json``, in the largest pictures that are there.
+
+    Training and test views are ``train_ids`` and ``val_ids`` (without any of those, the usual hold-out); the time is
+    ``warp_id`` (or ``time_id``) over the largest one; ``points.npy`` (P, 3), if present, are the sparse points, grey.
+    Cameras (Park et al. 2021): ``orientation`` has the camera's OpenCV axes as rows, ``position`` is its centre.
+
+    Raises:
+        DyngsError: anything missing, broken or inconsistent; names the file.
+    """
+    dataset = read_json_object(root / "dataset.json")
+    lists = {key: _ids(root, dataset, key) for key in ("ids", "train_ids", "val_ids")}
+    train = lists["train_ids"] or [name for name in lists["ids"] if name not in set(lists["val_ids"])]
+    used = list(dict.fromkeys([*train, *lists["val_ids"]]))
+    if not used:
+        raise DyngsError(f"{root / 'dataset.json'}: 'train_ids' is empty; nothing to read")
+    metadata = _metadata(root, used)
+    times = _times(root, metadata)
+    scene = _scene(root / "scene.json")
+    pictures = _find_pictures(root)
+    skewed: list[str] = []
+    frames = []
+    for name in used:
+        own = _camera(root / "camera" / f"{name}.json", scene, pictures, name, skewed)
+        camera = metadata[name].get("camera_id")
+        frames.append(
+            Frame(str(root / "camera" / f"{name}.json"), {**own, "time": times.get(name), "camera": camera}, {})
+        )
+    read, warnings = read_views(FrameFile(root / "dataset.json", {}, tuple(frames)))
+    views = {
+        name: replace(view, name=name, frame=_frame(metadata[name]))
+        for name, view in zip(used, read.values(), strict=True)
+    }
+    if skewed:
+        warnings.append(f"{len(skewed)} cameras have skew, which is ignored; first {skewed[0]}")
+    splits: dict[Split, tuple[View, ...]] = {"train": tuple(views[name] for name in train)}
+    if lists["val_ids"]:
+        splits["test"] = tuple(views[name] for name in lists["val_ids"])
+    return Capture(root, "nerfies", splits, _points(root / "points.npy", scene), warnings=tuple(warnings))
+
+
+def _ids(root: Path, dataset: dict[str, object], key: str) -> list[str]:
+    value = dataset.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(item, str) and _is_plain(item) for item in value):
+        raise DyngsError(f"{root / 'dataset.json'}: '{key}' must be a list of picture names")
+    return list(dict.fromkeys(value))
+
+
+def _is_plain(name: str) -> bool:
+    """Whether it names a file rather than a way to one."""
+    return bool(name) and not set(name) & {"/", "\\"} and name not in (".", "..")
+
+
+def _metadata(root: Path, names: list[str]) -> dict[str, dict[str, object]]:
+    path = root / "metadata.json"
+    fields = read_json_object(path) if path.is_file() else {}
+    found: dict[str, dict[str, object]] = {}
+    for name in names:
+        own = fields.get(name, {} if not fields else None)
+        if not isinstance(own, dict):
+            raise DyngsError(f"{path}: has no entry for '{name}' of dataset.json; add its warp_id and camera_id")
+        found[name] = own
+    return found
+
+
+def _times(root: Path, metadata: dict[str, dict[str, object]]) -> dict[str, float]:
+    """Time of each picture that has one: its number over the largest number."""
+    numbers: dict[str, int] = {}
+    for name, own in metadata.items():
+        value = own.get("warp_id", own.get("time_id"))
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or value % 1 or value < 0:
+            raise DyngsError(
+                f"{root / 'metadata.json'}, '{name}': warp_id must be a whole number >= 0, got {value!r:.40}"
+            )
+        numbers[name] = int(value)
+    last = max(numbers.values(), default=0)
+    return {name: number / max(last, 1) for name, number in numbers.items()}
+
+
+def _frame(own: dict[str, object]) -> int | None:
+    value = own.get("warp_id", own.get("time_id"))
+    return int(value) if isinstance(value, (int, float)) else None
+
+
+def _numbers(path: Path, fields: dict[str, object], key: str, shape: tuple[int, ...]) -> np.ndarray:
+    """The finite float64 numbers at ``key`` in the given shape."""
+    try:
+        value = np.array(fields[key], dtype=np.float64)
+    except KeyError:
+        raise DyngsError(f"{path}: the key '{key}' is missing") from None
+    except (TypeError, ValueError, OverflowError):
+        value = np.zeros(0)
+    if value.shape != shape or not np.isfinite(value).all():
+        wanted = "x".join(map(str, shape)) + " finite numbers" if shape else "a finite number"
+        raise DyngsError(f"{path}: '{key}' must hold {wanted}; export it again")
+    return value
+
+
+def _scene(path: Path) -> _Scene:
+    if not path.is_file():
+        return _Scene()
+    fields = read_json_object(path)
+    scale = float(_numbers(path, fields, "scale", ()))
+    if scale <= 0:
+        raise DyngsError(f"{path}: 'scale' must be positive, got {scale:g}")
+    return _Scene(_numbers(path, fields, "center", (3,)), scale)
+
+
+def _find_pictures(root: Path) -> _Pictures:
+    """The largest pictures: ``rgb/1x`` if it holds any, else ``rgb/2x`` and so on."""
+    folders = {}
+    for path in (root / "rgb").iterdir() if (root / "rgb").is_dir() else ():
+        match = re.fullmatch(r"(\d+)x", path.name)
+        if match and int(match[1]) > 0 and path.is_dir():
+            folders[int(match[1])] = path
+    for factor, folder in sorted(folders.items()):
+        files = {path.stem: path for path in sorted(folder.iterdir(), reverse=True) if path.suffix.lower() in SUFFIXES}
+        if files:
+            return _Pictures(folder, factor, files)
+    raise DyngsError(f"{root / 'rgb'}: no pictures in 1x, 2x, 4x or the like; restore one of these folders")
+
+
+def _camera(path: Path, scene: _Scene, pictures: _Pictures, name: str, skewed: list[str]) -> dict[str, object]:
+    """The camera as a frame of a transforms file, for pictures that are smaller by the factor of their folder."""
+    if not path.is_file():
+        raise DyngsError(f"{path}: no such camera file, although dataset.json lists it; restore it")
+    fields = read_json_object(path)
+    focal = float(_numbers(path, fields, "focal_length", ()))
+    aspect = float(_numbers(path, fields, "pixel_aspect_ratio", ())) if "pixel_aspect_ratio" in fields else 1.0
+    full, (cx, cy) = _numbers(path, fields, "image_size", (2,)), _numbers(path, fields, "principal_point", (2,))
+    if (full < 1).any():
+        raise DyngsError(f"{path}: 'image_size' must be positive")
+    if "skew" in fields and abs(float(_numbers(path, fields, "skew", ()))) > 1e-6 * focal:
+        skewed.append(str(path))
+    picture = pictures.files.get(name, pictures.folder / f"{name}.png")
+    width, height = _scaled_size(full, pictures.factor, picture)
+    scale_x, scale_y = width / full[0], height / full[1]
+    # "tangential" is what Nerfies' older files say.
+    tangential = "tangential_distortion" if "tangential_distortion" in fields else "tangential"
+    k1, k2, k3 = _numbers(path, fields, "radial_distortion", (3,)) if "radial_distortion" in fields else np.zeros(3)
+    p1, p2 = _numbers(path, fields, tangential, (2,)) if tangential in fields else np.zeros(2)
+    world_from_cam = np.eye(4)
+    world_from_cam[:3, :3] = _numbers(path, fields, "orientation", (3, 3)).T
+    world_from_cam[:3, 3] = scene.apply(_numbers(path, fields, "position", (3,)))
+    sizes = {"w": width, "h": height, "fl_x": focal * scale_x, "fl_y": focal * aspect * scale_y}
+    lens = {"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2, "cx": cx * scale_x, "cy": cy * scale_y}
+    return {
+        **{key: float(value) for key, value in (sizes | lens).items()},
+        "file_path": f"rgb/{pictures.folder.name}/{picture.name}",
+        "transform_matrix": (world_from_cam @ OPENGL_FROM_OPENCV).tolist(),
+    }
+
+
+def _scaled_size(full: np.ndarray, factor: int, picture: Path) -> tuple[int, int]:
+    """(width, height) of the picture; as it is stored if that is a rounding of ``full / factor``."""
+    nominal = round(float(full[0]) / factor), round(float(full[1]) / factor)
+    inside(picture)
+    try:
+        header = read_header(picture)
+    except DyngsError:
+        return nominal
+    check_size(picture, header.width, header.height, header.channels)
+    near = abs(header.width - full[0] / factor) <= 1 and abs(header.height - full[1] / factor) <= 1
+    return (header.width, header.height) if near else nominal
+
+
+def _points(path: Path, scene: _Scene) -> PointCloud | None:
+    if not path.is_file():
+        return None
+    xyz = read_number_array(path)
+    if xyz.ndim != 2 or xyz.shape[1] != 3:
+        raise DyngsError(f"{path}: must have 3 columns, one row per point; got shape {xyz.shape}")
+    return PointCloud(scene.apply(xyz), np.full(xyz.shape, 128, np.uint8)) if len(xyz) else None

@@ -1,0 +1,85 @@
+"""Reader for nerfstudio's and instant-ngp's ``transforms.json``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dyngs.data.capture import Capture, PointCloud, Split, View
+from dyngs.data.readers.transforms import FrameFile, read_frame_file, read_views
+from dyngs.errors import DyngsError, reading
+from dyngs.files.trust import inside
+
+
+def is_nerfstudio(root: Path) -> bool:
+    """Whether the folder holds ``transforms.json``."""
+    return (root / "transforms.json").is_file()
+
+
+def read_nerfstudio(root: Path) -> Capture:
+    """The capture of ``transforms.json``, with OpenGL camera-to-world poses and, if named, a ``.ply`` of points.
+
+    The lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` decide the splits; a val list without a test
+    list is the test set, as that is what is held out. Points and poses are read as they stand: ``applied_transform``
+    has been applied to both.
+
+    Raises:
+        DyngsError: see ``dyngs.data.readers.transforms.read_views``; an unreadable ``.ply``.
+    """
+    file = read_frame_file(root / "transforms.json")
+    views, warnings = read_views(file)
+    splits, notes = _splits(file, views)
+    written = file.fields.get("ply_file_path")
+    points = read_points(inside(root / written)) if isinstance(written, str) and written else None
+    return Capture(root, "nerfstudio", splits, points, warnings=(*warnings, *notes))
+
+
+def read_points(path: Path) -> PointCloud:
+    """Points of a ``.ply`` file (through trimesh), grey where it has no colours.
+
+    Raises:
+        DyngsError: missing or unreadable.
+    """
+    import trimesh
+
+    if not path.is_file():
+        raise DyngsError(f"{path}: no such point file; restore it or remove ply_file_path")
+    # Out of an open file, because textures that it names would be looked for beside one with a path.
+    with reading(path, "it must be a .ply file of points; export it again"), path.open("rb") as file:
+        loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
+        xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        own = isinstance(loaded, trimesh.PointCloud)
+        colours = loaded.colors if own else getattr(loaded.visual, "vertex_colors", None)
+        rgb = np.full((len(xyz), 3), 128, np.uint8)
+        if colours is not None and len(colours) == len(xyz):
+            rgb = np.ascontiguousarray(np.asarray(colours)[:, :3].astype(np.uint8))
+    return PointCloud(xyz, rgb)
+
+
+def _splits(file: FrameFile, views: dict[str, View]) -> tuple[dict[Split, tuple[View, ...]], list[str]]:
+    """Splits by the file's lists; all views as train where it has none."""
+    names: tuple[Split, ...] = ("train", "val", "test")
+    listed = {name: file.fields.get(f"{name}_filenames") for name in names}
+    if all(value is None for value in listed.values()):
+        return {"train": tuple(views.values())}, []
+    splits: dict[Split, tuple[View, ...]] = {}
+    unknown: list[str] = []
+    for name in names:
+        value = listed[name]
+        if value is None:
+            continue
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise DyngsError(f"{file.path}: '{name}_filenames' must be a list of file paths")
+        splits[name] = tuple(views[item] for item in dict.fromkeys(value) if item in views)
+        unknown += [item for item in value if item not in views]
+    held_out = {view.name for kept in splits.values() for view in kept}
+    splits.setdefault("train", tuple(view for view in views.values() if view.name not in held_out))
+    if "test" not in splits and "val" in splits:
+        splits["test"] = splits.pop("val")
+    used = {view.name for kept in splits.values() for view in kept}
+    notes = [f"{len(unknown)} listed pictures have no frame, first {unknown[0]}"] if unknown else []
+    if len(used) < len(views):
+        notes.append(f"{len(views) - len(used)} frames are in no split and are ignored")
+    return splits, notes

@@ -1,0 +1,145 @@
+"""Reader for NeuMan folders: a COLMAP model, masks, and a body fitted to each picture and aligned with the model."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dyngs.data.capture import Capture, Split
+from dyngs.data.poses import checked_pose
+from dyngs.data.readers.colmap import is_colmap, read_colmap
+from dyngs.data.readers.people import (
+    BodyFrames,
+    PersonView,
+    Silhouette,
+    body_frames,
+    entry,
+    numbers_of,
+    of_one_clip,
+    person_view,
+    read_npz,
+    some,
+)
+from dyngs.errors import DyngsError, reading
+from dyngs.files.pickles import read_pickle, read_pickled_array
+from dyngs.files.trust import inside
+
+ALIGNED = "4d_humans/smpl_optimized_aligned_scale.npz"
+ALIGNMENTS = "alignments.npy"
+FITS = ("smpl_output_optimized.pkl", "smpl_output_romp.pkl")
+
+
+def is_neuman(root: Path) -> bool:
+    """Whether the folder holds a COLMAP model and one of the files of body parameters."""
+    return is_colmap(root) and any((root / name).is_file() for name in (ALIGNED, ALIGNMENTS, *FITS))
+
+
+def read_neuman(root: Path) -> Capture:
+    """The capture of one moving camera, posed by COLMAP (Jiang et al. 2022), in the model's world and unit.
+
+    Body parameters, one row per posed picture in order of their names: ``4d_humans/smpl_optimized_aligned_scale.npz``
+    (global_orient, body_pose, betas, transl, scale), else ``smpl_output_optimized.pkl`` or ``smpl_output_romp.pkl``
+    (pose, betas of one person) with ``alignments.npy`` (picture name to a (4, 3) matrix M, ``world = [v 1] M``). Masks
+    in ``segmentations`` under the pictures' names are black where the person is. Splits are those of
+    ``{train,val,test}_split.txt``, if there.
+
+    Raises:
+        DyngsError: anything missing, broken or inconsistent; names the file.
+    """
+    with reading(root):
+        return _read(root)
+
+
+def _read(root: Path) -> Capture:
+    capture = read_colmap(root)
+    posed = sorted(capture.splits["train"], key=lambda view: view.image_path.name)
+    names = [view.image_path.name for view in posed]
+    numbers = [_number(root, name) for name in names]
+    first, last = min(numbers, default=0), max(numbers, default=0)
+    people: dict[str, PersonView] = {}
+    for view, number in zip(posed, numbers, strict=True):
+        mask = root / "segmentations" / view.image_path.name
+        timed = replace(view, camera_id=0, frame=number, time=(number - first) / max(last - first, 1))
+        people[view.image_path.name] = person_view(timed, Silhouette(mask, "black") if mask.is_file() else None)
+    body = _aligned(root, numbers) if (root / ALIGNED).is_file() else _fitted(root, names, numbers)
+    without = [name for name, view in people.items() if view.silhouette is None]
+    notes = [f"{len(without)} pictures have no mask in segmentations, first {without[0]}"] if without else []
+    splits, more = _splits(root, people)
+    warnings = (*capture.warnings, *notes, *more)
+    return capture.replace(format="neuman", splits=splits, body=of_one_clip(body), warnings=warnings)
+
+
+def _aligned(root: Path, numbers: list[int]) -> BodyFrames:
+    path = root / ALIGNED
+    found = read_npz(path, ("global_orient", "body_pose", "betas", "transl", "scale"))
+    parts = [_per_picture(path, key, found[key], len(numbers)) for key in ("global_orient", "body_pose")]
+    return body_frames(path, numbers, np.concatenate(parts, axis=1), found["transl"], found["betas"], found["scale"])
+
+
+def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
+    """SMPL as estimated in its own frame, brought to the world by each picture's similarity."""
+    path = next((root / name for name in FITS if (root / name).is_file()), root / FITS[0])
+    fits = read_pickle(inside(path))
+    if not isinstance(fits, dict) or len(fits) != 1:
+        count = len(fits) if isinstance(fits, dict) else 0
+        raise DyngsError(f"{path}: must hold the body parameters of one person, got {count}; keep one")
+    fit = next(iter(fits.values()))
+    poses = _per_picture(path, "pose", entry(path, fit, "pose"), len(numbers))
+    alignments = read_pickled_array(inside(root / ALIGNMENTS))
+    scales, turns, trans = [], [], []
+    for name in names:
+        where = f"{root / ALIGNMENTS}, {name}"
+        matrix = numbers_of(where, entry(root / ALIGNMENTS, alignments, name), (4, 3)).T
+        scale = float(np.cbrt(np.linalg.det(matrix[:, :3])))
+        if scale <= 0:
+            raise DyngsError(
+                f"{where}: the alignment is no similarity (its determinant is not positive); export it again"
+            )
+        pose, _ = checked_pose(np.concatenate([matrix[:, :3] / scale, matrix[:, 3:]], axis=1), where)
+        scales.append(scale)
+        turns.append(Rotation.from_matrix(pose[:3, :3]).as_rotvec())
+        trans.append(pose[:3, 3])
+    return body_frames(
+        path, numbers, poses, np.array(trans), entry(path, fit, "betas"), np.array(scales), np.array(turns)
+    )
+
+
+def _per_picture(path: Path, key: str, value: object, count: int) -> np.ndarray:
+    """(count, width)."""
+    rows = len(value) if isinstance(value, np.ndarray) and value.ndim else 0
+    if rows != count or not isinstance(value, np.ndarray):
+        raise DyngsError(
+            f"{path}: '{key}' has {rows} rows, but the COLMAP model has {count} posed pictures; fit the body to those"
+        )
+    return value.reshape(count, -1)
+
+
+def _number(root: Path, name: str) -> int:
+    digits = re.findall(r"\d+", Path(name).stem)
+    if not digits or len(digits[-1]) > 15:
+        raise DyngsError(f"{root / 'images' / name}: no frame number in its name; call it 00000.png or the like")
+    return int(digits[-1])
+
+
+def _splits(root: Path, people: dict[str, PersonView]) -> tuple[dict[Split, tuple[PersonView, ...]], list[str]]:
+    """As the lists of names say; all for training where there are none."""
+    splits: dict[Split, tuple[PersonView, ...]] = {}
+    unposed: list[str] = []
+    names: tuple[Split, ...] = ("train", "val", "test")
+    for split in names:
+        path = root / f"{split}_split.txt"
+        if not path.is_file():
+            continue
+        with reading(path, "it lists names of pictures, one a line"):
+            listed = list(dict.fromkeys(inside(path).read_text(encoding="utf-8").split()))
+        unposed += [name for name in listed if name not in people]
+        splits[split] = tuple(people[name] for name in listed if name in people)
+    if "train" not in splits:
+        held_out = {view.name for views in splits.values() for view in views}
+        splits["train"] = tuple(view for view in people.values() if view.name not in held_out)
+    notes = [f"{len(unposed)} pictures of the splits have no pose and are left out: {some(unposed)}"] if unposed else []
+    return splits, notes

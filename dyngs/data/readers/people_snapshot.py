@@ -1,0 +1,119 @@
+"""Reader for PeopleSnapshot folders: a video of a person who turns, ``camera.pkl``, masks and poses in HDF5 files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dyngs.data.capture import Capture
+from dyngs.data.pictures.video import VIDEO_SUFFIXES
+from dyngs.data.poses import inverse_rigid
+from dyngs.data.readers.camera_folders import OPENGL_FROM_OPENCV, open_camera, sequence_views
+from dyngs.data.readers.people import (
+    MASKS,
+    BodyFrames,
+    Silhouette,
+    body_frames,
+    entry,
+    hdf5_length,
+    numbers_of,
+    of_one_clip,
+    person_view,
+    read_hdf5,
+)
+from dyngs.errors import DyngsError, reading
+from dyngs.files.pickles import read_pickle
+from dyngs.files.trust import inside
+
+CAMERA = "camera.pkl"
+MASK_FILE = "masks.hdf5"
+POSE_FILE = "reconstructed_poses.hdf5"
+
+
+def is_people_snapshot(root: Path) -> bool:
+    """Whether the folder holds ``camera.pkl`` and one of the two HDF5 files."""
+    return (root / CAMERA).is_file() and any((root / name).is_file() for name in (MASK_FILE, POSE_FILE))
+
+
+def read_people_snapshot(root: Path) -> Capture:
+    """The capture of one camera at rest (Alldieck et al. 2018): frame n of the video is row n of masks and poses.
+
+    ``camera.pkl``: camera_f, camera_c (2,) px, camera_k (5,) OpenCV, camera_rt axis-angle and camera_t of
+    cam_from_world, width, height. ``masks.hdf5``: masks (F, H, W), 0 is background. ``reconstructed_poses.hdf5``: SMPL
+    pose (F, 72), trans (F, 3), betas (10,), in metres. Frames without a mask or parameters are left out.
+
+    Raises:
+        DyngsError: h5py is not installed; anything missing, broken or inconsistent; names the file.
+    """
+    with reading(root):
+        return _read(root)
+
+
+def _read(root: Path) -> Capture:
+    camera = open_camera((video := _video(root)).stem, video)
+    body = _body(root / POSE_FILE)
+    usable = set(body.frames) & set(range(hdf5_length(root / MASK_FILE, MASKS)))
+    pictures = {number: path for number, path in camera.pictures.items() if number in usable}
+    if not pictures:
+        raise DyngsError(
+            f"{root}: no frame of {video.name} has both a mask and body parameters; restore the HDF5 files"
+        )
+    views, warnings = sequence_views(
+        root / CAMERA, [replace(camera, pictures=pictures)], {camera.name: _calibration(root / CAMERA)}
+    )
+    people = tuple(
+        person_view(view, Silhouette(root / MASK_FILE, "nonzero", number))
+        for view, number in zip(views[camera.name], sorted(pictures), strict=True)
+    )
+    lost = len(camera.pictures) - len(pictures)
+    if lost:
+        warnings.append(f"{video.name}: {lost} of {len(camera.pictures)} frames lack a mask or a pose and are left out")
+    capture = Capture(root, "people_snapshot", {"train": people}, warnings=tuple(warnings))
+    return capture.replace(body=of_one_clip(body))
+
+
+def _video(root: Path) -> Path:
+    """The folder's only video, or the one named like the folder."""
+    found = sorted(p for p in root.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES and not p.name.startswith("."))
+    named = [path for path in found if path.stem == root.resolve().name] or found
+    if len(named) != 1:
+        what = f"{len(found)} videos" if found else "no video"
+        raise DyngsError(f"{root}: {what} in it; keep one, called {root.resolve().name}.mp4")
+    return named[0]
+
+
+def _calibration(path: Path) -> dict[str, object]:
+    """The fields of a frame in a transforms file."""
+    fields = read_pickle(inside(path))
+    fx, fy = numbers_of(f"{path}: 'camera_f'", entry(path, fields, "camera_f"), (2,)).tolist()
+    cx, cy = numbers_of(f"{path}: 'camera_c'", entry(path, fields, "camera_c"), (2,)).tolist()
+    lens = numbers_of(f"{path}: 'camera_k'", entry(path, fields, "camera_k"), (5,)).tolist()
+    pose = np.eye(4)
+    turn = numbers_of(f"{path}: 'camera_rt'", entry(path, fields, "camera_rt"), (3,))
+    pose[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    pose[:3, 3] = numbers_of(f"{path}: 'camera_t'", entry(path, fields, "camera_t"), (3,))
+    size = {
+        name: float(numbers_of(f"{path}: '{key}'", entry(path, fields, key), (1,))[0])
+        for name, key in (("w", "width"), ("h", "height"))
+    }
+    return {
+        **size,
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx,
+        "cy": cy,
+        **dict(zip(("k1", "k2", "p1", "p2", "k3"), lens, strict=True)),
+        "transform_matrix": (inverse_rigid(pose) @ OPENGL_FROM_OPENCV).tolist(),
+    }
+
+
+def _body(path: Path) -> BodyFrames:
+    """The parameters of the frames that have some: rows that were never fitted are 0 throughout."""
+    poses, trans, betas = (read_hdf5(path, key) for key in ("pose", "trans", "betas"))
+    if len(poses) != len(trans):
+        raise DyngsError(f"{path}: 'pose' has {len(poses)} rows but 'trans' {len(trans)}; export it again")
+    fitted = np.flatnonzero([bool(np.any(p)) or bool(np.any(t)) for p, t in zip(poses, trans, strict=True)])
+    return body_frames(path, fitted.tolist(), poses[fitted], trans[fitted], betas)

@@ -1,0 +1,284 @@
+"""Views from a transforms JSON file: what Blender, nerfstudio and instant-ngp captures have in common."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from dyngs.data.capture import Lens, VideoFrame, View
+from dyngs.data.intrinsics import MAX_SIDE, match_size, pinhole_matrix, rescale_warning
+from dyngs.data.pictures.images import SUFFIXES, PictureHeader, read_header
+from dyngs.data.poses import cam_from_opengl, checked_pose, repair_warning
+from dyngs.errors import DyngsError
+from dyngs.files.json_object import read_json_object
+from dyngs.files.trust import check_size, inside
+
+_LARGEST = 1e300
+_LARGEST_INTEGER = 2**53
+_FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One entry of ``frames``; what it lacks is looked up in the file's top level.
+
+    Attributes:
+        where: file and index, for messages.
+        own: the frame's fields.
+        shared: the file's fields.
+        picture: the picture where ``file_path`` does not name it.
+        video: what the picture comes out of, if anything.
+    """
+
+    where: str
+    own: dict[str, object]
+    shared: dict[str, object]
+    picture: Path | None = None
+    video: VideoFrame | None = None
+
+    def number(self, key: str) -> float | None:
+        """The finite number at ``key``, None if absent."""
+        return _number(self.own.get(key, self.shared.get(key)), key, self.where)
+
+    def integer(self, key: str) -> int | None:
+        """The whole number at ``key`` of this frame alone, None if absent or something else."""
+        value = self.own.get(key)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            return None
+        return int(value) if value % 1 == 0 and abs(value) < _LARGEST_INTEGER else None
+
+    def text(self, key: str) -> str | None:
+        """The string at ``key``, None if absent."""
+        value = self.own.get(key, self.shared.get(key))
+        if value is not None and not isinstance(value, str):
+            raise DyngsError(f"{self.where}: '{key}' must be a string, got {value!r:.40}")
+        return value
+
+
+@dataclass(frozen=True)
+class FrameFile:
+    """A parsed transforms file: its path, all its fields, and its frames."""
+
+    path: Path
+    fields: dict[str, object]
+    frames: tuple[Frame, ...]
+
+
+@dataclass
+class _Notes:
+    """Suspicions collected while views are made."""
+
+    repaired: dict[str, float] = field(default_factory=dict)
+    rescaled: list[str] = field(default_factory=list)
+
+    def lines(self) -> list[str]:
+        return repair_warning(self.repaired) + rescale_warning(self.rescaled)
+
+
+def read_frame_file(path: Path) -> FrameFile:
+    """The file's fields and frames.
+
+    Raises:
+        DyngsError: unreadable, broken JSON (with line and column), or no list ``frames`` of objects.
+    """
+    wrong = "the list 'frames' is missing; is this a transforms file?"
+    fields = read_json_object(path, wrong)
+    listed = fields.get("frames")
+    if not isinstance(listed, list):
+        raise DyngsError(f"{path}: {wrong}")
+    frames = []
+    for index, own in enumerate(listed):
+        where = f"{path}, frame {index}"
+        if not isinstance(own, dict):
+            raise DyngsError(f"{where}: must be an object with file_path and transform_matrix")
+        if isinstance(own.get("file_path"), str):
+            where += f" ({own['file_path']:.200})"
+        frames.append(Frame(where, own, fields))
+    return FrameFile(path, fields, tuple(frames))
+
+
+def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
+    """Views by ``file_path`` as written in the file, in its order, and warnings.
+
+    Raises:
+        DyngsError: missing or wrong fields, impossible poses, sizes that disagree, the same picture twice.
+    """
+    root = file.path.parent
+    paths = [_image_path(root, frame) for frame in file.frames]
+    twice = [path for path, count in Counter(paths).items() if count > 1]
+    if twice:
+        raise DyngsError(f"{file.path}: {twice[0]} is listed more than once; remove the duplicate frames")
+    headers = [_header(path) if frame.video is None else None for frame, path in zip(file.frames, paths, strict=True)]
+    common = _common_size(file, paths, headers)
+    notes = _Notes()
+    views = {}
+    for frame, path, header in zip(file.frames, paths, headers, strict=True):
+        stored = (header.width, header.height) if header else None
+        views[str(frame.own["file_path"])] = _view(frame, root, path, stored, common, notes)
+    return views, notes.lines()
+
+
+def view_name(path: Path, root: Path) -> str:
+    """The picture's path below ``root`` without its extension, safe as a relative file name."""
+    relative = PurePosixPath(os.path.relpath(path, root).replace(os.sep, "/")).with_suffix("")
+    return "/".join(part for part in relative.parts if part not in ("..", "/"))
+
+
+def _view(
+    frame: Frame, root: Path, path: Path, stored: tuple[int, int] | None, common: tuple[int, int] | None, notes: _Notes
+) -> View:
+    described = _described_size(frame) or stored or common
+    if described is None:
+        header = read_header(path)  # says what is wrong with the file
+        described = header.width, header.height
+    intrinsics, size, rescaled = match_size(_intrinsics(frame, *described), described, stored, frame.where)
+    if rescaled:
+        notes.rescaled.append(frame.where)
+    pose, error = checked_pose(_matrix(frame), frame.where)
+    notes.repaired[frame.where] = error
+    mask = frame.text("mask_path")
+    camera = frame.integer("camera")
+    return View(
+        name=view_name(path, root),
+        image_path=path,
+        cam_from_world=cam_from_opengl(pose),
+        intrinsics=intrinsics,
+        width=size[0],
+        height=size[1],
+        lens=_lens(frame),
+        camera_id=(camera if camera is not None else frame.integer("camera_id")) or 0,
+        mask_path=_below(root, mask, frame.where) if mask else None,
+        time=_number(frame.own.get("time"), "time", frame.where),
+        frame=frame.integer("frame"),
+        video=frame.video,
+    )
+
+
+def _number(value: object, key: str, where: str) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < _LARGEST:
+        raise DyngsError(f"{where}: '{key}' must be a finite number, got {value!r:.40}")
+    return float(value)
+
+
+def _below(root: Path, written: str, where: str) -> Path:
+    path = Path(os.path.normpath(root / written.replace("\\", "/")))
+    if not path.name or path == Path(os.path.normpath(root)) or "\0" in written:
+        raise DyngsError(f"{where}: {written!r:.80} names no file; write the way to it from the capture's folder")
+    return path
+
+
+def _image_path(root: Path, frame: Frame) -> Path:
+    """The picture's file; extensions are tried where none is written, PNG first."""
+    if frame.picture is not None:
+        return frame.picture
+    written = frame.own.get("file_path")
+    if not isinstance(written, str) or not written:
+        raise DyngsError(f"{frame.where}: the key 'file_path' is missing")
+    path = _below(root, written, frame.where)
+    if path.suffix.lower() in SUFFIXES or path.is_file():
+        return path
+    candidates = [path.with_name(path.name + ending) for suffix in SUFFIXES for ending in (suffix, suffix.upper())]
+    return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
+
+
+def _header(path: Path) -> PictureHeader | None:
+    """None where the file is missing or damaged: the loader refuses it, with its reason, when it is wanted."""
+    inside(path)
+    try:
+        header = read_header(path)
+    except DyngsError:
+        return None
+    check_size(path, header.width, header.height, header.channels)
+    return header
+
+
+def _described_size(frame: Frame) -> tuple[int, int] | None:
+    width, height = frame.number("w"), frame.number("h")
+    if width is None or height is None:
+        return None
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise DyngsError(f"{frame.where}: w and h must be from 1 to {MAX_SIDE:,}, got {width:g} and {height:g}")
+    return round(width), round(height)
+
+
+def _common_size(file: FrameFile, paths: list[Path], headers: list[PictureHeader | None]) -> tuple[int, int] | None:
+    """(width, height) of the pictures that the file says no size of and that share its focal length."""
+    sizes: dict[tuple[int, int], Path] = {}
+    for frame, path, header in zip(file.frames, paths, headers, strict=True):
+        has_own = any(key in frame.own for key in _FOCAL_KEYS)
+        if header and not has_own and _described_size(frame) is None:
+            sizes.setdefault((header.width, header.height), path)
+    if len(sizes) > 1:
+        (first, path), (second, other) = list(sizes.items())[:2]
+        raise DyngsError(
+            f"{file.path}: pictures of different sizes share one focal length ({path} is {first[0]}x{first[1]}, "
+            f"{other} is {second[0]}x{second[1]}); give w, h and fl_x for each frame"
+        )
+    return next(iter(sizes), None)
+
+
+def _intrinsics(frame: Frame, width: int, height: int) -> np.ndarray:
+    source = frame.own if any(key in frame.own for key in _FOCAL_KEYS) else frame.shared
+    focal_x = _focal(source, "x", width, frame.where)
+    focal_y = _focal(source, "y", height, frame.where)
+    if focal_x is None and focal_y is None:
+        raise DyngsError(f"{frame.where}: no focal length; give fl_x (px) or camera_angle_x (radians)")
+    cx, cy = frame.number("cx"), frame.number("cy")
+    return pinhole_matrix(
+        focal_x or focal_y or 0.0,
+        focal_y or focal_x or 0.0,
+        0.5 * width if cx is None else cx,
+        0.5 * height if cy is None else cy,
+    )
+
+
+def _focal(source: dict[str, object], axis: str, size: int, where: str) -> float | None:
+    """Focal length in pixels along one axis, None where the source does not say it for this axis."""
+    focal = _number(source.get(f"fl_{axis}"), f"fl_{axis}", where)
+    # An angle beside an fl_x for the other axis only repeats it rounded: square pixels are the better guess.
+    if focal is None and not any(source.get(key) is not None for key in ("fl_x", "fl_y")):
+        angle = _number(source.get(f"camera_angle_{axis}"), f"camera_angle_{axis}", where)
+        if angle is None:
+            return None
+        if not 0 < angle < math.pi:
+            raise DyngsError(f"{where}: camera_angle_{axis} must lie between 0 and pi radians, got {angle:g}")
+        focal = 0.5 * size / max(math.tan(0.5 * angle), 1e-300)
+    if focal is not None and focal <= 0:
+        raise DyngsError(f"{where}: fl_{axis} must be positive, got {focal:g}")
+    return focal
+
+
+def _lens(frame: Frame) -> Lens:
+    model = (frame.text("camera_model") or "OPENCV").upper()
+    k1, k2, k3, k4, k5, k6, p1, p2 = (
+        frame.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+    )
+    if model == "OPENCV_FISHEYE" or frame.own.get("is_fisheye", frame.shared.get("is_fisheye")) is True:
+        return Lens("fisheye", (k1, k2, k3, k4))
+    if model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return Lens()
+    if model not in ("OPENCV", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE"):
+        raise DyngsError(f"{frame.where}: camera_model {model} is not supported; use PINHOLE, OPENCV or OPENCV_FISHEYE")
+    if k4 and not (k5 or k6 or model == "FULL_OPENCV"):
+        raise DyngsError(f"{frame.where}: k4 has no agreed meaning for {model}; use FULL_OPENCV or set it to 0")
+    params = (k1, k2, p1, p2, k3, k4, k5, k6)
+    while len(params) > 4 and not params[-1]:
+        params = params[:-1]
+    return Lens("opencv", params) if any(params) else Lens()
+
+
+def _matrix(frame: Frame) -> np.ndarray:
+    value = frame.own.get("transform_matrix")
+    if value is None:
+        raise DyngsError(f"{frame.where}: the key 'transform_matrix' is missing")
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise DyngsError(f"{frame.where}: transform_matrix must hold 4x4 numbers; export it again") from None

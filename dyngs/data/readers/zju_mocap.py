@@ -1,0 +1,258 @@
+"""Reader for ZJU-MoCap folders: ``annots.npy`` of several cameras, or ``cameras.pkl`` and ``mesh_infos.pkl`` of one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from dyngs.data.capture import Capture, Split, View
+from dyngs.data.poses import checked_pose, inverse_rigid
+from dyngs.data.readers.camera_folders import OPENGL_FROM_OPENCV
+from dyngs.data.readers.people import (
+    BodyFrames,
+    Silhouette,
+    body_frames,
+    entry,
+    numbers_of,
+    of_one_clip,
+    person_view,
+    rows_of,
+    some,
+)
+from dyngs.data.readers.transforms import Frame, FrameFile, read_views
+from dyngs.errors import DyngsError, reading
+from dyngs.files.pickles import read_pickle, read_pickled_array
+from dyngs.files.trust import inside
+
+ANNOTATIONS = "annots.npy"
+CAMERAS = "cameras.pkl"
+MESHES = "mesh_infos.pkl"
+
+_MASK_FOLDERS = ("mask_cihp", "mask", "masks")
+_MIN_TO_HOLD_ONE_OUT = 3
+_NUM_JOINTS = 24
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """One picture.
+
+    Attributes:
+        file: below the capture's folder, with or without extension.
+        camera: index.
+        frame: number.
+        calibration: fields of a frame in a transforms file.
+        where: what calibrates it, for messages.
+    """
+
+    file: str
+    camera: int
+    frame: int
+    calibration: dict[str, object]
+    where: str
+
+
+def is_zju_mocap(root: Path) -> bool:
+    """Whether the folder holds ``annots.npy``, or ``cameras.pkl`` beside ``images``."""
+    return (root / ANNOTATIONS).is_file() or ((root / CAMERAS).is_file() and (root / "images").is_dir())
+
+
+def read_zju_mocap(root: Path) -> Capture:
+    """The capture of a person in metres, seen by several calibrated cameras at rest or by one.
+
+    ``annots.npy`` (Peng et al. 2021) holds ``cams`` (K, D, R, T in mm, per camera) and ``ims`` (pictures of all cameras
+    per frame); SMPL parameters lie in ``new_params/N.npy`` or ``params/N.npy``, N being the number in the picture's
+    name; masks (labels, 0 is background) in ``mask_cihp``, ``mask`` or ``masks`` under the pictures' names. Of three
+    cameras or more the first one is for testing. ``cameras.pkl`` and ``mesh_infos.pkl`` (Weng et al. 2022) hold
+    the same per picture of ``images/``, in metres; masks (white) lie in ``masks/``.
+
+    Parameters: v = Rh LBS(x; poses) + Th, about the template's origin: kept as ``BodyFrames.turns``. OpenCV calibrated
+    these cameras, so that pixel centres lie at whole numbers: half a pixel is added to the principal point.
+
+    Raises:
+        DyngsError: anything missing, broken or inconsistent; names the file.
+    """
+    with reading(root):
+        return _read(root)
+
+
+def _read(root: Path) -> Capture:
+    if (root / ANNOTATIONS).is_file():
+        path, shots = root / ANNOTATIONS, _annotated_shots(root / ANNOTATIONS)
+        found, body = _params_per_file(root, {shot.frame for shot in shots})
+        person, folders = "nonzero", _MASK_FOLDERS
+    else:
+        path, shots = root / CAMERAS, _single_shots(root / CAMERAS)
+        found, body = root / MESHES, _mesh_infos(root / MESHES)
+        person, folders = "white", ("masks",)
+    views, warnings = _views(path, shots)
+    rows_of(found, body, views)
+    masks = [_mask(root, shot.file, folders) for shot in shots]
+    people = [
+        person_view(view, None if mask is None else Silhouette(mask, person))
+        for view, mask in zip(views, masks, strict=True)
+    ]
+    without = [view.name for view, mask in zip(views, masks, strict=True) if mask is None]
+    if without:
+        warnings.append(f"{len(without)} pictures have no mask in {' or '.join(folders)}, first {without[0]}")
+    splits, notes = _splits(people)
+    return Capture(root, "zju_mocap", splits, warnings=(*warnings, *notes)).replace(body=of_one_clip(body))
+
+
+def _annotated_shots(path: Path) -> list[_Shot]:
+    fields = read_pickled_array(inside(path))
+    cams = {key: _items(f"{path}, cams", entry(path, fields, "cams"), key) for key in ("K", "D", "R", "T")}
+    counts = {key: len(values) for key, values in cams.items()}
+    if len(set(counts.values())) > 1 or not counts["K"]:
+        raise DyngsError(f"{path}: 'cams' must have one K, D, R and T per camera, got {counts}; export it again")
+    calibrations = []
+    for camera, (k, d, r, t) in enumerate(zip(*cams.values(), strict=True)):
+        where = f"{path}, camera {camera}"
+        pose = np.eye(4)
+        pose[:3, :3] = numbers_of(f"{where}: 'R'", r, (3, 3))
+        pose[:3, 3] = numbers_of(f"{where}: 'T'", t, (3,)) / 1000
+        calibrations.append(_calibration(where, k, d, pose))
+    shots = []
+    for index, own in enumerate(_items(path, fields, "ims")):
+        files = _items(f"{path}, ims {index}", own, "ims")
+        if len(files) != len(calibrations) or not all(isinstance(file, str) for file in files):
+            raise DyngsError(
+                f"{path}, ims {index}: must name one picture for each of the {len(calibrations)} cameras, got "
+                f"{len(files)}; export it again"
+            )
+        frame = _frame_number(path, str(files[0]))
+        shots += [
+            _Shot(str(file), camera, frame, calibration, f"{path}, camera {camera}")
+            for camera, (file, calibration) in enumerate(zip(files, calibrations, strict=True))
+        ]
+    if not shots:
+        raise DyngsError(f"{path}: 'ims' lists no pictures; export it again")
+    return shots
+
+
+def _single_shots(path: Path) -> list[_Shot]:
+    shots = []
+    for name, own in sorted(_by_name(path).items()):
+        where = f"{path}, {name}"
+        pose = numbers_of(f"{where}: 'extrinsics'", entry(where, own, "extrinsics"), (4, 4))
+        lens = own.get("distortions", np.zeros(5))
+        calibration = _calibration(where, entry(where, own, "intrinsics"), lens, pose)
+        shots.append(_Shot(f"images/{name}", 0, _frame_number(path, name), calibration, where))
+    return shots
+
+
+def _params_per_file(root: Path, frames: Iterable[int]) -> tuple[Path, BodyFrames]:
+    """The folder of parameters, and what its file of each frame holds."""
+    folder = next((root / name for name in ("new_params", "params") if (root / name).is_dir()), root / "new_params")
+    numbers = sorted(frames)
+    missing = [f"{number}.npy" for number in numbers if not (folder / f"{number}.npy").is_file()]
+    if missing:
+        raise DyngsError(
+            f"{folder}: no body parameters for {len(missing)} of {len(numbers)} frames ({some(missing)}); restore "
+            f"these or remove the frames from {ANNOTATIONS}"
+        )
+    paths = [folder / f"{number}.npy" for number in numbers]
+    files = [(str(path), read_pickled_array(inside(path))) for path in paths]
+    poses, trans, turns = (_column(files, key, width) for key, width in (("poses", None), ("Th", 3), ("Rh", 3)))
+    return folder, body_frames(folder, numbers, poses, trans, _column(files, "shapes"), turns=turns)
+
+
+def _mesh_infos(path: Path) -> BodyFrames:
+    """Shape coefficients where the file has them, and the pelvis of the body that was fitted."""
+    by_name = _by_name(path)
+    infos = [(f"{path}, {name}", own) for name, own in by_name.items()]
+    key = next((key for key in ("betas", "shapes") if all(key in own for _, own in infos)), None)
+    betas = np.zeros(10) if key is None else _column(infos, key)
+    poses, trans, turns = (_column(infos, key, width) for key, width in (("poses", None), ("Th", 3), ("Rh", 3)))
+    pelvis = np.mean(_column(infos, "tpose_joints", 3 * _NUM_JOINTS), axis=0)[:3]
+    numbers = [_frame_number(path, name) for name in by_name]
+    return body_frames(path, numbers, poses, trans, betas, turns=turns, pelvis=pelvis)
+
+
+def _column(rows: Iterable[tuple[str, object]], key: str, width: int | None = None) -> list[np.ndarray]:
+    """What each of the named dictionaries holds at ``key``, finite numbers, as many as ``width`` says."""
+    shape = None if width is None else (width,)
+    return [numbers_of(f"{where}: '{key}'", entry(where, own, key), shape) for where, own in rows]
+
+
+def _calibration(where: str, intrinsics: object, lens: object, cam_from_world: np.ndarray) -> dict[str, object]:
+    k = numbers_of(f"{where}: the intrinsics", intrinsics, (3, 3))
+    values = numbers_of(f"{where}: the distortion", lens, None).tolist()
+    if len(values) not in (4, 5, 8):
+        raise DyngsError(
+            f"{where}: the distortion must have 4, 5 or 8 coefficients, got {len(values)}; export it again"
+        )
+    pose, _ = checked_pose(cam_from_world, where)
+    return {
+        "fl_x": float(k[0, 0]),
+        "fl_y": float(k[1, 1]),
+        "cx": float(k[0, 2]) + 0.5,
+        "cy": float(k[1, 2]) + 0.5,
+        "camera_model": "FULL_OPENCV" if len(values) == 8 else "OPENCV",
+        **dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), values, strict=False)),
+        "transform_matrix": (inverse_rigid(pose) @ OPENGL_FROM_OPENCV).tolist(),
+    }
+
+
+def _views(path: Path, shots: Sequence[_Shot]) -> tuple[list[View], list[str]]:
+    """One view per shot, and warnings; times run from 0 at the lowest frame number to 1 at the highest one."""
+    first, last = min(shot.frame for shot in shots), max(shot.frame for shot in shots)
+    frames = []
+    for shot in shots:
+        times = {"frame": shot.frame, "time": (shot.frame - first) / max(last - first, 1)}
+        frames.append(
+            Frame(shot.where, {**shot.calibration, **times, "file_path": shot.file, "camera": shot.camera}, {})
+        )
+    views, warnings = read_views(FrameFile(path, {}, tuple(frames)))
+    return list(views.values()), warnings
+
+
+def _splits(views: Sequence[View]) -> tuple[dict[Split, tuple[View, ...]], list[str]]:
+    if len({view.camera_id for view in views}) < _MIN_TO_HOLD_ONE_OUT:
+        return {"train": tuple(views)}, []
+    return {
+        "train": tuple(view for view in views if view.camera_id != 0),
+        "test": tuple(view for view in views if view.camera_id == 0),
+    }, ["no camera is named for testing: the first one is held out"]
+
+
+def _mask(root: Path, file: str, folders: Sequence[str]) -> Path | None:
+    """``FOLDER/a/b.png`` of the picture ``a/b.jpg`` or ``images/a/b.jpg``, in the first folder that has it."""
+    picture = PurePosixPath(file.replace("\\", "/"))
+    name = picture.name if not picture.suffix else picture.with_suffix("").name
+    below = [picture.parent / f"{name}.png"]
+    if picture.parts[0] == "images":
+        below.append(PurePosixPath(*below[0].parts[1:]))
+    candidates = (root / folder / path for folder in folders for path in below)
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _frame_number(path: Path, name: str) -> int:
+    """The number in a picture's name: ``000123.jpg``, ``frame_000123`` or ``Camera (1)_0123_2019-08-23_16.592.jpg``."""
+    stem = PurePosixPath(name.replace("\\", "/")).name
+    found = re.search(r"\)_(\d{1,15})(?!\d)", stem) or re.search(r"(?<!\d)(\d{1,15})(?:\.\w+)?$", stem)
+    if not found:
+        raise DyngsError(f"{path}: no frame number in the name {name!r:.80}; call the picture 000000.jpg or the like")
+    return int(found[1])
+
+
+def _by_name(path: Path) -> dict[str, dict[str, object]]:
+    """Picture name to what the file says about it."""
+    fields = read_pickle(inside(path))
+    if not isinstance(fields, dict) or not fields or not all(isinstance(own, dict) for own in fields.values()):
+        raise DyngsError(f"{path}: must be a dictionary from picture names to parameters; export it again")
+    strange = [name for name in fields if not isinstance(name, str) or not re.fullmatch(r"[\w-]+", name)]
+    if strange:
+        raise DyngsError(f"{path}: {strange[0]!r:.80} is no name of a picture; export it again")
+    return fields
+
+
+def _items(where: object, fields: object, key: str) -> list[object]:
+    value = entry(where, fields, key)
+    if not isinstance(value, (list, tuple, np.ndarray)) or (isinstance(value, np.ndarray) and not value.ndim):
+        raise DyngsError(f"{where}: '{key}' must be a list; export it again")
+    return list(value)

@@ -1,0 +1,235 @@
+"""Captures of the embedded scenes, ray traced into the layout of NeRF-synthetic and D-NeRF."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Scene, render_scene
+from dyngs.data.synthetic.scenes import SceneName, scene_at, still_life
+from dyngs.errors import DyngsError
+from dyngs.files.write import write_image, write_text
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """How pictures are taken.
+
+    Attributes:
+        size: width and height in pixels.
+        num_val, num_test: pictures that are held out.
+        seed: turns the training cameras; one seed gives the same bytes each time.
+        distance: of the cameras from the origin, world units.
+        samples: S, samples per pixel side.
+    """
+
+    size: int = 128
+    num_val: int = 0
+    num_test: int = 8
+    seed: int = 0
+    distance: float = 4.0
+    samples: int = 3
+
+
+@dataclass(frozen=True)
+class StillOptions(PictureOptions):
+    """How the still scene is taken.
+
+    Attributes:
+        num_train: training pictures.
+    """
+
+    num_train: int = 48
+
+
+@dataclass(frozen=True)
+class DynamicOptions(PictureOptions):
+    """How a moving scene is taken. The seed also chooses which camera takes which time.
+
+    Test pictures lie at times between the training times, those of ``num_val`` are of one fixed camera; in ``room``
+    both numbers only say whether there is a camera of that kind, which is never trained on.
+
+    Attributes:
+        num_times: training times, evenly spaced in [0, 1]; in ``room`` each camera takes a picture at each.
+        num_cameras: training cameras of ``room``.
+    """
+
+    num_test: int = 12
+    samples: int = 2
+    num_times: int = 48
+    num_cameras: int = 8
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """One picture to take: where it goes, below the root and without suffix, the (4, 4) OpenGL pose, and when."""
+
+    name: str
+    world_from_cam: np.ndarray
+    time: float | None = None
+    camera: int | None = None
+
+
+def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Path:
+    """Write pictures of ``still_life`` in the layout of the NeRF-synthetic scenes; returns ``out``.
+
+    Files: ``transforms_SPLIT.json`` (OpenGL camera-to-world) and ``SPLIT/r_000.png`` (RGBA, straight alpha, sRGB) for
+    every split with pictures. Each file is written atomically, the JSON last.
+
+    Raises:
+        DyngsError: the folder cannot be written.
+    """
+    scene = still_life()
+    splits = {
+        "train": hemisphere_cameras(options.num_train, options.distance, options.seed),
+        "val": orbit_cameras(options.num_val, options.distance, elevation_deg=45.0, start_deg=10.0),
+        "test": orbit_cameras(options.num_test, options.distance, elevation_deg=28.0, start_deg=0.0),
+    }
+    for split, poses in splits.items():
+        shots = [_Shot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
+        _write_split(out, split, shots, lambda _: scene, options)
+    return out
+
+
+def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = DynamicOptions()) -> Path:
+    """Write pictures of the moving scene ``name`` in the layout of D-NeRF; returns ``out``.
+
+    Files: ``transforms_SPLIT.json`` with ``time`` in [0, 1] per frame, and the pictures, RGBA with straight alpha. Each
+    time is seen by one camera somewhere else on the hemisphere. ``room`` is a video of several fixed cameras instead:
+    ``camAA/frame_BBBB.png`` without alpha, frames with ``camera``; test and val have one camera each, never trained on.
+
+    Raises:
+        DyngsError: no such scene, no pictures asked for, ``out`` holds something already, or cannot be written.
+    """
+    scene_at(name, 0.0)
+    if min(options.size, options.num_times, options.num_cameras, options.samples) < 1:
+        raise DyngsError("a synthetic capture needs size, num_times, num_cameras and samples of at least 1")
+    require_new_folder(out)
+    splits = _room_shots(options) if name == "room" else _teleporting_shots(options)
+    for split, shots in splits.items():
+        _write_split(out, split, shots, lambda shot: scene_at(name, shot.time or 0.0), options)
+    return out
+
+
+def require_new_folder(out: Path) -> None:
+    """Nothing, if ``out`` does not exist or is an empty folder.
+
+    Raises:
+        DyngsError: it holds something or is a file.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise DyngsError(f"{out} exists already; name a new folder for the capture")
+
+
+def _write_split(
+    out: Path,
+    split: str,
+    shots: Sequence[_Shot],
+    scene_of: Callable[[_Shot], Scene],
+    options: StillOptions | DynamicOptions,
+) -> None:
+    """The pictures of one split, then its JSON; nothing where it has no pictures."""
+    if not shots:
+        return
+    frames = []
+    for shot in shots:
+        rgba = render_scene(scene_of(shot), shot.world_from_cam, options.size, options.samples)
+        write_image(out / f"{shot.name}.png", rgba if shot.camera is None else rgba[..., :3])
+        frame: dict[str, object] = {"file_path": f"./{shot.name}"}
+        if shot.camera is not None:
+            frame["camera"] = shot.camera
+        if shot.time is not None:
+            frame["time"] = shot.time
+        frames.append(frame | {"transform_matrix": shot.world_from_cam.tolist()})
+    transforms = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
+    write_text(out / f"transforms_{split}.json", json.dumps(transforms, indent=1) + "\n")
+
+
+def _teleporting_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
+    """Training cameras all over the hemisphere in random order, test cameras on an orbit, val from one place."""
+    train = hemisphere_cameras(options.num_times, options.distance, options.seed)
+    train = np.random.default_rng(options.seed).permutation(train)  # the spiral climbs: time would tell the height
+    test = orbit_cameras(options.num_test, options.distance, elevation_deg=28.0, start_deg=-60.0)
+    fixed = orbit_cameras(1, options.distance, elevation_deg=28.0, start_deg=-60.0)
+    poses = {"train": train, "val": np.repeat(fixed, options.num_val, axis=0), "test": test}
+    times = {
+        "train": _even_times(options.num_times),
+        "val": _even_times(options.num_val),
+        "test": _times_between(options.num_times, options.num_test),
+    }
+    return {
+        split: [
+            _Shot(f"{split}/r_{i:03d}", pose, time)
+            for i, (pose, time) in enumerate(zip(poses[split], times[split], strict=True))
+        ]
+        for split in poses
+    }
+
+
+def _room_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
+    """Fixed cameras on an arc before the corner, low and high in turn; the test camera in the middle of the arc."""
+    count = options.num_cameras
+    shift = np.random.default_rng(options.seed).uniform(-2.0, 2.0)
+    azimuths_deg = -45.0 + shift + 64.0 * ((np.arange(count) + 0.5) / count - 0.5)
+    elevations_deg = np.where(np.arange(count) % 2 == 0, 16.0, 28.0)
+    middle = -45.0 + shift + (32.0 / count if count % 2 else 0.0)
+    azimuths_deg = np.append(azimuths_deg, [middle, middle])
+    elevations_deg = np.append(elevations_deg, [22.0, 34.0])
+    poses = _look_at_origin(options.distance, np.radians(azimuths_deg), np.radians(elevations_deg))
+    cameras = {
+        "train": range(count),
+        "val": (count + 1,) if options.num_val else (),
+        "test": (count,) if options.num_test else (),
+    }
+    return {
+        split: [
+            _Shot(f"cam{camera:02d}/frame_{i:04d}", poses[camera], time, camera)
+            for i, time in enumerate(_even_times(options.num_times))
+            for camera in cameras[split]
+        ]
+        for split in cameras
+    }
+
+
+def _even_times(count: int) -> list[float]:
+    """``count`` times from 0 to 1, both included; a single one is 0."""
+    return [i / max(count - 1, 1) for i in range(count)]
+
+
+def _times_between(num_times: int, count: int) -> list[float]:
+    """``count`` times spread over [0, 1], each midway between two neighbours of ``_even_times(num_times)``."""
+    gaps = max(num_times - 1, 1)
+    return [(int((i + 0.5) * gaps / count) + 0.5) / gaps for i in range(count)]
+
+
+def hemisphere_cameras(count: int, distance: float, seed: int) -> np.ndarray:
+    """(count, 4, 4) OpenGL camera-to-world poses spread evenly over the upper hemisphere, looking at the origin.
+
+    A Fibonacci spiral from 6 to 80 degrees of elevation, turned by a random azimuth.
+    """
+    turn = np.random.default_rng(seed).uniform(0.0, 2 * np.pi)
+    share = (np.arange(count) + 0.5) / max(count, 1)
+    heights = np.sin(np.radians(6.0)) * (1 - share) + np.sin(np.radians(80.0)) * share
+    azimuths = turn + np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
+    return _look_at_origin(distance, azimuths, np.arcsin(heights))
+
+
+def orbit_cameras(count: int, distance: float, elevation_deg: float, start_deg: float) -> np.ndarray:
+    """(count, 4, 4) OpenGL camera-to-world poses on a level circle around the origin."""
+    azimuths = np.radians(start_deg) + 2 * np.pi * np.arange(count) / max(count, 1)
+    return _look_at_origin(distance, azimuths, np.full(count, np.radians(elevation_deg)))
+
+
+def _look_at_origin(distance: float, azimuths: np.ndarray, elevations: np.ndarray) -> np.ndarray:
+    """(V, 4, 4) OpenGL camera-to-world poses, z up; angles (V,) in radians."""
+    cos_e, sin_e, cos_a, sin_a = np.cos(elevations), np.sin(elevations), np.cos(azimuths), np.sin(azimuths)
+    backward = np.stack([cos_e * cos_a, cos_e * sin_a, sin_e], axis=-1)
+    right = np.stack([-sin_a, cos_a, np.zeros_like(sin_a)], axis=-1)
+    poses = np.tile(np.eye(4), (len(azimuths), 1, 1))
+    poses[:, :3, 0], poses[:, :3, 1], poses[:, :3, 2] = right, np.cross(backward, right), backward
+    poses[:, :3, 3] = distance * backward
+    return poses

@@ -1,0 +1,300 @@
+"""The embedded scenes: a still life, and four that move - rigidly, by bending, by appearing and merging, in a room.
+
+A moving scene is a function from time in [0, 1] to a ``Scene``; its still primitives come first. Whatever moves carries
+a texture, and so moves visibly. Units: world units, radians.
+
+Local letters: R points on surfaces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import numpy as np
+
+from dyngs.data.synthetic.raytrace import Box, Paint, Primitive, Scene, Sheet, Sphere, Wave
+from dyngs.errors import DyngsError
+
+SceneName = Literal["spin", "wave", "merge", "room"]
+"""The scenes that move."""
+
+Rgb = tuple[float, float, float]
+
+_FAINT = 0.05
+"""``Scene.faint`` of the moving scenes: a ball darkens what is nearer than some four radii."""
+
+_PLATE_TOP = -0.34
+_ROOM_FLOOR = -0.50
+
+
+def still_life() -> Scene:
+    """The demo scene: three painted balls and a box on a checkered plate, inside |x|, |y|, |z| <= 1.1."""
+    return Scene(
+        (
+            Box(
+                (0.0, 0.0, -0.40), (0.98, 0.98, 0.06), _checkers(6, (0.80, 0.77, 0.70), (0.10, 0.16, 0.22)), gloss=0.05
+            ),
+            Sphere((-0.34, 0.40, 0.13), 0.47, _swirl((0.85, 0.20, 0.12), (0.95, 0.80, 0.55)), gloss=0.4),
+            Sphere((0.52, -0.40, -0.02), 0.32, _dots((0.08, 0.30, 0.62), (0.95, 0.92, 0.80)), gloss=0.6),
+            Sphere((-0.40, -0.52, -0.10), 0.24, _sectors(8, (0.95, 0.68, 0.10), (0.10, 0.42, 0.30)), gloss=0.6),
+            Box((0.48, 0.43, -0.04), (0.26, 0.26, 0.30), _framed((0.30, 0.12, 0.42), (0.86, 0.62, 0.30)), yaw=0.5),
+        )
+    )
+
+
+def scene_at(name: SceneName, time: float) -> Scene:
+    """The scene ``name`` at ``time`` in [0, 1].
+
+    - ``spin``: a die turns by 100 degrees on a plate and a ball rolls about it along 130 degrees of a circle.
+    - ``wave``: a cloth ripples over a plate with three still things; after time 1 it is as at time 0.
+    - ``merge``: a ball grows from nothing from 0.3 on, a ball rolls into a larger one, a third sinks into a box.
+    - ``room``: a furnished corner, opaque in all directions, where one ball hops across the floor.
+
+    Raises:
+        DyngsError: no such scene.
+    """
+    if name == "spin":
+        return _spin(time)
+    if name == "wave":
+        return _wave(time)
+    if name == "merge":
+        return _merge(time)
+    if name == "room":
+        return _room(time)
+    raise DyngsError(f"there is no moving scene '{name}'; choose one of {', '.join(get_args(SceneName))}")
+
+
+def _spin(time: float) -> Scene:
+    azimuth = np.radians(-130.0 + 130.0 * time)
+    radius, path_radius = 0.24, 0.70
+    return Scene(
+        (
+            _plate((0.76, 0.70, 0.60), (0.30, 0.13, 0.12)),
+            Sphere((-0.60, 0.60, -0.16), 0.18, _dots((0.90, 0.72, 0.16), (0.98, 0.96, 0.88)), gloss=0.5),
+            Box((0.0, 0.0, 0.04), (0.34, 0.34, 0.38), _die(), yaw=float(np.radians(100.0 * time - 20.0)), gloss=0.3),
+            Sphere(
+                (path_radius * np.cos(azimuth), path_radius * np.sin(azimuth), _PLATE_TOP + radius),
+                radius,
+                _sectors(8, (0.10, 0.42, 0.62), (0.96, 0.90, 0.78)),
+                gloss=0.6,
+                turn=_rotation("z", azimuth) @ _rotation("x", -path_radius * azimuth / radius),
+            ),
+        ),
+        faint=_FAINT,
+    )
+
+
+def _wave(time: float) -> Scene:
+    turn = 2 * np.pi * time
+    waves = (Wave(0.115, (5.2, 1.6), -turn), Wave(0.045, (-2.4, 6.0), -turn + 1.0))
+    return Scene(
+        (
+            _plate((0.72, 0.75, 0.74), (0.12, 0.20, 0.20)),
+            Sphere((0.74, -0.74, -0.16), 0.18, _swirl((0.85, 0.20, 0.12), (0.95, 0.80, 0.55)), gloss=0.5),
+            Sphere((-0.74, 0.74, -0.12), 0.22, _dots((0.08, 0.30, 0.62), (0.95, 0.92, 0.80)), gloss=0.5),
+            Box((-0.76, -0.76, -0.20), (0.14, 0.14, 0.14), _framed((0.10, 0.34, 0.26), (0.86, 0.62, 0.30)), yaw=0.4),
+            Sheet((0.0, 0.0, 0.16), (0.74, 0.56), waves, _carpet()),
+        ),
+        faint=_FAINT,
+    )
+
+
+def _merge(time: float) -> Scene:
+    things: list[Primitive] = [
+        _plate((0.80, 0.77, 0.70), (0.15, 0.24, 0.18)),
+        Box((0.44, 0.42, -0.04), (0.30, 0.30, 0.30), _framed((0.12, 0.20, 0.44), (0.86, 0.62, 0.30)), yaw=0.35),
+    ]
+    large, small = 0.30, 0.20
+    large_x, small_x = -0.55 + 0.55 * time, 0.70 - 0.70 * time
+    for x, radius, paint in (
+        (large_x, large, _swirl((0.10, 0.36, 0.30), (0.95, 0.86, 0.60))),
+        (small_x, small, _sectors(8, (0.92, 0.42, 0.08), (0.97, 0.92, 0.80))),
+    ):
+        center = (x, -0.52, _PLATE_TOP + radius)
+        things.append(Sphere(center, radius, paint, gloss=0.5, turn=_rotation("y", x / radius)))
+    height = 0.62 - 0.66 * _ease(time / 0.8)
+    things.append(Sphere((0.44, 0.42, height), 0.22, _dots((0.62, 0.10, 0.14), (0.96, 0.92, 0.84)), gloss=0.6))
+    grown = 0.36 * _ease((time - 0.3) / 0.6)
+    if grown > 0:
+        paint = _swirl((0.40, 0.16, 0.52), (0.93, 0.80, 0.86))
+        things.append(Sphere((-0.50, 0.42, _PLATE_TOP + grown), grown, paint, gloss=0.6))
+    return Scene(tuple(things), faint=_FAINT)
+
+
+def _room(time: float) -> Scene:
+    radius, hops = 0.24, 3
+    start, end = np.array([0.72, -0.86]), np.array([-0.45, -0.06])
+    x, y = start + time * (end - start)
+    height = _ROOM_FLOOR + radius + 0.55 * abs(np.sin(np.pi * hops * time))
+    heading = _rotation("z", np.arctan2(*(end - start)[::-1]))
+    floor = _tiles(26, (0.72, 0.56, 0.40), (0.46, 0.32, 0.21))
+    left = _wallpaper(1, 2, (15, 9), (0.62, 0.68, 0.60), (0.36, 0.50, 0.46))
+    right = _wallpaper(0, 2, (15, 9), (0.80, 0.72, 0.58), (0.66, 0.42, 0.30))
+    ball = _sectors(8, (0.95, 0.68, 0.10), (0.10, 0.42, 0.30))
+    return Scene(
+        (
+            Box((3.5, -3.5, _ROOM_FLOOR - 0.1), (5.2, 5.2, 0.1), floor, gloss=0.0),
+            Box((-1.6, -3.5, 2.5), (0.1, 5.2, 3.2), left, gloss=0.0),
+            Box((3.5, 1.6, 2.5), (5.2, 0.1, 3.2), right, gloss=0.0),
+            Box((-0.85, 0.80, -0.08), (0.42, 0.42, 0.42), _framed((0.30, 0.12, 0.42), (0.86, 0.62, 0.30)), yaw=0.5),
+            Box((0.36, 0.98, -0.02), (0.28, 0.28, 0.48), _tiles(4, (0.88, 0.84, 0.74), (0.10, 0.22, 0.34)), yaw=0.25),
+            Sphere((-0.85, 0.80, 0.60), 0.26, _dots((0.08, 0.30, 0.62), (0.95, 0.92, 0.80)), gloss=0.6),
+            Sphere((-0.95, -0.55, -0.16), 0.34, _swirl((0.72, 0.16, 0.20), (0.95, 0.86, 0.66)), gloss=0.4),
+            Sphere(
+                (x, y, height), radius, ball, gloss=0.6, turn=heading @ _rotation("y", 2 * np.pi * time) @ heading.T
+            ),
+        ),
+        faint=_FAINT,
+    )
+
+
+def _plate(light: Rgb, dark: Rgb) -> Box:
+    """The checkered plate on which things stand, its top at ``_PLATE_TOP``."""
+    return Box((0.0, 0.0, -0.40), (0.98, 0.98, 0.06), _checkers(6, light, dark), gloss=0.05)
+
+
+def _rotation(axis: Literal["x", "y", "z"], angle: float) -> np.ndarray:
+    """(3, 3) right-handed rotation about one axis of the world."""
+    c, s = np.cos(angle), np.sin(angle)
+    first = "xyz".index(axis) + 1
+    turn = np.eye(3)
+    i, j = first % 3, (first + 1) % 3
+    turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
+    return turn
+
+
+def _ease(share: float) -> float:
+    """0 below 0, 1 above 1, smooth between."""
+    x = min(max(share, 0.0), 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def _checkers(count: int, light: tuple[float, float, float], dark: tuple[float, float, float]) -> Paint:
+    """``count`` x ``count`` squares seen from above, a plain dark rim."""
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        cells = np.floor((local[:, :2] * 0.94 + 1.0) * 0.5 * count).astype(np.int64).sum(axis=1)
+        is_light = (cells % 2 == 0) & (np.abs(local[:, :2]).max(axis=1) < 0.94) & (local[:, 2] > 0.99)
+        return np.where(is_light[:, None], _f32(light), _f32(dark))
+
+    return paint
+
+
+def _swirl(first: tuple[float, float, float], second: tuple[float, float, float]) -> Paint:
+    """Bands that wind around the pole, with soft edges."""
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        wave = np.sin(9.0 * local[:, 2] + 2.0 * np.arctan2(local[:, 1], local[:, 0]) + 1.5 * np.sin(4.0 * local[:, 0]))
+        share = (0.5 + 0.5 * np.clip(4.0 * wave, -1.0, 1.0))[:, None].astype(np.float32)
+        return share * _f32(first) + (1 - share) * _f32(second)
+
+    return paint
+
+
+def _dots(ground: tuple[float, float, float], dot: tuple[float, float, float]) -> Paint:
+    """24 round dots spread over the sphere."""
+    i = np.arange(24) + 0.5
+    z = 1 - 2 * i / 24
+    azimuth = i * np.pi * (3.0 - np.sqrt(5.0))
+    centers = np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z]).astype(np.float32)
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        is_dot = (local @ centers).max(axis=1) > np.cos(0.22)
+        return np.where(is_dot[:, None], _f32(dot), _f32(ground))
+
+    return paint
+
+
+def _sectors(count: int, first: tuple[float, float, float], second: tuple[float, float, float]) -> Paint:
+    """A beach ball with ``count`` sectors about a tilted axis and white caps."""
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        tilted_z = 0.8 * local[:, 2] + 0.6 * local[:, 1]
+        tilted_y = 0.8 * local[:, 1] - 0.6 * local[:, 2]
+        sector = np.floor(np.arctan2(tilted_y, local[:, 0]) * count / (2 * np.pi)).astype(np.int64)
+        rgb = np.where((sector % 2 == 0)[:, None], _f32(first), _f32(second))
+        return np.where((np.abs(tilted_z) > 0.93)[:, None], _f32([0.9, 0.9, 0.88]), rgb)
+
+    return paint
+
+
+def _framed(frame: tuple[float, float, float], panel: tuple[float, float, float]) -> Paint:
+    """A frame around every face and fine rings, as of wood, on its panel."""
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        in_frame = np.sort(np.abs(local), axis=1)[:, 1] > 0.78
+        ring = 0.80 + 0.20 * np.sin(11.0 * local[:, 2] + 4.0 * np.sin(2.0 * local[:, 0] + local[:, 1]))
+        return np.where(in_frame[:, None], _f32(frame), ring[:, None].astype(np.float32) * _f32(panel))
+
+    return paint
+
+
+def _tiles(count: int, light: Rgb, dark: Rgb) -> Paint:
+    """Checkers of ``count`` cubes a side, on all faces."""
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        cells = np.floor((local * 0.999 + 1.0) * 0.5 * count).astype(np.int64).sum(axis=1)
+        return np.where((cells % 2 == 0)[:, None], _f32(light), _f32(dark))
+
+    return paint
+
+
+def _wallpaper(across: int, up: int, counts: tuple[int, int], ground: Rgb, spot: Rgb) -> Paint:
+    """Rows of soft spots, every other row shifted, over the two given axes of a box."""
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        row = (local[:, up] + 1.0) * counts[1]
+        column = (local[:, across] + 1.0) * counts[0] + 0.5 * (np.floor(row) % 2)
+        distance = np.hypot(row % 1.0 - 0.5, column % 1.0 - 0.5)
+        share = np.clip((0.34 - distance) / 0.08, 0.0, 1.0)[:, None].astype(np.float32)
+        return share * _f32(spot) + (1 - share) * _f32(ground)
+
+    return paint
+
+
+def _die() -> Paint:
+    """A die: opposite faces in one colour, with 1 to 6 pips of which opposite ones add up to seven."""
+    colors = np.array([[0.66, 0.12, 0.10], [0.10, 0.30, 0.50], [0.90, 0.78, 0.52]], np.float32)
+    d = 0.48
+    corners = [(-d, -d), (d, d), (-d, d), (d, -d)]
+    pips = {n: corners[: n - n % 2] + [(0.0, 0.0)] * (n % 2) for n in range(1, 6)}
+    pips[6] = [*corners, (-d, 0.0), (d, 0.0)]
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        axis = np.abs(local).argmax(axis=1)
+        side = np.take_along_axis(local, axis[:, None], axis=1)[:, 0] > 0
+        number = np.where(side, axis + 1, 6 - axis)
+        rows = np.arange(len(local))
+        x, y = local[rows, (axis + 1) % 3], local[rows, (axis + 2) % 3]
+        is_pip = np.zeros(len(local), bool)
+        for n, centers in pips.items():
+            for a, b in centers:
+                is_pip |= (number == n) & (np.hypot(x - a, y - b) < 0.19)
+        is_edge = np.maximum(np.abs(x), np.abs(y)) > 0.93
+        rgb = np.where(is_edge[:, None], np.float32(0.6) * colors[axis], colors[axis])
+        return np.where(is_pip[:, None], _f32((0.96, 0.94, 0.88)), rgb)
+
+    return paint
+
+
+def _carpet() -> Paint:
+    """Nested lozenges within a toothed border; each corner has its own colour, so that no part looks like another."""
+    border, cream, navy = _f32((0.50, 0.07, 0.08)), _f32((0.92, 0.82, 0.62)), _f32((0.06, 0.14, 0.34))
+    corners = np.array([[0.72, 0.16, 0.12], [0.10, 0.42, 0.40], [0.86, 0.54, 0.12], [0.40, 0.18, 0.42]], np.float32)
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        u, v = local[:, 0], local[:, 1]
+        ring = np.floor((np.abs(u) + np.abs(v)) * 4.0).astype(np.int64)
+        field = np.where((ring % 2 == 0)[:, None], cream, corners[(u > 0) + 2 * (v > 0)])
+        field = np.where((ring == 0)[:, None], navy, field)
+        edge = np.maximum(np.abs(u), np.abs(v))
+        tooth = np.floor(np.where(np.abs(u) > np.abs(v), v * 7.0, u * 9.0)).astype(np.int64) % 2 == 0
+        rim = np.where((tooth & (edge < 0.97))[:, None], cream, border)
+        return np.where((edge > 0.84)[:, None], rim, field)
+
+    return paint
+
+
+def _f32(values: Sequence[float]) -> np.ndarray:
+    return np.asarray(values, np.float32)

@@ -1,0 +1,1 @@
+"""Evaluation of runs on held-out views."""

@@ -1,0 +1,339 @@
+"""Measures a finished run on held-out views and writes the report beside it."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from statistics import fmean, median
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from dyngs.config import DynamicModel, SceneModel
+from dyngs.data.capture import Capture, Split, View
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.read import read_capture
+from dyngs.deform.trained import TrainedScene
+from dyngs.errors import DyngsError
+from dyngs.evaluate.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
+from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
+from dyngs.files.write import write_text
+from dyngs.human.avatar.trained import AvatarScene
+from dyngs.human.motion.clips import footage, same_clip
+from dyngs.rendering import RenderOptions
+from dyngs.runs.checkpoint import COMPACT_NAME, LoadedRun, is_compact, load_run
+from dyngs.scene import Scene, moment_of, num_colour_values
+from dyngs.train.background import evaluation_background
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Metrics of one view; None where a metric cannot be had (``EvalReport.reasons`` says why).
+
+    ``render_seconds`` holds ``deform_seconds``; ``time`` is None for a still capture. ``psnr_person`` and
+    ``ssim_person`` are those inside the person's box.
+    """
+
+    name: str
+    width: int
+    height: int
+    psnr: float
+    ssim: float
+    flip: float | None
+    lpips: float | None
+    render_seconds: float
+    deform_seconds: float
+    time: float | None = None
+    psnr_person: float | None = None
+    ssim_person: float | None = None
+
+
+@dataclass(frozen=True)
+class EvalReport:
+    """What ``dyngs eval`` prints and writes; the fields are the keys of the file (docs/formats.md).
+
+    Attributes:
+        split: which views.
+        num_views, width, height: how many, and the size of the first in pixels.
+        background: name of the colour behind pictures and renders, "white" or "black".
+        psnr, ssim, flip, lpips: means over the views of the per-view values.
+        lpips_net: backbone that LPIPS uses, or would use.
+        num_gaussians: N.
+        num_moving, moving_share: M and M / N.
+        model_mb: float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12 bytes per
+            Gaussian.
+        field_mb: of these, the field's.
+        colour_floats: numbers per Gaussian that its colour takes, with its share of a network.
+        fps: one over the median time of drawing one view, after a warm-up: deformation and rendering; loading and
+            metrics not counted.
+        deform_share: median share of that time that the deformation takes.
+        psnr_per_time: mean PSNR at each distinct time; empty for a still capture.
+        flicker, flicker_error: see ``dyngs.evaluate.temporal``.
+        seconds_train, step: how long and how far the run was trained.
+        reasons: metric name to why it is None.
+        notes: anything else that a reader of the numbers should know.
+        per_view: the single views.
+        stored_mb: size on disk of a run that ``dyngs export --format compact`` wrote; None of others.
+        psnr_person, ssim_person: means inside the box around the person, where the true picture is not transparent;
+            only of a human model, and None where pictures have no alpha.
+    """
+
+    split: str
+    num_views: int
+    width: int
+    height: int
+    background: str
+    psnr: float
+    ssim: float
+    flip: float | None
+    lpips: float | None
+    lpips_net: str
+    num_gaussians: int
+    num_moving: int
+    moving_share: float
+    model_mb: float
+    field_mb: float
+    colour_floats: float
+    fps: float
+    deform_share: float
+    seconds_train: float
+    step: int
+    flicker: float | None = None
+    flicker_error: float | None = None
+    psnr_per_time: tuple[TimeScore, ...] = ()
+    reasons: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    per_view: tuple[ViewScore, ...] = ()
+    psnr_person: float | None = None
+    ssim_person: float | None = None
+    stored_mb: float | None = None
+
+    def to_json(self) -> str:
+        """The report as strict JSON (no NaN or Infinity), ending in a newline."""
+        return json.dumps(asdict(self), indent=2, allow_nan=False) + "\n"
+
+
+def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "alex", threads: int = 0) -> EvalReport:
+    """Report of a run on one split, also written into its folder: ``metrics.json``, ``metrics_SPLIT.json`` if not test.
+
+    Args:
+        run_dir: folder of a run with at least one checkpoint.
+        split: "test", "val" or "train".
+        lpips_net: "alex", "vgg" or "squeeze".
+        threads: for rendering and metrics; 0 leaves the number as it is.
+
+    Raises:
+        DyngsError: no such run or split, unreadable pictures, a render or metric that is not finite, unwritable folder.
+    """
+    run = load_run(run_dir)
+    capture = read_capture(run.config.data)
+    views = split_views(capture, split)
+    background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
+    scene = scene_of_split(run, capture, split)
+    drawing = Drawing(scene, render_options(run.config.model), colour)
+    with _num_threads(threads):
+        loader = PictureLoader(views, run.config.data)
+        pictures = (loader[i] for i in range(len(loader)))
+        scores, reasons = score_views(scene, pictures, drawing.options, colour, load_lpips(lpips_net))
+        temporal = {
+            "flicker": flicker_of_split(drawing, loader, views),
+            "flicker_error": flicker_error(drawing, loader, views),
+        }
+    reasons |= {name: measured.reason for name, measured in temporal.items() if measured.reason is not None}
+    report = EvalReport(
+        split=split,
+        num_views=len(scores),
+        width=scores[0].width,
+        height=scores[0].height,
+        background=background,
+        psnr=fmean(s.psnr for s in scores),
+        ssim=fmean(s.ssim for s in scores),
+        flip=_mean([s.flip for s in scores]),
+        lpips=_mean([s.lpips for s in scores]),
+        lpips_net=lpips_net,
+        num_gaussians=len(scene),
+        num_moving=0 if scene.is_still else len(scene.rows),
+        moving_share=scene.moving_share,
+        model_mb=parameter_megabytes(scene),
+        field_mb=4e-6 * scene.num_field_values,
+        colour_floats=num_colour_values(scene) / max(len(scene), 1),
+        fps=1 / median(s.render_seconds for s in scores),
+        deform_share=median(s.deform_seconds / s.render_seconds for s in scores),
+        seconds_train=run.seconds_train,
+        step=run.step,
+        flicker=temporal["flicker"].value,
+        flicker_error=temporal["flicker_error"].value,
+        psnr_per_time=psnr_per_time((s.time, s.psnr) for s in scores),
+        reasons=reasons,
+        notes=_notes(run, scores),
+        per_view=tuple(scores),
+        psnr_person=_mean([s.psnr_person for s in scores]),
+        ssim_person=_mean([s.ssim_person for s in scores]),
+        stored_mb=1e-6 * (run_dir / COMPACT_NAME).stat().st_size if is_compact(run_dir) else None,
+    )
+    write_text(report_path(run_dir, split), report.to_json())
+    return report
+
+
+def report_path(run_dir: Path, split: str) -> Path:
+    """Where the report of ``split`` lies in a run folder."""
+    return run_dir / ("metrics.json" if split == "test" else f"metrics_{split}.json")
+
+
+def score_views(
+    scene: Scene, pictures: Iterable[Picture], options: RenderOptions, background: Tensor, lpips: Lpips
+) -> tuple[list[ViewScore], dict[str, str]]:
+    """Scores of the Gaussians against pictures, and the reasons for metrics that are None.
+
+    Args:
+        scene: what to draw, at the time of each picture.
+        pictures: truth and camera of each view, drawn one at a time.
+        options: as in training, without depth.
+        background: (3,) colour behind both the truth and the render.
+        lpips: from ``load_lpips``.
+
+    Raises:
+        DyngsError: a value that is not finite, naming the view.
+    """
+    scores: list[ViewScore] = []
+    reasons: dict[str, str] = {}
+    for picture in pictures:
+        if not scores:
+            _timed_render(scene, picture, options, background)  # the warm-up
+        rendered, seconds, deform_seconds = _timed_render(scene, picture, options, background)
+        if not rendered.isfinite().all():
+            raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
+        truth, mask = picture.composite(background), picture.mask
+        box = person_box(picture) if isinstance(scene, AvatarScene) else None
+        optional = {"flip": flip(rendered, truth, mask), "lpips": lpips(rendered, truth, mask)}
+        for name, metric in optional.items():
+            if metric.reason is not None:
+                reasons.setdefault(name, metric.reason)
+        score = ViewScore(
+            name=picture.name,
+            width=picture.cameras.width,
+            height=picture.cameras.height,
+            psnr=psnr(rendered, truth, mask),
+            ssim=ssim(rendered, truth, mask),
+            flip=optional["flip"].value,
+            lpips=optional["lpips"].value,
+            render_seconds=seconds,
+            deform_seconds=deform_seconds,
+            time=picture.time,
+            psnr_person=None if box is None else psnr(rendered[box], truth[box], None if mask is None else mask[box]),
+            ssim_person=None if box is None else ssim(rendered[box], truth[box], None if mask is None else mask[box]),
+        )
+        _require_finite(score, mask)
+        scores.append(score)
+    return scores, reasons
+
+
+def person_box(picture: Picture) -> tuple[slice, slice] | None:
+    """Rows and columns of the smallest box around what is not transparent; None without alpha or where nothing is."""
+    if picture.alpha is None or not bool((picture.alpha > 0).any()):
+        return None
+    shown = picture.alpha > 0
+    rows, columns = (torch.nonzero(shown.any(axis))[:, 0] for axis in (1, 0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def split_views(capture: Capture, split: str) -> Sequence[View]:
+    """Views of a split, at least one. Raises DyngsError that lists the splits which there are."""
+    views = {name: views for name, views in capture.splits.items() if views}
+    for name, found in views.items():
+        if name == split:
+            return found
+    there = ", ".join(f"{name} ({len(found)} views)" for name, found in views.items())
+    raise DyngsError(f"{capture.root}: the split {split!r} has no views; there is {there or 'none'}")
+
+
+def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
+    """The scene of a run as the views of ``split`` show it: a person plays the clip of that split.
+
+    Frames that were trained on keep their refined poses; others have those of their files.
+    """
+    if not isinstance(run.scene, AvatarScene) or capture.body is None:
+        return run.scene
+    given, trained = capture.body[cast(Split, split)], capture.body["train"]
+    if same_clip(given, trained):
+        return run.scene
+    shown = footage(capture.root, given, split_views(capture, split), run.scene.given_joints)
+    return run.scene.playing(shown.clip)
+
+
+def render_options(model: SceneModel) -> RenderOptions:
+    """How a model wants to be drawn."""
+    return RenderOptions(
+        near=model.near,
+        eps2d=model.eps2d,
+        mode=model.rasterize_mode,
+        alpha_min=model.alpha_min,
+        transmittance_min=model.transmittance_min,
+    )
+
+
+def parameter_megabytes(scene: Scene) -> float:
+    """Size in MB (1e6 bytes) as float32: 236 bytes per Gaussian at SH degree 3, the field, and masks bit by bit.
+
+    Harmonics of a Gaussian that are all zero beyond the base colour do not count.
+    """
+    shapes = sum(x.numel() for name, x in scene.gaussians.tensors().items() if name != "sh")
+    masks = scene.masks if isinstance(scene, TrainedScene) else None
+    bits = 0.0 if masks is None else 1e-6 * masks.bits.numel()
+    return 4e-6 * (shapes + num_colour_values(scene) + scene.num_field_values) + bits
+
+
+def _timed_render(
+    scene: Scene, picture: Picture, options: RenderOptions, background: Tensor
+) -> tuple[Tensor, float, float]:
+    """(H, W, 3) rendered picture, the seconds that it took, and those of them that the deformation took."""
+    with torch.no_grad():
+        start = time.perf_counter()
+        moment = moment_of(scene, picture.time)
+        deformed = time.perf_counter()
+        rendering = moment.seen_by(picture.cameras, options, background)
+        end = time.perf_counter()
+    return rendering.rgb[0], end - start, deformed - start
+
+
+def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
+    """What a reader of the numbers should know."""
+    notes = []
+    if run.config.data.background == "random":
+        notes.append("trained on random backgrounds, evaluated on black")
+    if isinstance(run.config.model, DynamicModel) and run.scene.is_still:
+        notes.append("the model is dynamic, but nothing moves in it: it is drawn as fast as a static one")
+    if len({(s.width, s.height) for s in scores}) > 1:
+        notes.append("views differ in size; width and height are those of the first")
+    return tuple(notes)
+
+
+def _require_finite(score: ViewScore, mask: Tensor | None) -> None:
+    for name in ("psnr", "ssim", "flip", "lpips"):
+        value = getattr(score, name)
+        if value is not None and not math.isfinite(value):
+            empty = mask is not None and not bool((mask > 0).any())
+            why = "its mask ignores every pixel" if empty else "the picture holds NaN or Inf"
+            raise DyngsError(f"view {score.name!r}: {name} is not finite, {why}")
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if len(known) == len(values) else None
+
+
+@contextmanager
+def _num_threads(threads: int) -> Iterator[None]:
+    """Run the block with ``threads`` threads (0 = as they are)."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,164 @@
+"""What a model does over time: its quality at each moment, and how much its pictures flicker before a fixed camera.
+
+Both measures of flicker are in grey levels of 255 and mean absolute values over pixels, channels and moments, of
+pictures clamped to [0, 1]. Local letters: R a rendered picture, G the true one, t its time, k moments in order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.data.capture import View
+from dyngs.data.frame_selection import standing_cameras
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.errors import DyngsError
+from dyngs.evaluate.metrics import MetricValue
+from dyngs.rendering import RenderOptions
+from dyngs.scene import Scene, moment_of
+
+MAX_MOMENTS = 60
+"""Up to so many training times, flicker is measured at all of them."""
+
+_SAMPLED_TRIPLES = MAX_MOMENTS // 3
+_NO_TIMES = "the pictures have no times"
+
+
+@dataclass(frozen=True)
+class TimeScore:
+    """PSNR (dB) at one moment: the mean of the views taken then."""
+
+    time: float
+    psnr: float
+    num_views: int
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A scene and how it is drawn.
+
+    Attributes:
+        scene: Gaussians at any time.
+        options: as in training, without depth.
+        background: (3,) colour.
+    """
+
+    scene: Scene
+    options: RenderOptions
+    background: Tensor
+
+    @torch.no_grad()
+    def picture(self, cameras: Cameras, time: float | None) -> Tensor:
+        """(H, W, 3) what the one camera sees at ``time``, clamped to [0, 1]."""
+        return moment_of(self.scene, time).seen_by(cameras, self.options, self.background).rgb[0].clamp(0, 1)
+
+
+def clamped_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
+    """``times`` within [0, 1], and a line of warning where one was not.
+
+    Raises:
+        DyngsError: a time that is not finite.
+    """
+    if not all(math.isfinite(t) for t in times):
+        raise DyngsError(f"times must be finite numbers in [0, 1], got {', '.join(f'{t:g}' for t in times)}")
+    inside = tuple(min(max(float(t), 0.0), 1.0) for t in times)
+    count = sum(a != b for a, b in zip(times, inside, strict=True))
+    if not count:
+        return inside, ()
+    return inside, (f"{count} of {len(times)} times lie outside [0, 1] and were clamped to it",)
+
+
+def psnr_per_time(scores: Iterable[tuple[float | None, float]]) -> tuple[TimeScore, ...]:
+    """PSNR at each distinct time, ascending, from (time, psnr) of the views; those without a time are left out."""
+    found: defaultdict[float, list[float]] = defaultdict(list)
+    for time, value in scores:
+        if time is not None:
+            found[time].append(value)
+    return tuple(TimeScore(time, fmean(values), len(values)) for time, values in sorted(found.items()))
+
+
+def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> MetricValue:
+    """Mean of |R_{k+1} - 2 R_k + R_{k-1}| x 255: the second difference in time, before one camera, without any truth.
+
+    Smooth motion has little of it, flickering much. Where moments are not evenly spaced, R_k is compared with the
+    straight line between its neighbours: 2 |w R_{k-1} + (1 - w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} -
+    t_{k-1}), which is the same for even ones. Of more than 60 moments, 20 triples of neighbours are taken, evenly
+    spread. A scene in which nothing moves has 0.
+
+    Args:
+        drawing: what is drawn.
+        cameras: one camera.
+        times: distinct, ascending; those of training.
+    """
+    if drawing.scene.is_still:
+        return MetricValue(0.0)
+    if len(times) < 3:
+        return MetricValue(None, f"needs at least three training times, there are {len(times)}")
+    seen: dict[int, Tensor] = {}
+    values = []
+    for k in _middles(len(times)):
+        seen = {i: seen[i] if i in seen else drawing.picture(cameras, times[i]) for i in (k - 1, k, k + 1)}
+        before, now, after = (times[i] for i in (k - 1, k, k + 1))
+        line = torch.lerp(seen[k + 1], seen[k - 1], (after - now) / (after - before))
+        values.append(2 * 255 * _mean_change(line, seen[k]))
+    return MetricValue(fmean(values))
+
+
+def flicker_error(drawing: Drawing, loader: PictureLoader, views: Sequence[View]) -> MetricValue:
+    """Mean of |(R_{k+1} - R_k) - (G_{k+1} - G_k)| x 255: how wrongly pictures change, before the cameras that stand.
+
+    Over all neighbours in time of each pose that has several times; a mask leaves out what does not count in one of
+    the two. Something that should move but does not has it, as has everything that flickers.
+
+    Args:
+        drawing: what is drawn.
+        loader: pictures of ``views``, in their order.
+        views: one split.
+    """
+    if all(view.time is None for view in views):
+        return MetricValue(None, _NO_TIMES)
+    total, weight = 0.0, 0.0
+    for indices in standing_cameras(views):
+        errors = (_signed_error(drawing, loader[i]) for i in indices)
+        before, counted = next(errors)
+        for now, counts in errors:
+            weights = torch.minimum(counted, counts)
+            total += float(((now - before).abs().mean(-1) * weights).double().sum())
+            weight += float(weights.double().sum())
+            before, counted = now, counts
+    if not weight:
+        return MetricValue(None, "no camera of this split stands still while time passes")
+    return MetricValue(255 * total / weight)
+
+
+def flicker_of_split(drawing: Drawing, loader: PictureLoader, views: Sequence[View]) -> MetricValue:
+    """``flicker`` before the first camera of the split, at the training times."""
+    if all(view.time is None for view in views):
+        return MetricValue(None, _NO_TIMES)
+    return flicker(drawing, loader[0].cameras, drawing.scene.times)
+
+
+def _middles(num_times: int) -> list[int]:
+    """Which moments are compared with their neighbours."""
+    if num_times <= MAX_MOMENTS:
+        return list(range(1, num_times - 1))
+    return np.linspace(1, num_times - 2, _SAMPLED_TRIPLES).round().astype(int).tolist()
+
+
+def _signed_error(drawing: Drawing, picture: Picture) -> tuple[Tensor, Tensor]:
+    """(H, W, 3) render minus truth, and (H, W) what counts: R' - R - (G' - G) is the difference of two of them."""
+    truth = picture.composite(drawing.background).clamp(0, 1)
+    counts = torch.ones(truth.shape[:2]) if picture.mask is None else picture.mask
+    return drawing.picture(picture.cameras, picture.time) - truth, counts
+
+
+def _mean_change(a: Tensor, b: Tensor) -> float:
+    return float((a - b).abs().double().mean())

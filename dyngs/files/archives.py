@@ -1,0 +1,84 @@
+"""Arrays in ``.npz`` archives of others: only those that are asked for, and nothing allocated before it is checked."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from dyngs.errors import DyngsError, reading, reason
+from dyngs.files.limits import require_at_most
+
+MOST_BYTES = 1 << 29
+"""Of the arrays that are read of one file, each number counted as 8 at least. SMPL-X has half as many."""
+_HIGHEST_RATIO = 1032
+"""Of deflate: more is a lie of the directory."""
+_CHUNK = 1 << 20
+
+
+def read_arrays(path: Path, choose: Callable[[Collection[str]], Iterable[str]]) -> dict[str, np.ndarray]:
+    """The arrays of numbers or text in a ``.npz`` that ``choose`` picks of the names in it; others are not touched.
+
+    Raises:
+        DyngsError: the file is missing or damaged, or what is picked holds objects or takes more than ``MOST_BYTES``.
+    """
+    if path.exists() and not path.is_file():
+        raise DyngsError(f"{path}: is no file; name a .npz")
+    advice = "it is not a .npz, or a damaged one: copy it again"
+    with reading(path, advice), path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        picked = {name: members[name] for name in choose(members)}
+        total = sum(info.file_size for info in picked.values())
+        require_at_most(path, total, MOST_BYTES, "bytes of arrays")
+        found, total = {}, 0
+        for name, info in picked.items():
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"'{name:.40}' is packed in a way that NumPy does not write")
+            if info.file_size > _HIGHEST_RATIO * info.compress_size + _CHUNK:
+                raise ValueError(f"'{name:.40}' cannot be as large as the archive says")
+            with archive.open(info) as stream:
+                found[name] = _array(path, name, info.file_size, stream, total)
+            total += _weight(found[name].shape, found[name].dtype)
+        return found
+
+
+def require_text(raw: bytes | bytearray, dtype: np.dtype) -> None:
+    """Check that the bytes of an array are text, if its type says so. Raises ValueError."""
+    if dtype.kind == "U" and (np.frombuffer(raw, dtype.byteorder + "u4") > 0x10FFFF).any():
+        raise ValueError("an array of text in it holds what is no text")
+
+
+def _array(path: Path, name: str, size: int, stream: IO[bytes], before: int) -> np.ndarray:
+    """An array; ``before`` are the bytes of those read earlier."""
+    try:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, by_columns, dtype = read(stream)
+        if dtype.kind not in "biufcSU":
+            raise ValueError("it holds Python objects" if dtype.hasobject else f"it is of type {dtype!s:.40}")
+        require_at_most(path, before + _weight(shape, dtype), MOST_BYTES, "bytes of arrays")
+        count = math.prod(shape) * dtype.itemsize
+        if min(shape, default=0) < 0 or size - stream.tell() < count:
+            raise ValueError("it is shorter than its shape")
+        raw = bytearray(count)
+        view = memoryview(raw)
+        for start in range(0, count, _CHUNK):
+            part = stream.read(min(_CHUNK, count - start))
+            view[start : start + len(part)] = part
+        stream.read()  # whose end checks the sum
+        require_text(raw, dtype)
+        return np.frombuffer(raw, dtype, math.prod(shape)).reshape(shape, order="F" if by_columns else "C")
+    except DyngsError:
+        raise
+    except Exception as error:  # NumPy reads the header as Python text; a damaged one raises nearly anything
+        raise DyngsError(
+            f"{path}: '{name:.40}' is not an array of numbers ({reason(error)}); export it again"
+        ) from error
+
+
+def _weight(shape: tuple[int, ...], dtype: np.dtype) -> int:
+    return math.prod(shape) * max(dtype.itemsize, 8)

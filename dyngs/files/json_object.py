@@ -1,0 +1,29 @@
+"""Reading a JSON file that must be an object, with one clear line for whatever is wrong with it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from dyngs.errors import DyngsError, reading
+from dyngs.files.trust import inside
+
+
+def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, object]:
+    """The object in ``path``; a byte order mark is allowed.
+
+    Args:
+        what: said of a file that holds something else than an object.
+
+    Raises:
+        DyngsError: unreadable, broken JSON (with line and column), or no object.
+    """
+    with reading(path, "it must be a JSON file; copy or export it again"):
+        try:
+            fields = json.loads(inside(path).read_text(encoding="utf-8-sig"))
+        except json.JSONDecodeError as error:
+            where = f"{path}, line {error.lineno} column {error.colno}"
+            raise DyngsError(f"{where}: broken JSON ({error.msg}); copy or export it again") from error
+    if not isinstance(fields, dict):
+        raise DyngsError(f"{path}: {what}")
+    return fields

@@ -1,0 +1,111 @@
+"""Files that appear whole or not at all, pictures among them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+
+from dyngs.errors import DyngsError
+from dyngs.files.picture_errors import picture_error
+from dyngs.files.temporary import temporary_beside
+
+
+@contextmanager
+def whole_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
+    """A temporary path beside ``path`` that takes its place when the block ends well, and vanishes otherwise.
+
+    The folder is made where it is missing; the temporary name keeps the suffix, by which writers choose the format.
+
+    Args:
+        path: of the file.
+        durable: also wait until the disk has it, so that a power cut leaves the old file or the new one, never a name
+            without its data.
+
+    Raises:
+        DyngsError: the folder cannot be made or the file cannot be written.
+    """
+    try:
+        temporary = temporary_beside(path)
+    except OSError as error:
+        raise DyngsError(f"cannot write {path}: {error.strerror or error}") from error
+    try:
+        yield temporary
+        if durable:
+            _flush_file(temporary)
+        os.replace(temporary, path)
+        if durable:
+            _flush_folder(path.parent)
+    except OSError as error:
+        raise DyngsError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _flush_file(path: Path) -> None:
+    file = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
+
+
+def _flush_folder(folder: Path) -> None:
+    """Wait until the disk has the names in ``folder``, where the system can do that."""
+    with suppress(OSError):
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
+
+
+def write_text(path: Path, text: str, *, durable: bool = False) -> None:
+    """Write ``text`` as UTF-8, atomically; ``durable`` as in ``whole_file``."""
+    with whole_file(path, durable=durable) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_image(path: Path, pixels: np.ndarray) -> None:
+    """Write a picture, atomically; the suffix names the format.
+
+    Args:
+        path: ``.png`` or ``.jpg`` (8 bit), ``.exr`` (float32), or what else OpenImageIO writes.
+        pixels: (H, W) or (H, W, C); uint8 as it is, or floats, which are clamped to [0, 1] for 8-bit formats. A fourth
+            channel is alpha: straight for PNG, premultiplied for EXR, as these formats want it.
+
+    Raises:
+        DyngsError: unknown suffix, a full disk, and the like.
+    """
+    import OpenImageIO as oiio
+
+    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    if pixels.ndim != 3 or 0 in pixels.shape:
+        raise ValueError(f"pixels must be (H, W) or (H, W, C), got {pixels.shape}")
+    if path.suffix.lower() == ".exr":
+        pixels, kind = pixels.astype(np.float32), oiio.FLOAT
+    else:
+        pixels, kind = to_uint8(pixels), oiio.UINT8
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, kind)
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    with whole_file(path) as temporary:
+        output = oiio.ImageOutput.create(str(temporary))
+        if output is None:
+            picture_error(oiio)  # fetched, or it would be printed when the program ends
+            raise DyngsError(f"cannot write {path}: no format has the suffix '{path.suffix}' (use .png or .exr)")
+        written = output.open(str(temporary), spec) and output.write_image(np.ascontiguousarray(pixels))
+        problem = picture_error(output)
+        if not (output.close() and written):
+            raise DyngsError(f"cannot write {path}: {problem or picture_error(output) or 'unknown error'}")
+
+
+def to_uint8(pixels: np.ndarray) -> np.ndarray:
+    """The same picture as uint8; floats in [0, 1] are rounded, NaN becomes 0."""
+    if pixels.dtype == np.uint8:
+        return pixels
+    clean = np.nan_to_num(pixels.astype(np.float32), nan=0.0)
+    return (np.clip(clean, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

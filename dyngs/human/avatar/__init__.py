@@ -1,0 +1,1 @@
+"""The avatar: Gaussians on a body template, posed by its skeleton."""

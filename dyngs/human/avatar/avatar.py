@@ -1,0 +1,246 @@
+"""Gaussians on the texels of a body template's atlas, and how a pose moves them.
+
+Local letters: N Gaussians, J joints, K joints that one Gaussian follows, P texels, M vertices and T triangles of the
+template.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from dyngs.conventions import num_sh_terms
+from dyngs.gaussians import Gaussians
+from dyngs.human.motion.clips import Clip
+from dyngs.human.pose.covariance import moved_axes
+from dyngs.human.pose.polar import nearest_rotations, quats_of
+from dyngs.human.pose.skinning import apply, blended, joint_transforms, rotations
+from dyngs.human.template.body import Body
+from dyngs.human.template.uv import Texels, shells
+
+FOLLOWED = 8
+"""Joints that one Gaussian follows at most; the template's vertices follow no more."""
+
+_WIDTH, _THICKNESS = 0.5, 0.25
+"""Standard deviations of a first Gaussian, in texels of the surface: within it, and along its normal."""
+
+_SKIN, _SHELL = 0.9, 0.1
+"""Opacities of the first Gaussians: on the lowest scaffold, and on those above it."""
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """What ties each of N Gaussians to the template: constant, row by row.
+
+    Attributes:
+        points: (N, 3) place at rest on its scaffold, m.
+        size: (N,) side of its texel, m.
+        joints: (N, K) int64 that it follows, heaviest first.
+        weights: (N, K) shares, rows sum to 1.
+        face: (N,) int64 triangle of the template in which its texel lies.
+        barycentric: (N, 3) of the texel's centre in that triangle.
+        uv: (N, 2) of the texel's centre in the atlas.
+        height: (N,) of its scaffold above the skin, m.
+    """
+
+    points: Tensor
+    size: Tensor
+    joints: Tensor
+    weights: Tensor
+    face: Tensor
+    barycentric: Tensor
+    uv: Tensor
+    height: Tensor
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, index: Tensor) -> Anchors:
+        """The rows at ``index`` (long or bool)."""
+        return Anchors(**{name: x[index] for name, x in self.tensors().items()})
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Field name to tensor."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """Joints (J, 3) at rest, m, and the parent of each, -1 for the root."""
+
+    joints: Tensor
+    parents: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class PoseShapes:
+    """What a template's vertices do at rest when joints turn: SMPL's pose blend shapes (Loper et al. 2015).
+
+    Attributes:
+        directions: (9 (J - 1), 3 M) m per unit of the rotations' difference from the identity, root left out.
+        faces: (T, 3) int64 vertices of the triangles.
+    """
+
+    directions: Tensor
+    faces: Tensor
+
+    def offsets(self, anchors: Anchors, rotations: Tensor) -> Tensor:
+        """(N, 3) m at rest: of the three vertices around each anchor, by their shares.
+
+        Args:
+            anchors: N, on this template.
+            rotations: (J, 3, 3) relative to the parent joints.
+        """
+        at_vertices = (_bends(rotations)[1:].flatten() @ self.directions).unflatten(0, (-1, 3))
+        around = self.faces.index_select(0, anchors.face)
+        parts = at_vertices.index_select(0, around.flatten()).unflatten(0, (-1, 3))
+        return (anchors.barycentric[..., None] * parts).sum(1)
+
+
+def pose_shapes(body: Body) -> PoseShapes | None:
+    """The pose blend shapes of ``body``, None where it has none; rounded to half precision, as runs store them.
+
+    Each direction errs by 2^-11 of itself at most; where random ones shift points by 1 cm, points err by 8 micrometres.
+    """
+    return None if body.pose_dirs is None else PoseShapes(body.pose_dirs.half().float(), body.faces)
+
+
+@dataclass(frozen=True)
+class Posing:
+    """One pose; differentiable.
+
+    Attributes:
+        rotations: (J, 3, 3) relative to the parent joint.
+        trans: (3,) world units, added last.
+        scale: () world units per metre.
+    """
+
+    rotations: Tensor
+    trans: Tensor
+    scale: Tensor
+
+
+def first_gaussians(texels: Texels, heights: Sequence[float], sh_degree: int) -> tuple[Gaussians, Anchors]:
+    """Grey discs on every texel, ``heights`` (m) above the surface, at rest; the lowest height is nearly opaque.
+
+    A disc lies in the tangent plane, as wide as its texel; those of one height follow those of the one before.
+    """
+    places = shells(texels, heights)
+    of = places.texel
+    size = texels.size[of]
+    joints, weights = heaviest(texels.weights)
+    rows, columns = (texels.index // texels.resolution, texels.index % texels.resolution)
+    uv = torch.stack([columns + 0.5, texels.resolution - 0.5 - rows], dim=1).to(size) / texels.resolution
+    anchors = Anchors(
+        points=places.points(texels),
+        size=size,
+        joints=joints[of],
+        weights=weights[of],
+        face=texels.faces[of],
+        barycentric=texels.barycentric[of],
+        uv=uv[of],
+        height=places.height,
+    )
+    ratios = size.new_tensor([_WIDTH, _WIDTH, _THICKNESS]).log()
+    opacity = torch.where(places.height == min(heights), _SKIN, _SHELL)
+    gaussians = Gaussians(
+        means=anchors.points.clone(),
+        quats=quats_of(texels.frames)[of],
+        log_scales=size.log()[:, None] + ratios,
+        logit_opacities=(opacity / (1 - opacity)).log().to(size),
+        sh=size.new_zeros(len(places), num_sh_terms(sh_degree), 3),
+    )
+    return gaussians, anchors
+
+
+def heaviest(weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Joints (P, K) int64 and shares (P, K), normalised, of the heaviest of ``weights`` (P, J); ties by index."""
+    count = min(FOLLOWED, weights.shape[1])
+    ordered = weights.sort(dim=1, descending=True, stable=True)
+    kept = ordered.values[:, :count]
+    return ordered.indices[:, :count].contiguous(), kept / kept.sum(1, keepdim=True)
+
+
+def skinning_weights(anchors: Anchors, num_joints: int, corrections: Tensor | None = None) -> Tensor:
+    """(N, J) shares; with ``corrections`` (N, K) those of the followed joints are w e^c, normalised.
+
+    Where a Gaussian follows one joint alone no correction does anything: they act where parts of the body meet.
+    """
+    shares = anchors.weights
+    if corrections is not None:
+        shares = shares * corrections.exp()
+        shares = shares / shares.sum(1, keepdim=True)
+    dense = shares.new_zeros(len(anchors), num_joints)
+    return dense.scatter_add(1, anchors.joints, shares)
+
+
+def posed(
+    gaussians: Gaussians, weights: Tensor, skeleton: Skeleton, posing: Posing, offsets: Tensor | None = None
+) -> Gaussians:
+    """The N Gaussians of the rest pose in another one, in the world; differentiable in everything.
+
+    x' = s T x + t with T = sum_j w_j A_j (Loper et al. 2015); covariances by the same linear map, exactly. Colours of
+    SH degree 1 are turned with its nearest rotation, so that what faced a camera at rest looks the same when turned to
+    it.
+
+    Args:
+        gaussians: at rest, m; SH degree 0 or 1.
+        weights: (N, J).
+        skeleton: J joints.
+        posing: the pose.
+        offsets: (N, 3) m, added to the means at rest; None is none.
+    """
+    transforms = blended(weights, joint_transforms(skeleton.joints, skeleton.parents, posing.rotations))
+    linear = transforms[..., :3]
+    means = gaussians.means if offsets is None else gaussians.means + offsets
+    quats, log_scales = moved_axes(linear, gaussians.quats, gaussians.log_scales)
+    return Gaussians(
+        means=posing.scale * apply(transforms, means) + posing.trans,
+        quats=quats,
+        log_scales=log_scales + posing.scale.log(),
+        logit_opacities=gaussians.logit_opacities,
+        sh=gaussians.sh if gaussians.sh.shape[1] == 1 else turned_colours(gaussians.sh, nearest_rotations(linear)),
+    )
+
+
+def offsets_at_rest(
+    anchors: Anchors, weights: Tensor, posing: Posing, shapes: PoseShapes | None, pose_dirs: Tensor | None
+) -> Tensor | None:
+    """(N, 3) what a pose adds to the places at rest, m: of the template and as learned, either of which may lack."""
+    given = None if shapes is None else shapes.offsets(anchors, posing.rotations)
+    if pose_dirs is None:
+        return given
+    learned = pose_offsets(weights, posing, pose_dirs)
+    return learned if given is None else given + learned
+
+
+def pose_offsets(weights: Tensor, posing: Posing, pose_dirs: Tensor) -> Tensor:
+    """(N, 3) offsets P vec(sum_j w_j (R_j - 1)), m, with P the ``pose_dirs`` (N, 27) as 3 x 9; the root does not count.
+
+    As SMPL's pose blend shapes (Loper et al. 2015), but learned, and only of the joints that a Gaussian follows.
+    """
+    features = weights[:, 1:] @ _bends(posing.rotations)[1:].flatten(1)
+    return (pose_dirs.unflatten(1, (3, 9)) * features[:, None]).sum(-1)
+
+
+def _bends(rotations: Tensor) -> Tensor:
+    """(J, 3, 3) difference of rotations from the identity."""
+    return rotations - torch.eye(3, dtype=rotations.dtype)
+
+
+def turned_colours(sh: Tensor, turns: Tensor) -> Tensor:
+    """(N, 4, 3) coefficients of degree 1 such that the colour seen along ``turns`` (N, 3, 3) d is what it was along d.
+
+    The terms of degree 1 are -y, z, -x: coefficients are a vector v, the colour v . d.
+    """
+    vector = torch.stack([-sh[:, 3], -sh[:, 1], sh[:, 2]], dim=1)
+    x, y, z = (turns @ vector).unbind(1)
+    return torch.stack([sh[:, 0], -y, z, -x], dim=1)
+
+
+def posing_of(clip: Clip, row: int) -> Posing:
+    """The pose of one frame of a clip."""
+    return Posing(rotations(clip.poses[row]), clip.trans[row], clip.scale[row])

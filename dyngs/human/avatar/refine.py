@@ -1,0 +1,130 @@
+"""What is learned about a body beside its Gaussians: the fit of every frame, the skeleton, the skinning weights.
+
+Body fits are never exact, and the template is not the person. Everything starts at what was given. Local letters: F
+frames, J joints, N Gaussians, K joints that one follows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyngs.config import HumanModel
+from dyngs.deform.learned import LearnedTensors
+from dyngs.human.avatar.avatar import Anchors, Posing, Skeleton, skinning_weights
+from dyngs.human.motion.clips import Clip
+from dyngs.human.pose.skinning import rotations
+
+POSE_CM = 0.05
+"""Turn of a joint, rad, that counts as much as a centimetre."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What was learned about all poses of a person.
+
+    Attributes:
+        turns: (J, 3) axis-angle, rad, applied before the given rotation of a joint.
+        log_scale: natural logarithm of the change of the template's size.
+    """
+
+    turns: Tensor
+    log_scale: float
+
+
+class Corrections:
+    """Learned differences to a clip of F frames, a skeleton and skinning weights.
+
+    Names: ``poses`` (F, J, 3) axis-angle, applied before the given rotation of a joint; ``trans`` (F, 3); ``turns``
+    (J, 3) as ``poses`` but of all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K); as an option
+    ``pose_dirs`` (N, 27), see ``dyngs.human.avatar.avatar.pose_offsets``.
+    """
+
+    def __init__(self, options: HumanModel, clip: Clip, skeleton: Skeleton, anchors: Anchors) -> None:
+        self.options = options
+        unit = float(clip.scale.mean())
+        rates = {
+            "poses": options.lr_poses,
+            "trans": options.lr_trans * unit,
+            "turns": options.lr_turns,
+            "joints": options.lr_joints,
+            "log_scale": options.lr_log_scale,
+            "weights": options.lr_weights,
+            "pose_dirs": options.lr_pose_offsets,
+        }
+        zeros = {
+            "poses": torch.zeros_like(clip.poses),
+            "trans": torch.zeros_like(clip.trans),
+            "turns": torch.zeros_like(skeleton.joints),
+            "joints": torch.zeros_like(skeleton.joints),
+            "log_scale": torch.zeros(1),
+            "weights": torch.zeros_like(anchors.weights),
+        }
+        if options.pose_offsets:
+            zeros["pose_dirs"] = torch.zeros(len(anchors), 27)
+        self.learned = LearnedTensors(zeros, rates, options.lr_decay)
+
+    @property
+    def pose_dirs(self) -> Tensor | None:
+        """(N, 27), None where they are not learned."""
+        return self.learned["pose_dirs"] if self.options.pose_offsets else None
+
+    def follow(self, source: Tensor, is_new: Tensor) -> None:
+        """Rows of Gaussians descend from ``source``."""
+        for name in ("weights", "pose_dirs"):
+            if name in self.learned:
+                self.learned.select(name, source, is_new)
+
+    def penalties(self) -> dict[str, Tensor]:
+        """Weighted mean squares: fits and weights should stay near what was given."""
+        learned, options = self.learned, self.options
+        terms = {}
+        if options.pose_weight > 0:
+            turns = (learned["poses"].square().mean() + learned["turns"].square().mean()) / POSE_CM**2
+            terms["pose"] = options.pose_weight * (turns + (100 * learned["joints"]).square().mean())
+        if "pose_dirs" in learned and options.offset_weight > 0:
+            terms["pose offsets"] = options.offset_weight * (100 * learned["pose_dirs"]).square().sum(1).mean()
+        if options.weights_weight > 0:
+            terms["skinning weights"] = options.weights_weight * learned["weights"].square().mean()
+        return terms
+
+
+def corrected_posing(learned: LearnedTensors | Mapping[str, Tensor], clip: Clip, row: int) -> Posing:
+    """The pose of frame ``row`` of the clip that was trained on."""
+    own = rotations(learned["turns"] + learned["poses"][row])
+    return Posing(
+        rotations(clip.poses[row]) @ own,
+        clip.trans[row] + learned["trans"][row],
+        clip.scale[row] * learned["log_scale"][0].exp(),
+    )
+
+
+def corrected_clip(fit: Fit, clip: Clip, poses: Tensor | None = None, trans: Tensor | None = None) -> Clip:
+    """The clip with ``fit`` applied, and with what was learned about its own ``poses`` (F, J, 3) and ``trans`` (F, 3).
+
+    The poses of ``corrected_posing`` as axis-angle vectors.
+    """
+    from scipy.spatial.transform import Rotation
+
+    own = fit.turns.expand_as(clip.poses) if poses is None else fit.turns + poses
+    given, extra = (Rotation.from_rotvec(x.detach().double().reshape(-1, 3).numpy()) for x in (clip.poses, own))
+    return replace(
+        clip,
+        poses=torch.from_numpy((given * extra).as_rotvec()).to(clip.poses).reshape(clip.poses.shape),
+        trans=clip.trans if trans is None else clip.trans + trans.detach(),
+        scale=clip.scale * math.exp(fit.log_scale),
+    )
+
+
+def corrected_skeleton(learned: LearnedTensors | Mapping[str, Tensor], skeleton: Skeleton) -> Skeleton:
+    """Joints where they were learned to be."""
+    return Skeleton(skeleton.joints + learned["joints"], skeleton.parents)
+
+
+def corrected_weights(learned: LearnedTensors | Mapping[str, Tensor], anchors: Anchors, num_joints: int) -> Tensor:
+    """(N, J) skinning weights."""
+    return skinning_weights(anchors, num_joints, learned["weights"])

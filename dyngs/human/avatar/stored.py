@@ -1,0 +1,79 @@
+"""What the tensors of a person in a file must be like, so that it can be posed and drawn.
+
+Local letters: N Gaussians, J joints, K joints that one Gaussian follows, F frames, M vertices and T triangles of the
+template.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from dyngs.gaussians import Gaussians
+from dyngs.human.motion.motion import ROWS
+from dyngs.human.pose.skinning import check_tree
+from dyngs.tensor_checks import require_indices, require_moments, require_positive, require_tensor
+
+_MOST_FACES = 2**31
+
+
+def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
+    """Nothing, if the state of a person's model fits its Gaussians.
+
+    Raises:
+        KeyError: a tensor lacks.
+        ValueError: one is not as the others have it.
+    """
+    n, j, f = len(gaussians), len(state["joints"]), len(state["clip.times"])
+    require_body(gaussians, state["parents"], j)
+    require_moments("clip.times", state["clip.times"])
+    shapes = dict.fromkeys(("joints", "learned.joints", "learned.turns"), (j, 3))
+    shapes |= dict.fromkeys(("clip.poses", "learned.poses"), (f, j, 3))
+    shapes |= dict.fromkeys(("clip.trans", "learned.trans"), (f, 3))
+    shapes |= {"clip.scale": (f,), "learned.log_scale": (1,)}
+    for name, shape in shapes.items():
+        require_tensor(name, state[name], shape)
+    require_positive("clip.scale", state["clip.scale"])
+    if not f:
+        raise ValueError("the clip has no frame")
+    prefix = "anchors."
+    require_anchors({name.removeprefix(prefix): x for name, x in state.items() if name.startswith(prefix)}, n, j)
+    if bool((state["anchors.weights"] < 0).any()) or not bool((state["anchors.weights"].sum(1) > 0).all()):
+        raise ValueError("the skinning weights of a Gaussian are no shares")
+    require_tensor("learned.weights", state["learned.weights"], tuple(state["anchors.weights"].shape))
+    if "learned.pose_dirs" in state:
+        require_tensor("learned.pose_dirs", state["learned.pose_dirs"], (n, 27))
+    if "shapes.directions" in state:
+        require_indices("anchors.face", state["anchors.face"], (n,), len(state["shapes.faces"]))
+    if "near" in state:
+        require_indices("near", state["near"], (n, None), n)
+
+
+def require_body(gaussians: Gaussians, parents: Tensor, num_joints: int) -> None:
+    """Nothing, if there are Gaussians of at most 4 harmonics, on a skeleton of a known kind. Raises ValueError."""
+    terms = gaussians.sh.shape[1]
+    if num_joints not in ROWS or terms not in (1, 4):
+        raise ValueError(f"{len(gaussians)} Gaussians of {terms} harmonics on {num_joints} joints")
+    if parents.is_floating_point() or tuple(parents.shape) != (num_joints,):
+        raise ValueError(f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({num_joints},)")
+    check_tree(tuple(parents.tolist()))
+
+
+def require_anchors(anchors: Mapping[str, Tensor], num_gaussians: int, num_joints: int) -> None:
+    """Nothing, if the anchors are those of N Gaussians on J joints. Raises KeyError or ValueError."""
+    n, k = num_gaussians, anchors["weights"].shape[-1]
+    shapes = {"points": (n, 3), "size": (n,), "barycentric": (n, 3), "uv": (n, 2), "height": (n,), "weights": (n, k)}
+    for name, shape in shapes.items():
+        require_tensor(f"anchors.{name}", anchors[name], shape)
+    require_indices("anchors.joints", anchors["joints"], (n, k), num_joints)
+    require_indices("anchors.face", anchors["face"], (n,), _MOST_FACES)
+
+
+def require_shapes(directions: Tensor, faces: Tensor, num_joints: int) -> None:
+    """Nothing, if these are pose blend shapes of a template with J joints. Raises ValueError."""
+    require_tensor("shapes.directions", directions, (9 * (num_joints - 1), None), torch.float16)
+    require_indices("shapes.faces", faces, (None, 3), directions.shape[1] // 3, torch.int32)
+    if directions.shape[1] % 3:
+        raise ValueError(f"'shapes.directions' has {directions.shape[1]} columns, not three for each vertex")

@@ -1,0 +1,162 @@
+"""Reader of AMASS motion files: ``.npz`` of SMPL, SMPL-H and SMPL-X.
+
+Local letters: J joints, F frames, B shape parameters.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from dyngs.errors import DyngsError, reading
+from dyngs.files.archives import read_arrays
+from dyngs.human.motion.motion import ROWS, Motion, Up, require_moderate, require_rate
+from dyngs.human.motion.retarget import on_floor
+from dyngs.human.template.body import Body
+
+_MODELS = {72: "smpl", 156: "smplh", 165: "smplx"}
+_PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
+"""Keys and widths of the parts of 165 numbers, in their order; all after the second may be missing."""
+_Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def read_amass(path: Path, body: Body, up: Up = "auto") -> Motion:
+    """The motion of 55 joints, y up, in float32; joints that the file lacks do not turn.
+
+    Keys: ``poses`` (F, 72, 156 or 165), or ``root_orient``, ``pose_body`` and the like; ``trans`` (F, 3);
+    ``mocap_framerate`` or ``mocap_frame_rate``; ``betas`` (B,) if known; ``scale`` (one or F) and ``up_axis`` ("y" or
+    "z") of files that dyngs or a fit wrote. The last two numbers of SMPL's 24 joints, the hands, are left out.
+
+    AMASS files are z up: unless ``up`` or the key ``up_axis`` says otherwise, a file is z up if it has no ``scale``.
+    Turned by T, it poses every vertex to T v: the root rotates about the pelvis of the shaped body, J_0, hence
+    R_0' = T R_0 and trans' = T (trans + s J_0) - s J_0.
+
+    A file without ``scale`` and ``up_axis`` was made for SMPL, SMPL-H or SMPL-X (by its width). Shape parameters that
+    ``body`` lacks are left out. If it is not of that kind, all are set to zero and the lowest vertex of the clip to
+    y = 0, as the pelvis of the file's body is not known.
+
+    Raises:
+        DyngsError: names the file and what is missing or wrong.
+    """
+    with reading(path):
+        return _motion(path, _arrays(path), body, up)
+
+
+def _motion(path: Path, arrays: dict[str, np.ndarray], body: Body, up: Up) -> Motion:
+    poses, width = _poses(path, arrays)
+    frames = len(poses)
+    trans = _numbers(path, arrays, "trans")
+    if trans.shape != (frames, 3):
+        raise DyngsError(f"{path}: 'trans' must be {frames} x 3 numbers as 'poses' has {frames} frames, {_got(trans)}")
+    betas = np.atleast_1d(_numbers(path, arrays, "betas").squeeze()) if "betas" in arrays else np.zeros(10)
+    if betas.ndim != 1:
+        raise DyngsError(f"{path}: 'betas' must be one row of numbers, {_got(betas)}")
+    scale = _scale(path, arrays, frames)
+    is_own = "scale" in arrays or "up_axis" in arrays
+    is_other_model = not is_own and body.name != _MODELS[width]
+    if not is_own:
+        betas = np.zeros_like(betas) if is_other_model else betas[: body.num_shapes]
+    if _is_z_up(path, arrays, up):
+        pelvis = scale[:, None] * _pelvis(body, betas)
+        poses[:, 0] = (Rotation.from_matrix(_Y_UP_FROM_Z_UP) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+        trans = (trans + pelvis) @ _Y_UP_FROM_Z_UP.T - pelvis
+    values = (torch.from_numpy(x).float() for x in (poses, trans, betas, scale))
+    poses, trans, betas, scale = values
+    motion = Motion(poses, trans, betas, _fps(path, arrays), scale)
+    return on_floor(motion, body) if is_other_model else motion
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of numbers and text that matter; others, which may hold objects, are not touched."""
+    keys = ("poses", *_PARTS, "trans", "betas", "scale", "up_axis", "mocap_framerate", "mocap_frame_rate")
+    if not path.is_file():
+        raise DyngsError(f"{path}: no such file")
+    return read_arrays(path, lambda names: [key for key in keys if key in names])
+
+
+def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
+    """(F, 55, 3) axis-angle, and how many numbers a frame has in the file."""
+    if "poses" in arrays:
+        flat = _numbers(path, arrays, "poses")
+        if flat.ndim != 2 or flat.shape[1] not in _MODELS:
+            raise DyngsError(f"{path}: 'poses' must have 72, 156 or 165 numbers per frame, {_got(flat)}")
+    else:
+        flat = _joined_parts(path, arrays)
+    if not len(flat):
+        raise DyngsError(f"{path}: has no frames")
+    require_moderate(path, len(flat), 55)
+    rows = list(ROWS[flat.shape[1] // 3])
+    poses = np.zeros((len(flat), 55, 3))
+    poses[:, rows] = flat.reshape(len(flat), -1, 3)[:, : len(rows)]
+    return poses, flat.shape[1]
+
+
+def _joined_parts(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
+    missing = [key for key in ("root_orient", "pose_body") if key not in arrays]
+    if missing:
+        raise DyngsError(f"{path}: has neither 'poses' nor '{missing[0]}'; give an AMASS file of a motion")
+    frames = len(np.atleast_1d(arrays["root_orient"]))
+    parts = []
+    for key, width in _PARTS.items():
+        part = _numbers(path, arrays, key) if key in arrays else np.zeros((frames, width))
+        if part.shape != (frames, width):
+            raise DyngsError(f"{path}: '{key}' must be {frames} x {width} numbers, {_got(part)}")
+        parts.append(part)
+    return np.concatenate(parts, axis=1)
+
+
+def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str) -> np.ndarray:
+    """The finite float64 numbers at ``key``."""
+    if key not in arrays:
+        raise DyngsError(f"{path}: the key '{key}' is missing; give an AMASS file of a motion")
+    value = arrays[key]
+    if value.dtype.kind not in "fiu":
+        raise DyngsError(f"{path}: '{key}' must hold numbers, not {value.dtype}")
+    with np.errstate(invalid="ignore", over="ignore"):  # of NaN and the like, which are refused below
+        value = value.astype(np.float64)
+    if not (np.abs(value) < 1e9).all():
+        raise DyngsError(f"{path}: '{key}' holds NaN or huge numbers; repair or export it again")
+    return value
+
+
+def _fps(path: Path, arrays: dict[str, np.ndarray]) -> float:
+    key = "mocap_frame_rate" if "mocap_frame_rate" in arrays else "mocap_framerate"
+    rate = _numbers(path, arrays, key)
+    if rate.size != 1 or not rate.item() > 0:
+        raise DyngsError(f"{path}: '{key}' must be one positive number")
+    return require_rate(path, rate.item())
+
+
+def _scale(path: Path, arrays: dict[str, np.ndarray], frames: int) -> np.ndarray:
+    """(F,) of the template; 1 where nothing is said."""
+    scale = _numbers(path, arrays, "scale") if "scale" in arrays else np.ones(())
+    if scale.shape not in ((), (1,), (frames,)) or not (scale > 0).all():
+        raise DyngsError(f"{path}: 'scale' must be one positive number, or one for each of {frames} frames")
+    return np.broadcast_to(scale, frames).copy()
+
+
+def _is_z_up(path: Path, arrays: dict[str, np.ndarray], up: Up) -> bool:
+    if up != "auto":
+        return up == "z"
+    if "up_axis" not in arrays:
+        return "scale" not in arrays
+    said = str(arrays["up_axis"])
+    if said not in ("y", "z"):
+        raise DyngsError(f"{path}: 'up_axis' must be 'y' or 'z', not {said!r:.20}")
+    return said == "z"
+
+
+def _pelvis(body: Body, betas: np.ndarray) -> np.ndarray:
+    """(3,) the root joint of the shaped body at rest."""
+    pelvis = body.joints[0].double().numpy()
+    if body.joint_shape_dirs is None:
+        return pelvis
+    directions = body.joint_shape_dirs[0].double().numpy()[:, : len(betas)]
+    return pelvis + directions @ betas[: directions.shape[1]]
+
+
+def _got(value: np.ndarray) -> str:
+    return f"has {' x '.join(map(str, value.shape)) or 'one number'}"

@@ -1,0 +1,205 @@
+"""Reader of Biovision Hierarchy files (``.bvh``).
+
+Local letters: S joints of the file, F frames, C channels of all joints together.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dyngs.errors import DyngsError, reading
+from dyngs.files.limits import require_at_most
+from dyngs.human.motion.motion import chunks, require_moderate, require_rate
+from dyngs.human.motion.retarget import SourceMotion
+
+_END_SITE = -1
+_MOST_JOINTS = 4096
+_LONGEST_NAME = 200
+_CHARACTERS = 1 << 16
+"""Of the part MOTION that are parsed at once."""
+_GAP = re.compile(r"\s")
+_CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz")
+
+
+@dataclass
+class _Joint:
+    name: str
+    parent: int  # -1 for the root
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    channels: list[str] = field(default_factory=list)  # "zrotation" and the like, in the order of the file
+
+
+def read_bvh(path: Path) -> SourceMotion:
+    """The motion of the file's joints, in its own units and axes; rest is where all rotations are zero.
+
+    A joint moves relative to its parent by T R: T is its position channels, or OFFSET along axes that have none, and
+    R = R_1 R_2 R_3 its rotations about single axes, in degrees, in the order of its channels.
+
+    Raises:
+        DyngsError: names the file and what is wrong with it.
+    """
+    with reading(path):
+        hierarchy, rows = _halves(path)
+        joints = _joints(path, hierarchy)
+        values, fps = _values(path, rows, joints)
+        rotations = np.empty((len(values), len(joints), 3, 3))
+        positions = np.empty((len(values), len(joints), 3))
+        rest = np.zeros((len(joints), 3))
+        for part in chunks(len(values)):
+            rest = _place(joints, values[part], rotations[part], positions[part])
+        names = tuple(joint.name for joint in joints)
+        return SourceMotion(path, names, rest, rotations, positions, fps, world_is_y_up=False)
+
+
+def _place(joints: Sequence[_Joint], values: np.ndarray, rotations: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """(S, 3) the joints at rest; fills rotations (F, S, 3, 3) and positions (F, S, 3) of frames with values (F, C)."""
+    rest = np.zeros((len(joints), 3))
+    column = 0
+    for i, joint in enumerate(joints):
+        own = values[:, column : column + len(joint.channels)]
+        column += len(joint.channels)
+        position, rotation = _local_motion(joint.offset, joint.channels, own)
+        if joint.parent >= 0:
+            above = rotations[:, joint.parent]
+            rest[i] = rest[joint.parent] + joint.offset
+            position = positions[:, joint.parent] + (above @ position[..., None])[..., 0]
+            rotation = above @ rotation
+        positions[:, i], rotations[:, i] = position, rotation
+    return rest
+
+
+def _halves(path: Path) -> tuple[str, str]:
+    """What stands before and after the line ``MOTION``."""
+    if path.exists() and not path.is_file():
+        raise DyngsError(f"{path}: is no file; name a .bvh")
+    try:
+        text = path.read_bytes().decode("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise DyngsError(f"{path}: cannot be read ({error.strerror})") from error
+    halves = re.split(r"(?im)^[^\S\n]*MOTION[^\S\n]*$", text, maxsplit=1)
+    if not text.lstrip()[:9].upper() == "HIERARCHY":
+        raise DyngsError(f"{path}: not a BVH file: it does not begin with HIERARCHY")
+    if len(halves) < 2:
+        raise DyngsError(f"{path}: has no part MOTION; it may be cut off, export it again")
+    return halves[0].lstrip()[9:], halves[1]
+
+
+def _joints(path: Path, hierarchy: str) -> list[_Joint]:
+    """The joints, parents first."""
+    joints: list[_Joint] = []
+    lacking: set[int] = set()  # an OFFSET
+    blocks: list[int] = []  # the joints whose braces are open, _END_SITE among them
+    announced: int | None = None  # what the next brace opens
+    for line in hierarchy.replace("{", "\n{\n").replace("}", "\n}\n").splitlines():
+        words = line.split()
+        if not words:
+            continue
+        word, inside = words[0].upper(), blocks[-1] if blocks else None
+        starts_root = word == "ROOT" and inside is None and not joints
+        starts_joint = word == "JOINT" and inside is not None and inside >= 0
+        if announced is not None:
+            if word != "{":
+                raise DyngsError(f"{path}: HIERARCHY: expected a brace before '{line.strip():.60}'; export it again")
+            blocks.append(announced)
+            announced = None
+        elif (starts_root or starts_joint) and len(words) > 1:
+            announced = len(joints)
+            require_at_most(path, announced + 1, _MOST_JOINTS, "joints")
+            lacking.add(announced)
+            joints.append(_Joint(" ".join(words[1:])[:_LONGEST_NAME], -1 if inside is None else inside))
+        elif word == "END" and inside is not None and inside >= 0:
+            announced = _END_SITE
+        elif word == "}" and blocks:
+            blocks.pop()
+        elif word == "OFFSET" and inside == _END_SITE:
+            continue
+        elif word == "OFFSET" and inside is not None:
+            joints[inside].offset = _offset(path, joints[inside].name, words[1:])
+            lacking.discard(inside)
+        elif word == "CHANNELS" and inside is not None and inside >= 0:
+            joints[inside].channels = _channels(path, joints[inside].name, words[1:])
+        else:
+            raise DyngsError(f"{path}: HIERARCHY: did not expect '{line.strip():.60}'; export it again")
+    if not joints or blocks or announced is not None:
+        raise DyngsError(f"{path}: HIERARCHY is cut off or has no ROOT; export it again")
+    if lacking:
+        raise DyngsError(f"{path}: the joint '{joints[min(lacking)].name}' has no OFFSET; export it again")
+    return joints
+
+
+def _offset(path: Path, name: str, words: list[str]) -> np.ndarray:
+    offset = _numbers(path, words)
+    if len(offset) != 3:
+        raise DyngsError(f"{path}: the OFFSET of '{name}' must be three numbers; export it again")
+    return offset
+
+
+def _channels(path: Path, name: str, words: list[str]) -> list[str]:
+    channels = [word.lower() for word in words[1:]]
+    if words[:1] != [str(len(channels))] or not set(channels) <= set(_CHANNELS):
+        raise DyngsError(f"{path}: the CHANNELS of '{name}' must be a count and so many of Xposition ... Zrotation")
+    return channels
+
+
+def _values(path: Path, rows: str, joints: Sequence[_Joint]) -> tuple[np.ndarray, float]:
+    """(F, C) numbers of the frames, and frames per second."""
+    header = re.match(r"\s*Frames\s*:\s*(\d{1,9})\s+Frame\s+Time\s*:\s*(\S+)", rows, re.IGNORECASE)
+    if header is None:
+        raise DyngsError(f"{path}: MOTION must begin with 'Frames: ' and 'Frame Time: '; export it again")
+    frames, channels = int(header[1]), sum(len(joint.channels) for joint in joints)
+    seconds = _numbers(path, [header[2]]).item()
+    if not frames or not channels or not seconds > 0:
+        raise DyngsError(f"{path}: needs at least one frame, one channel and a positive Frame Time")
+    fps = require_rate(path, 1.0 / seconds if seconds > 1e-300 else math.inf)
+    if frames * channels > (len(rows) - header.end() + 1) // 2:  # each has a digit and a gap
+        count = sum(1 for _ in re.finditer(r"\S+", rows[header.end() :]))
+        raise _cut_off(path, frames, channels, count)
+    require_moderate(path, frames, len(joints))
+    values = np.empty(frames * channels)
+    count, start = 0, header.end()
+    while start < len(rows):
+        gap = _GAP.search(rows, start + _CHARACTERS)
+        end = len(rows) if gap is None else gap.start()
+        part = _numbers(path, rows[start:end].split())
+        values[count : count + len(part)] = part[: max(len(values) - count, 0)]
+        count, start = count + len(part), end
+    if count != len(values):
+        raise _cut_off(path, frames, channels, count)
+    return values.reshape(frames, channels), fps
+
+
+def _cut_off(path: Path, frames: int, channels: int, count: int) -> DyngsError:
+    return DyngsError(
+        f"{path}: says {frames} frames of {channels} numbers but holds {count} numbers; it may be cut off"
+    )
+
+
+def _numbers(path: Path, words: list[str]) -> np.ndarray:
+    """The finite float64 numbers."""
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise DyngsError(f"{path}: {error!s:.80}; export it again") from None
+    if not (np.abs(values) < 1e9).all():
+        raise DyngsError(f"{path}: holds NaN or huge numbers; export it again")
+    return values
+
+
+def _local_motion(offset: np.ndarray, channels: list[str], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(F, 3) position and (F, 3, 3) rotation relative to the parent."""
+    position = np.tile(offset, (len(values), 1))
+    rotation = Rotation.identity(len(values))
+    for channel, value in zip(channels, values.T, strict=True):
+        if channel.endswith("position"):
+            position[:, "xyz".index(channel[0])] = value
+        else:
+            axis = np.eye(3)["xyz".index(channel[0])]
+            rotation = rotation * Rotation.from_rotvec(np.radians(value)[:, None] * axis)
+    return position, rotation.as_matrix()

@@ -1,0 +1,1 @@
+"""Pose maths: rotations, linear blend skinning, moved covariances."""

@@ -1,0 +1,119 @@
+"""Gaussians moved by any linear maps: their axes and lengths afterwards, exactly, with gradients that stay finite.
+
+Local letter: N Gaussians. Inside, components come first, (3, 3, N): long rows are what elementwise operations are fast
+on.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from dyngs.human.pose.polar import quats_of
+from dyngs.ops.quaternions import unit_quats
+
+_SWEEPS = 6
+"""Most sweeps of Jacobi's method, which converges quadratically: nearly rigid maps need 1 or 2."""
+
+_BLOCK = 8192
+"""Gaussians that are worked on at a time, so that intermediate results stay in the cache."""
+
+_THINNEST = -16.0
+"""Logarithm of the smallest ratio of a Gaussian's axes that is told from zero."""
+
+_CLOSEST = 1e-4
+"""Relative gap of two squared axes below which turning one into the other changes nothing that could be seen."""
+
+
+def moved_axes(linear: Tensor, quats: Tensor, log_scales: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations wxyz (N, 4) and log scales (N, 3) of covariances T S T^T with S that of ``quats`` and ``log_scales``.
+
+    Exact for every T: with T R diag(s) = U diag(d) V^T the covariance is U diag(d^2) U^T. The gradient of U divides by
+    d_i^2 - d_j^2; where these are nearly equal, what it multiplies vanishes too, and the quotient is clipped.
+
+    Args:
+        linear: (N, 3, 3) T.
+        quats: (N, 4) wxyz of any length; zero turns nothing.
+        log_scales: (N, 3).
+    """
+    longest = log_scales.amax(-1, keepdim=True)
+    lengths = (log_scales - longest).clamp_min(_THINNEST).exp()
+    axes, moved = _Axes.apply(linear @ (rotations_of(quats) * lengths[:, None, :]))  # pyright: ignore[reportGeneralTypeIssues]
+    return quats_of(axes), moved + longest
+
+
+def rotations_of(quats: Tensor) -> Tensor:
+    """(N, 3, 3) rotations of quaternions wxyz (N, 4) of any length; of zero the identity."""
+    w, x, y, z = unit_quats(quats).T
+    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
+    xy, xz, yz, wx, wy, wz = 2 * x * y, 2 * x * z, 2 * y * z, 2 * w * x, 2 * w * y, 2 * w * z
+    rows = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+class _Axes(torch.autograd.Function):
+    """U (a rotation) and log d of M = U diag(d) V^T, the d in no order."""
+
+    @staticmethod
+    def forward(ctx: Any, matrices: Tensor) -> tuple[Tensor, Tensor]:
+        blocks = matrices.detach().permute(1, 2, 0).split(_BLOCK, dim=-1)
+        columns, turned = torch.cat([_orthogonal_columns(x.contiguous()) for x in blocks], dim=-1).split(3)
+        lengths = columns.square().sum(0).sqrt().clamp_min(torch.finfo(columns.dtype).tiny)
+        axes = columns / lengths
+        last = torch.linalg.cross(axes[:, 0], axes[:, 1], dim=0)
+        turned[:, 2] *= torch.where((last * axes[:, 2]).sum(0) < 0, -1.0, 1.0)
+        axes[:, 2] = last
+        ctx.save_for_backward(axes, lengths, turned)
+        return axes.permute(2, 0, 1), lengths.log().T
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        everything = (*ctx.saved_tensors, grads[0].permute(1, 2, 0), grads[1].T)
+        blocks = zip(*(x.split(_BLOCK, dim=-1) for x in everything), strict=True)
+        return torch.cat([_gradients(*block) for block in blocks], dim=-1).permute(2, 0, 1)
+
+
+def _gradients(axes: Tensor, lengths: Tensor, turned: Tensor, g_axes: Tensor, g_logs: Tensor) -> Tensor:
+    """(3, 3, N) gradients by M, U X V^T, from those by U and log d.
+
+    X_ij = (S_ij - S_ji) d_j / (d_j^2 - d_i^2) with S = U^T g_U, and X_kk = g_k / d_k.
+    """
+    spin = _product(axes.transpose(0, 1), g_axes)
+    spin = spin - spin.transpose(0, 1)
+    squares = lengths.square()
+    gap = squares[None] - squares[:, None]
+    least = _CLOSEST * torch.maximum(squares[None], squares[:, None])
+    inner = spin * lengths[None] * torch.where(gap.abs() < least, 0.0, 1 / gap)
+    for k in range(3):
+        inner[k, k] = g_logs[k] / lengths[k]
+    return _product(_product(axes, inner), turned.transpose(0, 1))
+
+
+def _orthogonal_columns(columns: Tensor) -> Tensor:
+    """(6, 3, N): M V with orthogonal columns above the rotations V, by one-sided Jacobi rotations (Hestenes 1958)."""
+    tiny, small = torch.finfo(columns.dtype).tiny, 4 * torch.finfo(columns.dtype).eps
+    both = torch.cat([columns, torch.eye(3, dtype=columns.dtype)[..., None].repeat(1, 1, columns.shape[-1])])
+    for _ in range(_SWEEPS if columns.shape[-1] else 0):
+        largest = columns.new_zeros(())
+        for p, q in ((0, 1), (0, 2), (1, 2)):
+            first, second = both[:, p], both[:, q]
+            a, b = (first[:3] * first[:3]).sum(0), (second[:3] * second[:3]).sum(0)
+            c, gap = 2 * (first[:3] * second[:3]).sum(0), b - a
+            largest = torch.maximum(largest, (c * c / (a * b).clamp_min(tiny)).amax())
+            c = torch.where(gap < 0, -c, c)
+            tangent = c / (gap.abs() + torch.hypot(gap, c)).clamp_min(tiny)
+            cosine = (1 + tangent * tangent).rsqrt()
+            sine = tangent * cosine
+            both[:, p], both[:, q] = cosine * first - sine * second, sine * first + cosine * second
+        if not bool(largest > small):  # c^2 / (a b) shrinks as its own square: the rest is rounding
+            break
+    return both
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """(3, 3, N) products of matrices (3, 3, N)."""
+    return (a[:, :, None] * b[None]).sum(1)

@@ -1,0 +1,1 @@
+"""Synthetic captures of dressed people."""

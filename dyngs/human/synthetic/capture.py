@@ -1,0 +1,278 @@
+"""A synthetic capture of a person: the dressed template in motion, from many cameras, with its exact pose.
+
+Pictures come from a z-buffer of triangles in numpy. It shares no formula with the rasterizer of Gaussians, so that they
+are an independent ground truth.
+
+Local letters: J joints, M vertices, T triangles, U vertices of the atlas, F frames, H hits, S texels per side.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from dyngs.data.synthetic.captures import require_new_folder
+from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
+from dyngs.errors import DyngsError
+from dyngs.files.write import write_image, write_text
+from dyngs.human.motion.motion import JOINTS, Motion, save_motion
+from dyngs.human.synthetic.clothes import atlas_of, dressed, outfit_of, texture_of, texture_places
+from dyngs.human.template.mesh import Hits, interpolated, unit, vertex_normals, visible
+
+if TYPE_CHECKING:
+    from dyngs.human.template.body import Body
+
+_FPS = 12.0
+_RADIUS = 3.5
+"""Of the ring of cameras, m."""
+_TARGET = np.array([0.0, 0.95, 0.0])
+"""What all cameras look at, m."""
+_TO_LIGHT = np.array([0.35, 0.75, 0.56])
+_AMBIENT, _DIFFUSE = 0.6, 0.45
+
+
+@dataclass(frozen=True)
+class HumanOptions:
+    """How a capture of a person is taken.
+
+    Attributes:
+        size: width and height in pixels.
+        num_frames: of the walk, which train and test show.
+        num_new: frames of the other clip, ``pose``; 0 = no such split.
+        num_cameras: training cameras, on a ring around the person.
+        num_test: test cameras, each midway between two training cameras; 0 = neither test nor ``pose``.
+        seed: of the outfit, see ``dyngs.human.synthetic.clothes.outfit_of``; one seed gives the same bytes each time.
+        samples: per pixel side.
+    """
+
+    size: int = 128
+    num_frames: int = 12
+    num_new: int = 6
+    num_cameras: int = 8
+    num_test: int = 2
+    seed: int = 0
+    samples: int = 2
+
+
+@dataclass(frozen=True)
+class PosedMesh:
+    """A textured surface as it is lit and seen; float64, m.
+
+    Attributes:
+        vertices: (M, 3) in the world.
+        faces: (T, 3) int64, counter-clockwise from outside.
+        uv: (U, 2) in [0, 1]; row of the texture = (1 - v) * S.
+        uv_faces: (T, 3) int64 into ``uv``.
+        texture: (S, S, 3) sRGB values in [0, 1].
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
+    uv_faces: np.ndarray
+    texture: np.ndarray
+
+
+def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Path:
+    """Write pictures of a walking person in the layout that ``dyngs.data.readers.body_json`` reads; returns ``out``.
+
+    Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha, sRGB), ``transforms_SPLIT.json`` (OpenGL poses, m,
+    y up, floor at y = 0), and the exact parameters of the default template, ``body_train.npz`` and ``body_pose.npz``.
+    Clothes stand away from the template; how tall the person is, is the ``scale`` of the parameters.
+    Test shows the frames of train from other cameras; ``pose`` shows another clip from these other cameras.
+
+    Raises:
+        DyngsError: nothing asked for, ``out`` holds something already, or cannot be written.
+    """
+    from dyngs.human.template.body import default_body
+
+    if min(options.size, options.num_frames, options.num_cameras, options.samples) < 1:
+        raise DyngsError("a synthetic person needs size, num_frames, num_cameras and samples of at least 1")
+    if min(options.num_new, options.num_test, options.seed) < 0:
+        raise DyngsError("a synthetic person needs num_new, num_test and seed of at least 0")
+    require_new_folder(out)
+    body = default_body()
+    outfit = outfit_of(options.seed)
+    clothed, texture = dressed(body, outfit), texture_of(body, outfit)
+    train = dict(enumerate(_ring(options.num_cameras)))
+    test = {len(train) + i: pose for i, pose in enumerate(_ring_between(options.num_test, options.num_cameras))}
+    clips = {"train": walk(body, options.num_frames)}
+    if options.num_new and test:
+        clips["pose"] = squat(body, options.num_new)
+    for name, clip in clips.items():
+        motion = replace(clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale)
+        meshes = list(_posed_meshes(clothed, motion, texture))
+        splits = {"train": train, "test": test} if name == "train" else {"pose": test}
+        for split, cameras in splits.items():
+            _write_split(out, split, meshes, cameras, options)
+        save_motion(motion, out / f"body_{name}.npz")
+    return out
+
+
+def walk(body: Body, num_frames: int) -> Motion:
+    """(F frames) three swings of legs and arms on the spot while the body turns by 50 degrees; soles at y = 0."""
+    time = np.linspace(0.0, 1.0, num_frames)
+    swing, lift = np.sin(3 * np.pi * time), 0.3 - 0.3 * np.cos(3 * np.pi * time)
+    turns = {
+        "pelvis": _turn(y=np.radians(50.0) * (time - 0.5)),
+        "spine2": _turn(y=0.2 * swing),
+        "head": _turn(y=0.5 * np.sin(2 * np.pi * time)),
+    }
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        turns |= {
+            f"{side}_hip": _turn(x=-0.5 * sign * swing),
+            f"{side}_knee": _turn(x=0.2 + 0.6 * np.maximum(-sign * swing, 0.0) + 0.3 * lift),
+            f"{side}_shoulder": _turn(x=0.6 * sign * swing, z=-sign * 1.15),
+            f"{side}_elbow": _turn(y=-sign * (0.3 + lift)),
+        }
+    return _on_floor(body, turns, num_frames)
+
+
+def squat(body: Body, num_frames: int) -> Motion:
+    """(F frames) from standing down into a squat, while the arms go up sideways; soles at y = 0."""
+    depth = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, num_frames))
+    turns = {"spine1": _turn(x=0.35 * depth), "head": _turn(x=-0.3 * depth, z=0.2 * depth)}
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        turns |= {
+            f"{side}_hip": _turn(x=-1.3 * depth, z=0.15 * sign * depth),
+            f"{side}_knee": _turn(x=1.9 * depth),
+            f"{side}_ankle": _turn(x=-0.6 * depth),
+            f"{side}_shoulder": _turn(z=sign * (-1.2 + 2.1 * depth)),
+            f"{side}_elbow": _turn(y=-0.4 * sign * depth),
+        }
+    return _on_floor(body, turns, num_frames)
+
+
+def render_mesh(mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int) -> np.ndarray:
+    """(size, size, 4) sRGB values and straight alpha in [0, 1], of ``samples`` x ``samples`` places per pixel.
+
+    Lambert: the texture's value times 0.6 + 0.45 max(n . l, 0) with n smooth over edges, at most 1; no shadows. Alpha
+    is the share of places that see the mesh, whose colours are averaged.
+
+    Args:
+        mesh: what is seen, from both sides.
+        world_from_cam: (4, 4) OpenGL pose; square pixels, centred, ``CAMERA_ANGLE_X`` across.
+        size: width and height in pixels.
+        samples: places per pixel side.
+
+    Raises:
+        ValueError: the mesh reaches behind the camera.
+    """
+    rotation, center = world_from_cam[:3, :3], world_from_cam[:3, 3]
+    x, up, back = ((mesh.vertices - center) @ rotation).T
+    if not (back < 0).all():
+        raise ValueError("all vertices must be in front of the camera")
+    focal = _focal(size)
+    image = np.stack([0.5 * size - focal * x / back, 0.5 * size + focal * up / back, -1.0 / back], axis=-1)
+    normals = vertex_normals(mesh.vertices, mesh.faces)
+    sums = np.zeros((size * size, 4))
+    for k in range(samples * samples):
+        place = np.array([(k % samples + 0.5) / samples, (k // samples + 0.5) / samples, 0.0])
+        hits = visible((image - place)[mesh.faces], size, size)
+        sums[hits.index, :3] += _lit(mesh, normals, hits)
+        sums[hits.index, 3] += 1.0
+    rgb = sums[:, :3] / np.maximum(sums[:, 3:], 1.0)
+    return np.concatenate([rgb, sums[:, 3:] / samples**2], axis=1).reshape(size, size, 4)
+
+
+def _write_split(
+    out: Path, split: str, meshes: list[PosedMesh], cameras: dict[int, np.ndarray], options: HumanOptions
+) -> None:
+    """The pictures of one split, then its JSON; nothing where it has no cameras."""
+    if not cameras:
+        return
+    frames = []
+    for i, mesh in enumerate(meshes):
+        for camera, pose in cameras.items():
+            name = f"images/{split}/f{i:03d}_c{camera:02d}.png"
+            write_image(out / name, render_mesh(mesh, pose, options.size, options.samples))
+            entry: dict[str, object] = {"file_path": name, "frame": i, "camera": camera}
+            frames.append(entry | {"time": i / max(len(meshes) - 1, 1), "transform_matrix": pose.tolist()})
+    size, focal = options.size, _focal(options.size)
+    lens = {"w": size, "h": size, "fl_x": focal, "fl_y": focal, "cx": 0.5 * size, "cy": 0.5 * size}
+    write_text(out / f"transforms_{split}.json", json.dumps(lens | {"frames": frames}, indent=1) + "\n")
+
+
+def _posed_meshes(body: Body, motion: Motion, texture: np.ndarray) -> Iterator[PosedMesh]:
+    """The mesh of each frame, posed in float64."""
+    from dyngs.human.template.body import posed_vertices
+
+    uv, uv_faces = atlas_of(body)
+    exact, faces = body.to(torch.float64), body.faces.numpy()
+    for pose, trans, scale in zip(*(x.double() for x in (motion.poses, motion.trans, motion.scale)), strict=True):
+        vertices = posed_vertices(exact, pose[None], trans[None], scale=scale[None])[0].numpy()
+        yield PosedMesh(vertices, faces, uv, uv_faces, texture)
+
+
+def _on_floor(body: Body, turns: dict[str, np.ndarray], num_frames: int) -> Motion:
+    """The motion of joints that turn by axis-angle (F, 3) or (3,), its lowest vertex at y = 0 in every frame."""
+    from dyngs.human.template.body import posed_vertices
+
+    poses = torch.zeros(num_frames, len(JOINTS), 3)
+    for name, turn in turns.items():
+        poses[:, JOINTS.index(name)] = torch.from_numpy(turn).float()
+    trans = torch.zeros(num_frames, 3)
+    exact = body.to(torch.float64)
+    for frame, pose in enumerate(poses.double()):
+        trans[frame, 1] = -posed_vertices(exact, pose[None], torch.zeros(1, 3).double())[0, :, 1].min().float()
+    return Motion(poses, trans, torch.zeros(10), _FPS, torch.ones(num_frames))
+
+
+def _turn(x: np.ndarray | float = 0.0, y: np.ndarray | float = 0.0, z: np.ndarray | float = 0.0) -> np.ndarray:
+    """(F, 3) axis-angle of turning about z, then y, then x by angles (F,) in radians, all about fixed axes."""
+    angles = np.stack(np.broadcast_arrays(np.atleast_1d(z), y, x), axis=-1)
+    return Rotation.from_euler("zyx", angles).as_rotvec()
+
+
+def _ring(count: int) -> np.ndarray:
+    """(count, 4, 4) OpenGL camera-to-world poses all around, the first one in front, low and high in turn."""
+    share = np.arange(count) / max(count, 1)
+    return _looking(2 * np.pi * share, np.where(np.arange(count) % 2 == 0, 0.9, 1.7))
+
+
+def _ring_between(count: int, others: int) -> np.ndarray:
+    """(count, 4, 4) poses on the ring of ``others``, each midway between two of them."""
+    share = (np.arange(count) * others // max(count, 1) + 0.5) / others
+    return _looking(2 * np.pi * share, np.full(count, 1.3))
+
+
+def _looking(azimuths: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """(V, 4, 4) OpenGL camera-to-world poses, y up; azimuths (V,) from +z towards +x in radians, heights (V,) in m."""
+    centers = np.stack([_RADIUS * np.sin(azimuths), heights, _RADIUS * np.cos(azimuths)], axis=-1)
+    backward = unit(centers - _TARGET)
+    right = unit(np.cross([0.0, 1.0, 0.0], backward))
+    poses = np.tile(np.eye(4), (len(centers), 1, 1))
+    poses[:, :3] = np.stack([right, np.cross(backward, right), backward, centers], axis=-1)
+    return poses
+
+
+def _focal(size: int) -> float:
+    """Pixels."""
+    return float(0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X))
+
+
+def _lit(mesh: PosedMesh, normals: np.ndarray, hits: Hits) -> np.ndarray:
+    """(H, 3) sRGB values of what is hit."""
+    uv = interpolated(hits.shares, mesh.uv[mesh.uv_faces[hits.faces]])
+    normal = unit(interpolated(hits.shares, normals[mesh.faces[hits.faces]]))
+    light = _AMBIENT + _DIFFUSE * np.maximum(normal @ unit(_TO_LIGHT), 0.0)
+    return np.minimum(_sampled(mesh.texture, uv) * light[:, None], 1.0)
+
+
+def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """(H, 3) of a texture (S, S, 3) at ``uv`` (H, 2), bilinear between the centres of texels."""
+    last = len(texture) - 1
+    column, row = (np.clip(place, 0.0, last) for place in texture_places(uv, len(texture)))
+    left, top = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
+    right, below = np.minimum(left + 1, last), np.minimum(top + 1, last)
+    x, y = (column - left)[:, None], (row - top)[:, None]
+    upper = (1 - x) * texture[top, left] + x * texture[top, right]
+    lower = (1 - x) * texture[below, left] + x * texture[below, right]
+    return (1 - y) * upper + y * lower

@@ -1,0 +1,226 @@
+"""What a synthetic person wears: colours and cut of clothes and hair, chosen by a number.
+
+Local letters: M vertices, P places, U vertices of the atlas, S texels per side.
+"""
+
+from __future__ import annotations
+
+import colorsys
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.ndimage import distance_transform_edt
+
+from dyngs.errors import DyngsError
+from dyngs.human.motion.motion import JOINTS
+from dyngs.human.template.mesh import interpolated, vertex_normals, visible
+
+if TYPE_CHECKING:
+    from dyngs.human.template.body import Body
+
+_PARTS = {
+    "eye": ("eye",),
+    "head": ("neck", "head", "jaw"),
+    "torso": ("pelvis", "spine", "collar"),
+    "arm": ("shoulder",),
+    "forearm": ("elbow",),
+    "hand": ("wrist", "index", "middle", "pinky", "ring", "thumb"),
+    "leg": ("hip", "knee"),
+    "shoe": ("ankle", "foot"),
+}
+"""The joints by which the parts of the body move, without side and number."""
+
+_BELOW_KNEE = -0.36
+"""Height in T-pose at which shorts end, m."""
+
+
+@dataclass(frozen=True)
+class Outfit:
+    """Clothes and hair of a person who stands in T-pose, and how tall the person is.
+
+    Attributes:
+        palette: by name of cloth or part: (3,) sRGB values.
+        pitch: of stripes and checks, relative to those of 0.05 m.
+        upright: the stripes on the front run from top to bottom, not across.
+        long_sleeves, long_legs: they reach down to the hands and shoes.
+        shirt, trousers, hair: how far they stand away from the skin at most, m.
+        folds: radians per metre.
+        size: of the whole person, relative to the template.
+    """
+
+    palette: dict[str, np.ndarray]
+    pitch: float = 1.0
+    upright: bool = False
+    long_sleeves: bool = False
+    long_legs: bool = True
+    shirt: float = 0.0
+    trousers: float = 0.0
+    hair: float = 0.0
+    folds: float = 20.0
+    size: float = 1.0
+
+
+def outfit_of(seed: int) -> Outfit:
+    """What the person of ``seed`` wears. 0 is the template as it is, painted; all others stand away from it by up to
+    4 cm, differ in cut and pattern, and are 0.88 to 1.04 times as tall."""
+    palette = _palette(seed)
+    if seed == 0:
+        return Outfit(palette)
+    make = np.random.default_rng([seed, 1])
+    return Outfit(
+        palette,
+        pitch=float(make.uniform(0.7, 2.5)),
+        upright=bool(make.uniform() < 0.5),
+        long_sleeves=bool(make.uniform() < 0.5),
+        long_legs=bool(make.uniform() < 0.7),
+        shirt=float(make.uniform(0.005, 0.04)),
+        trousers=float(make.uniform(0.005, 0.04)),
+        hair=float(make.uniform(0.005, 0.04)),
+        folds=float(make.uniform(10.0, 30.0)),
+        size=float(make.uniform(0.88, 1.04)),
+    )
+
+
+def dressed(body: Body, outfit: Outfit) -> Body:
+    """``body`` with the clothes as part of its surface, smooth; joints, weights and atlas stay."""
+    vertices = body.vertices.double().numpy()
+    away = _heights(vertices, _shares_of_parts(body), _left_eye(body), outfit)
+    moved = vertices + away[:, None] * vertex_normals(vertices, body.faces.numpy())
+    return replace(body, vertices=torch.from_numpy(moved).to(body.vertices))
+
+
+def texture_of(body: Body, outfit: Outfit, resolution: int = 512) -> np.ndarray:
+    """(S, S, 3) sRGB values in [0, 1] of ``outfit``, float64; left and right, front and back differ.
+
+    Texels that no triangle covers repeat the nearest that one does, so that interpolation at seams stays on the body.
+
+    Args:
+        body: a template in T-pose with texture coordinates and the 55 joints of SMPL-X.
+        outfit: what is worn.
+        resolution: S, texels per side.
+
+    Raises:
+        DyngsError: the template has no texture coordinates.
+    """
+    uv, uv_faces = atlas_of(body)
+    columns, rows = texture_places(uv, resolution)
+    hits = visible(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], resolution, resolution)
+    around = body.faces.numpy()[hits.faces]
+    points = interpolated(hits.shares, body.vertices.double().numpy()[around])
+    parts = interpolated(hits.shares, _shares_of_parts(body)[around]).argmax(axis=1)
+    texture = np.zeros((resolution * resolution, 3))
+    texture[hits.index] = _painted(points, np.array(list(_PARTS))[parts], _left_eye(body), outfit)
+    is_bare = np.ones(resolution * resolution, dtype=bool)
+    is_bare[hits.index] = False
+    near = distance_transform_edt(is_bare.reshape(resolution, -1), return_distances=False, return_indices=True)
+    row, column = np.asarray(near)
+    return texture[row * resolution + column]
+
+
+def atlas_of(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    """Texture coordinates (U, 2), float64, and the triangles (T, 3) into them.
+
+    Raises:
+        DyngsError: the template has none.
+    """
+    if body.uv is None or body.uv_faces is None:
+        raise DyngsError(f"the body template '{body.name}' has no texture coordinates; give one with a texture atlas")
+    return body.uv.double().numpy(), body.uv_faces.numpy()
+
+
+def texture_places(uv: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
+    """Column and row (U,) of a texture, whole numbers at the centres of texels, of ``uv`` (U, 2)."""
+    return uv[:, 0] * resolution - 0.5, (1.0 - uv[:, 1]) * resolution - 0.5
+
+
+def _left_eye(body: Body) -> np.ndarray:
+    """(3,)"""
+    return body.joints[JOINTS.index("left_eye")].double().numpy()
+
+
+def _shares_of_parts(body: Body) -> np.ndarray:
+    """(M, 8) how much every vertex belongs to each of ``_PARTS``; rows sum to 1."""
+    bases = [name.removeprefix("left_").removeprefix("right_").rstrip("123") for name in JOINTS]
+    member = np.array([[base in names for names in _PARTS.values()] for base in bases], dtype=np.float64)
+    return body.weights.double().numpy() @ member
+
+
+def _heights(vertices: np.ndarray, shares: np.ndarray, eye: np.ndarray, outfit: Outfit) -> np.ndarray:
+    """(M,) how far the surface lies above the skin, m."""
+    x, y, z = vertices.T
+    of = dict(zip(_PARTS, shares.T, strict=True))
+    waist, below = _step((y - 0.1) / 0.08), _step((_BELOW_KNEE - y) / 0.06)
+    sleeves = of["arm"] + (of["forearm"] if outfit.long_sleeves else 0.0)
+    legs = of["leg"] * (1.0 if outfit.long_legs else 1.0 - below) + of["torso"] * (1.0 - waist)
+    legs = legs * _step(np.abs(x) / 0.05) * (0.5 + 0.5 * _step(-y / 0.6))
+    scalp = of["head"] * np.maximum(_step((y - eye[1] - 0.03) / 0.04), _step((-0.02 - z) / 0.04))
+    scalp = scalp * _step((y - eye[1] + 0.1) / 0.06)
+    folds = 0.8 + 0.2 * np.sin(outfit.folds * (y + 0.5 * x) + 4.0 * np.arctan2(z, np.abs(x) - 0.1))
+    return folds * (outfit.shirt * (of["torso"] * waist + sleeves) + outfit.trousers * legs) + outfit.hair * scalp
+
+
+def _step(x: np.ndarray) -> np.ndarray:
+    """From 0 at 0 to 1 at 1, smoothly."""
+    x = x.clip(0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def _palette(seed: int) -> dict[str, np.ndarray]:
+    """By name of cloth or part: (3,) sRGB values; hues far from each other, in an order that ``seed`` chooses."""
+    make = np.random.default_rng(seed)
+    names = ("shirt", "stripe", "back", "left_leg", "right_leg", "left_hand", "right_hand", "left_shoe", "right_shoe")
+    hues = (make.permutation(len(names)) + make.uniform()) / len(names)
+    values = {"shirt": 0.85, "stripe": 0.95, "back": 0.6, "left_leg": 0.6, "right_leg": 0.75}
+    colors = {
+        name: np.array(colorsys.hsv_to_rgb(hue, make.uniform(0.55, 0.85), values.get(name, 0.9)))
+        for name, hue in zip(names, hues, strict=True)
+    }
+    skin, hair = make.uniform(0.35, 0.9), make.uniform(0.1, 0.5)
+    return colors | {"skin": skin * np.array([1.0, 0.8, 0.68]), "hair": hair * np.array([1.0, 0.75, 0.5])}
+
+
+def _painted(points: np.ndarray, part: np.ndarray, eye: np.ndarray, outfit: Outfit) -> np.ndarray:
+    """(P, 3) colours of places ``points`` (P, 3) of the T-pose, m; their ``part`` (P,); ``eye`` (3,) the left."""
+    x, y, z = points.T
+    is_left, is_front, side = x > 0, z > -0.02, np.abs(x)
+    palette, pitch = outfit.palette, outfit.pitch
+
+    def either(name: str) -> np.ndarray:
+        return np.where(is_left[:, None], palette[f"left_{name}"], palette[f"right_{name}"])
+
+    def striped(along: np.ndarray, width: float, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        return np.where((np.floor(along / (width * pitch)) % 2 == 0)[:, None], first, second)
+
+    def disc(center_x: float, center_y: float, radius: float) -> np.ndarray:
+        return is_front & (np.hypot(x - center_x, y - center_y) < radius)
+
+    rgb = np.broadcast_to(palette["skin"], points.shape).copy()
+    is_head, is_torso, is_leg = (part == name for name in ("head", "torso", "leg"))
+    white, black, red = np.full(3, 0.95), np.full(3, 0.08), np.array([0.75, 0.1, 0.1])
+    shirt, stripe, back = palette["shirt"], palette["stripe"], palette["back"]
+    checks = 0.65 + 0.35 * ((np.floor(y / (0.06 * pitch)) + np.floor(z / (0.06 * pitch))) % 2)
+    trousers = checks[:, None] * either("leg")
+    ahead, behind = (x, y) if outfit.upright else (y, x)
+    torso = np.where(is_front[:, None], striped(ahead, 0.05, shirt, stripe), striped(behind, 0.06, back, stripe))
+    sleeves = np.where(is_left[:, None], striped(side, 0.05, shirt, stripe), striped(side, 0.08, back, white))
+    is_sleeve = (part == "arm") | ((part == "forearm") & outfit.long_sleeves)
+    is_leg = is_leg & (outfit.long_legs | (y > _BELOW_KNEE))
+    for where, colors in (
+        (is_torso, torso),
+        (is_torso & disc(0.09, 0.47, 0.05), white),
+        (is_torso & (y < 0.18), black),
+        (is_leg | (is_torso & (y < 0.14)), trousers),
+        (is_sleeve, sleeves),
+        ((part == "forearm") & is_left & (np.abs(side - 0.62) < 0.03), black),
+        (part == "hand", either("hand")),
+        (part == "shoe", either("shoe")),
+        (is_head & ((y > eye[1] + 0.05) | (~is_front & (y > eye[1] - 0.06))), palette["hair"]),
+        (is_head & (disc(eye[0], eye[1], 0.02) | disc(-eye[0], eye[1], 0.02)), black),
+        (part == "eye", white),
+        (is_head & (np.hypot(x / 2.5, y - eye[1] + 0.075) < 0.011) & (z > 0.05), red),
+        (is_head & disc(eye[0] + 0.012, eye[1] - 0.042, 0.014), palette["left_hand"]),
+    ):
+        rgb[where] = colors[where] if colors.ndim == 2 else colors
+    return rgb

@@ -1,0 +1,1 @@
+"""Body templates: files, rest shape, skinning weights, texture atlas."""

@@ -1,0 +1,255 @@
+"""Checkpoints and run folders.
+
+A run folder holds ``config.yaml`` (resolved), ``checkpoints/step_0007000.safetensors``, ``timing.json`` and
+``log.jsonl``. Equal runs write equal checkpoint bytes: wall time is kept in ``timing.json``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dyngs.colour.network import network_of
+from dyngs.config import Config, HumanModel, HumanNetModel, SceneModel
+from dyngs.config.io import load_resolved
+from dyngs.conventions import RasterizeMode
+from dyngs.deform.trained import trained_scene
+from dyngs.errors import DyngsError, reading, require_regular
+from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
+from dyngs.files.write import write_text
+from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.trained import trained_avatar
+from dyngs.scene import Scene
+from dyngs.storage.file import read_scene
+
+KEEP_CHECKPOINTS = 2
+TIMING_NAME = "timing.json"
+COMPACT_NAME = "scene.dyngs"
+"""Of the file that holds a run that is done in little space, see ``dyngs.storage``."""
+_KIND = FileKind("dyngs", "a checkpoint", 1)
+OTHER_CONFIG = "was its config changed? Otherwise train anew"
+"""Advice where a checkpoint and its run do not fit together."""
+MAX_STEP = 2**53
+BACKGROUNDS = ("white", "black", "random")
+
+
+@dataclass(frozen=True)
+class CheckpointInfo:
+    """What a checkpoint says of itself.
+
+    Attributes:
+        step: steps done.
+        extent: of the scene, world units.
+        world_offset: add it to the means to get the capture's own coordinates.
+        background: resolved choice: "white", "black" or "random".
+        rasterize_mode: how the Gaussians want to be drawn.
+    """
+
+    step: int
+    extent: float
+    world_offset: tuple[float, float, float]
+    background: str
+    rasterize_mode: str
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Everything that a run needs to go on: named tensors and a few values."""
+
+    info: CheckpointInfo
+    tensors: dict[str, Tensor]
+    path: Path | None = field(default=None, compare=False)
+    """Of the file that it was read from."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return f"the checkpoint of step {self.info.step}" if self.path is None else str(self.path)
+
+    def part(self, prefix: str) -> dict[str, Tensor]:
+        """The tensors whose names start with ``prefix.``, without it."""
+        return {name[len(prefix) + 1 :]: x for name, x in self.tensors.items() if name.startswith(f"{prefix}.")}
+
+
+@dataclass(frozen=True)
+class LoadedRun:
+    """A trained model, ready to be drawn.
+
+    Attributes:
+        config: the resolved configuration.
+        scene: what is drawn at any time.
+        step, seconds_train: how far and how long it was trained (0 s where ``timing.json`` is lost).
+        info: of the checkpoint.
+    """
+
+    config: Config
+    scene: Scene
+    step: int
+    seconds_train: float
+    info: CheckpointInfo
+
+
+def checkpoint_paths(run_dir: Path) -> list[Path]:
+    """The run's checkpoints, oldest first."""
+    found = (run_dir / "checkpoints").glob("step_*.safetensors")
+    return sorted((f for f in found if re.fullmatch(r"step_[0-9]+", f.stem)), key=step_of)
+
+
+def remove_old_checkpoints(run_dir: Path) -> None:
+    """Remove all but the newest ``KEEP_CHECKPOINTS`` of a run."""
+    for old in checkpoint_paths(run_dir)[:-KEEP_CHECKPOINTS]:
+        old.unlink(missing_ok=True)
+
+
+def step_of(path: Path) -> int:
+    """Steps done, by the name of a checkpoint."""
+    return int(path.stem.removeprefix("step_"))
+
+
+def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float) -> Path:
+    """The new checkpoint's path; written atomically, the oldest but ``KEEP_CHECKPOINTS`` are then removed.
+
+    Raises:
+        DyngsError: a model with values that are not finite (earlier checkpoints stay), a full disk, and the like.
+    """
+    tensors = {name: x.detach().contiguous() for name, x in checkpoint.tensors.items()}
+    for name, x in tensors.items():
+        if name.startswith(("gaussians.", "model.")) and not bool(torch.isfinite(x).all()):
+            field, step = name.removeprefix("gaussians.").removeprefix("model."), checkpoint.info.step
+            raise DyngsError(f"{run_dir}: {field} is not finite after step {step}; not saved. {last_good(run_dir)}")
+    path = run_dir / "checkpoints" / f"step_{checkpoint.info.step:07d}.safetensors"
+    # Its time first: a checkpoint whose time is lost by a kill between the two would go on as if it had taken none.
+    _write_seconds(run_dir, checkpoint.info.step, seconds_train)
+    write_tensors(path, _KIND, tensors, asdict(checkpoint.info), ", then `dyngs train --resume`")
+    remove_old_checkpoints(run_dir)
+    return path
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """The checkpoint in ``path``.
+
+    Raises:
+        DyngsError: a file that is missing, truncated, altered, or of another version; names an older one if there is.
+    """
+    header, tensors = read_tensors(path, _KIND, _instead_of(path))
+    with reading(path, _instead_of(path).removeprefix("; ")):
+        return Checkpoint(info_of(header), tensors, path)
+
+
+def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
+    """What the header of a file says.
+
+    Raises:
+        KeyError: something lacks.
+        ValueError, TypeError: a value is of another kind or out of range.
+    """
+    step, (x, y, z) = header["step"], (float(value) for value in header["world_offset"])
+    extent, background, mode = float(header["extent"]), header["background"], header["rasterize_mode"]
+    if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step <= MAX_STEP:
+        raise ValueError(f"its step is {step!r:.60}")
+    if not all(math.isfinite(value) for value in (extent, x, y, z)) or extent < 0:
+        raise ValueError("its extent or its world_offset is no such number")
+    if background not in BACKGROUNDS or mode not in {mode.value for mode in RasterizeMode}:
+        raise ValueError(f"its background is {background!r:.60}, its rasterize_mode {mode!r:.60}")
+    return CheckpointInfo(step, extent, (x, y, z), background, mode)
+
+
+def latest_checkpoint(run_dir: Path) -> Checkpoint:
+    """The newest checkpoint of a run, which may be training. Raises DyngsError if there is none or it is damaged."""
+    while True:
+        paths = checkpoint_paths(run_dir)
+        if not paths:
+            raise DyngsError(f"{run_dir}: no checkpoints there; give the folder of a run that has trained")
+        try:
+            return load_checkpoint(paths[-1])
+        except DyngsError:
+            if paths[-1].exists():
+                raise  # otherwise its run has saved twice since it was found
+
+
+def load_run(run_dir: Path) -> LoadedRun:
+    """The model of a run folder at its newest checkpoint, or of its compact file where it has no checkpoints.
+
+    Raises:
+        DyngsError: no run folder, no checkpoint, or a damaged one.
+    """
+    config = load_resolved(run_dir)
+    if isinstance(config.model, HumanNetModel):
+        raise DyngsError(f"{run_dir}: a network, not a scene; `dyngs predict {run_dir} CAPTURE --out RUN` makes one")
+    checkpoint = _compact_checkpoint(run_dir) if is_compact(run_dir) else latest_checkpoint(run_dir)
+    scene = stored_scene(checkpoint, config.model)
+    step = checkpoint.info.step
+    return LoadedRun(config, scene, step, seconds_at(run_dir, step), checkpoint.info)
+
+
+def is_compact(run_dir: Path) -> bool:
+    """Whether the run is only there as the file that ``dyngs export --format compact`` writes."""
+    return (run_dir / COMPACT_NAME).is_file() and not checkpoint_paths(run_dir)
+
+
+def _compact_checkpoint(run_dir: Path) -> Checkpoint:
+    """What drawing needs; it cannot be trained on."""
+    path = run_dir / COMPACT_NAME
+    stored = read_scene(path)
+    with reading(path):
+        return Checkpoint(info_of(stored.info.model_dump()), stored.tensors, path)
+
+
+def stored_scene(checkpoint: Checkpoint, model: SceneModel) -> Scene:
+    """The scene of a checkpoint of ``model``.
+
+    Raises:
+        DyngsError: a tensor lacks, or is not as the model or the other tensors have it; names the file.
+    """
+    with reading(checkpoint.name, OTHER_CONFIG):
+        try:
+            gaussians, state = Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
+            colour = network_of(checkpoint.part("model.colour"))
+            if isinstance(model, HumanModel):
+                return replace(trained_avatar(gaussians, state), colour=colour)
+            return replace(trained_scene(gaussians, state, model), colour=colour)
+        except KeyError as missing:
+            raise DyngsError(f"{checkpoint.name} lacks {missing}; an earlier version wrote it: train anew") from None
+
+
+def last_good(run_dir: Path) -> str:
+    """A sentence that names the newest checkpoint, or says that there is none."""
+    paths = checkpoint_paths(run_dir)
+    return f"The last good checkpoint is {paths[-1]}" if paths else "There is no checkpoint yet"
+
+
+def seconds_at(run_dir: Path, step: int) -> float:
+    """Training time up to the checkpoint of ``step``, over all resumes; 0 where it is not known."""
+    return _read_seconds(run_dir).get(str(step), 0.0)
+
+
+def _read_seconds(run_dir: Path) -> dict[str, float]:
+    try:
+        require_regular(run_dir / TIMING_NAME)
+        stored = json.loads((run_dir / TIMING_NAME).read_text(encoding="utf-8"))
+        known = {str(int(step)): float(seconds) for step, seconds in stored["seconds_train"].items()}
+        return {step: seconds for step, seconds in known.items() if math.isfinite(seconds)}
+    except Exception:  # a lost or damaged file costs no more than the times
+        return {}
+
+
+def _write_seconds(run_dir: Path, step: int, seconds: float) -> None:
+    known = {s: value for s, value in _read_seconds(run_dir).items() if int(s) < step}
+    known[str(step)] = round(seconds, 3)
+    write_text(run_dir / TIMING_NAME, json.dumps({"seconds_train": known}) + "\n")
+
+
+def _instead_of(path: Path) -> str:
+    """What to do about a damaged checkpoint."""
+    older = [p for p in checkpoint_paths(path.parent.parent) if step_of(p) < step_of(path)]
+    if older:
+        return f"; delete it to go on from the previous one, {older[-1].name}"
+    return "; there is no older one, train anew"

@@ -1,0 +1,197 @@
+"""What a run folder holds, whether a new run may begin there, and what a killed process left in it."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from dyngs.config import Config, RunConfig
+from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.errors import DyngsError
+from dyngs.files.temporary import remove_leftovers, remove_quietly, temporary_folder_beside
+from dyngs.runs.checkpoint import COMPACT_NAME, TIMING_NAME, checkpoint_paths
+from dyngs.runs.lock import LOCK_NAME, writing
+from dyngs.runs.log import LOG_NAME
+
+SMALL_FOLDER = "small"
+"""In a run folder: the run as a file of at most ``budget.max_mb``."""
+_BEGUN = (RESOLVED_NAME, LOG_NAME, TIMING_NAME)
+"""What a run that was stopped before its first checkpoint may have written."""
+_OLD_LEFTOVER = re.compile(r"\.step_\d+\.\d+\.safetensors|\.tmp[A-Za-z0-9]{6}")
+"""Earlier versions, and the library that they let write there, called a checkpoint so while they wrote it."""
+
+
+def default_folder(name: str) -> Path:
+    """The run folder of a run that has only a name.
+
+    Raises:
+        DyngsError: the name leads out of ``runs``, or is none.
+    """
+    parts = Path(name).parts
+    if not parts or ".." in parts or Path(name).is_absolute():
+        raise DyngsError(f"run.name={name!r}: must name a folder below runs; for another place give run.dir=FOLDER")
+    return Path("runs", name)
+
+
+def require_no_run(folder: Path) -> None:
+    """Nothing, if a new run can be written to ``folder`` without replacing anything.
+
+    Raises:
+        DyngsError: says what is there.
+    """
+    found = _found(folder)
+    if checkpoint_paths(folder):
+        raise DyngsError(
+            f"{folder} already holds a run; go on with `dyngs train --resume {folder}` or give another folder"
+        )
+    if COMPACT_NAME in found:
+        raise DyngsError(
+            f"{folder} already holds a run, as {COMPACT_NAME}, which can be drawn but not trained on; "
+            "give another folder"
+        )
+    if found:
+        raise DyngsError(f"{folder} already holds {found[0]}, which a new run would replace; give another folder")
+
+
+def require_empty(folder: Path) -> None:
+    """Nothing, if ``folder`` does not exist or is empty; a lock file whose owner was killed is removed.
+
+    Raises:
+        DyngsError: something is there, or a process writes there.
+    """
+    if folder.is_dir() and not folder.is_symlink() and [path.name for path in folder.iterdir()] == [LOCK_NAME]:
+        with writing(folder):  # it removes the file at its end
+            pass
+    if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
+        raise DyngsError(f"{folder}: exists already; give another --out")
+    if folder.exists() and not os.access(folder, os.W_OK):
+        raise DyngsError(f"{folder}: cannot be written; give another --out or change its permissions")
+
+
+@contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """A hidden folder beside ``out`` that gets its name when the block ends well, and vanishes otherwise.
+
+    Raises:
+        DyngsError: ``out`` is not empty, when the block begins or when it ends.
+    """
+    require_empty(out)
+    started = temporary_folder_beside(out)
+    try:
+        yield started
+        try:
+            if out.is_dir():
+                out.rmdir()
+            started.rename(out)
+        except OSError as error:
+            require_empty(out)
+            raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
+    finally:
+        remove_quietly(started)
+
+
+@contextmanager
+def folder_of_export(out: Path, run_dir: Path, config: Config) -> Iterator[Path]:
+    """The folder to write the stored scene of a run to, and its configuration: ``out``, or one that becomes it.
+
+    Raises:
+        DyngsError: ``out`` holds another run, or a process writes there.
+    """
+    if not out.exists():
+        with new_folder(out) as started:
+            yield started
+        return
+    with writing(out):
+        if out.resolve() != run_dir.resolve():
+            _require_export_of(config, out)
+        yield out
+
+
+def _require_export_of(config: Config, folder: Path) -> None:
+    """Nothing, if a run can be exported to ``folder``: no run is there, or a former export of the same one."""
+    found = _found(folder)
+    if not found and not checkpoint_paths(folder):
+        return
+    try:
+        same = _is_same_run(load_resolved(folder), config)
+    except DyngsError:
+        same = False
+    if not same or checkpoint_paths(folder):
+        raise DyngsError(f"{folder}: holds another run, which an export would replace; give another --out")
+
+
+def require_startable(folder: Path, config: Config) -> None:
+    """Nothing, if the run of ``config`` can begin in ``folder``: nothing is there that it would replace, or only what
+    the very same run left that was stopped before its first checkpoint.
+
+    Raises:
+        DyngsError: says what is there and what to do.
+    """
+    begun = _config_of_begun(folder)
+    if begun is None:
+        require_no_run(folder)
+    elif not _is_same_run(begun, config):
+        raise DyngsError(
+            f"{folder} already holds another run, stopped before its first checkpoint; begin that again with `dyngs "
+            f"train --resume {folder}`, give another run.dir, or remove the folder"
+        )
+
+
+def was_only_begun(folder: Path) -> bool:
+    """Whether a run began in ``folder`` and was stopped before its first checkpoint."""
+    return _config_of_begun(folder) is not None
+
+
+def begin(folder: Path, config: Config) -> None:
+    """Write the configuration of a run, unless the same one is there already, which may be a person's own file."""
+    begun = _config_of_begun(folder)
+    if begun is None or not _is_same_run(begun, config):
+        save_config(config, folder / RESOLVED_NAME)
+
+
+def tidy(folder: Path, *, sole_writer: bool) -> None:
+    """Remove what killed processes left half written in a run folder; its owner calls this before it writes.
+
+    Args:
+        folder: of a run.
+        sole_writer: no other process writes into it, so that checkpoints that nobody goes on writing can be told.
+    """
+    ours = set(_BEGUN)
+    remove_leftovers(folder, ours.__contains__ if sole_writer else None)
+    checkpoints = folder / "checkpoints"
+    for inner in (checkpoints, folder / SMALL_FOLDER):
+        if not inner.is_symlink():
+            remove_leftovers(inner, (lambda _: True) if sole_writer else None)
+    if sole_writer and not checkpoints.is_symlink():
+        for path in checkpoints.glob(".*"):
+            if _OLD_LEFTOVER.fullmatch(path.name):
+                remove_quietly(path)
+
+
+def _found(folder: Path) -> list[str]:
+    """Names in ``folder`` that a run writes, whatever lies there under them; those of a begun run last."""
+    names = [COMPACT_NAME, SMALL_FOLDER, *sorted(path.name for path in folder.glob("metrics*.json")), *_BEGUN]
+    found = [name for name in names if (folder / name).exists() or (folder / name).is_symlink()]
+    checkpoints = folder / "checkpoints"
+    is_taken = not checkpoints.is_dir() and (checkpoints.exists() or checkpoints.is_symlink())
+    return ["checkpoints", *found] if is_taken else found
+
+
+def _config_of_begun(folder: Path) -> Config | None:
+    """The configuration of a run that was stopped before its first checkpoint; None where there is no such run."""
+    found = _found(folder)
+    if RESOLVED_NAME not in found or checkpoint_paths(folder) or any(name not in _BEGUN for name in found):
+        return None
+    try:
+        return load_resolved(folder)
+    except DyngsError:  # a file of that name, but not of a run
+        return None
+
+
+def _is_same_run(one: Config, other: Config) -> bool:
+    """Whether two runs have the same bytes, whatever they are called, wherever they are, by how many threads."""
+    first, second = (c.model_copy(update={"run": RunConfig(seed=c.run.seed)}) for c in (one, other))
+    return first == second

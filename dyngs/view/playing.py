@@ -1,0 +1,62 @@
+"""A trained person in another motion than that of training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from dyngs.config import HumanModel
+from dyngs.errors import DyngsError
+from dyngs.human.avatar.trained import AvatarScene
+from dyngs.human.motion.clips import clip_of_motion, placed, upright
+from dyngs.human.motion.motion import read_motion
+from dyngs.human.template.person import template
+from dyngs.runs.checkpoint import LoadedRun
+
+
+@dataclass(frozen=True)
+class Played:
+    """A run whose scene plays something else, and how fast, in frames per second."""
+
+    run: LoadedRun
+    fps: float
+
+
+def playing_motion(run: LoadedRun, path: Path) -> Played:
+    """The person of ``run`` in the motion of a file (AMASS, BVH or glTF).
+
+    A file with ``scale`` is a fit to this person and has its world; any other motion is brought to the person's size,
+    place and up.
+
+    Raises:
+        DyngsError: the run is not one of a person, or the file cannot be read.
+    """
+    scene, model = _avatar(run, f"--motion {path}")
+    motion = read_motion(path, template(model))
+    if motion.poses.shape[1] != len(scene.given_joints):
+        motion = motion.for_joints(len(scene.given_joints))
+    clip = clip_of_motion(motion)
+    if bool((motion.scale != 1).any()):
+        clip = replace(clip, trans=clip.trans - torch.tensor(run.info.world_offset))
+    else:
+        clip = placed(clip, scene.given_clip, scene.given_joints, scene.skeleton.parents)
+    return Played(replace(run, scene=scene.playing(clip)), motion.fps)
+
+
+def at_rest(run: LoadedRun) -> LoadedRun:
+    """The person of ``run`` in the pose of the template, upright on the floor.
+
+    Raises:
+        DyngsError: the run is not one of a person.
+    """
+    scene, _ = _avatar(run, "--pose rest")
+    rest = upright(scene.given_clip, scene.given_joints, scene.skeleton.parents)
+    return replace(run, scene=scene.playing(rest))
+
+
+def _avatar(run: LoadedRun, wanted: str) -> tuple[AvatarScene, HumanModel]:
+    if not isinstance(run.scene, AvatarScene) or not isinstance(run.config.model, HumanModel):
+        raise DyngsError(f"{wanted} needs the run of a person (model.kind=human), this one is {run.config.model.kind}")
+    return run.scene, run.config.model

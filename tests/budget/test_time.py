@@ -1,0 +1,180 @@
+"""How many steps fit, on clocks of known pace; and that a run ends in time, whatever the machine."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_fields import busy_config, write_tiny_capture
+
+from dyngs.budget.time import (
+    AIM,
+    FEWEST_STEPS,
+    Deadline,
+    deadline_of,
+    first_fit,
+    fitting_steps,
+    refitted,
+    same_phase,
+    seconds_left,
+    with_steps,
+)
+from dyngs.build import assemble
+from dyngs.config import AutoColour, BudgetConfig, Config, DataConfig, DynamicModel, TrainConfig
+from dyngs.config.io import load_resolved
+from dyngs.errors import DyngsError
+from dyngs.runs.checkpoint import load_run
+from dyngs.train.step import StepReport, Trainer
+from dyngs.train.trainer import train
+
+PLAIN = Config(data=DataConfig(root=Path("nowhere")))
+SHRUNK = PLAIN.model_copy(update={"train": TrainConfig(steps=7000, coarsest=4)})
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny_capture(tmp_path_factory.mktemp("capture"))
+
+
+def timed(config: Config, minutes: float) -> Config:
+    return config.model_copy(update={"budget": BudgetConfig(max_minutes=minutes)})
+
+
+@given(done=st.integers(0, 5000), pace=st.floats(1e-3, 10), seconds=st.floats(0, 1e5))
+def test_what_fits_fits_and_one_more_does_not(done: int, pace: float, seconds: float) -> None:
+    found = fitting_steps(PLAIN, done, pace, seconds, 7000)
+    assert done <= found <= 7000
+    assert found == done or seconds_left(PLAIN, done, found, pace) <= seconds
+    assert found == 7000 or seconds_left(PLAIN, done, found + 1, pace) > seconds
+
+
+def test_a_settled_run_goes_on_as_it_was() -> None:
+    """After growth each step takes as long as the last."""
+    assert seconds_left(PLAIN, 6000, 7000, 0.5) == pytest.approx(500)
+    assert fitting_steps(PLAIN, 6000, 0.5, 100, 7000) == 6200
+
+
+def test_sharper_pictures_take_longer() -> None:
+    """From a quarter of the sides on, a pixel's share of a step is 16 times as much."""
+    assert seconds_left(SHRUNK, 6000, 7000, 0.5) == pytest.approx(500)
+    small = seconds_left(SHRUNK, 10, 7000, 0.1)
+    assert small > 1.5 * seconds_left(PLAIN, 10, 7000, 0.1)
+    assert small < (1 / (0.3 + 0.7 / 16)) * seconds_left(PLAIN, 10, 7000, 0.1)
+
+
+@pytest.mark.parametrize("factor", [0.3, 1.0, 4.0])
+def test_a_run_whose_steps_change_pace_fills_its_time(factor: float) -> None:
+    """A simulated machine: steps that take ``factor`` times as long from a third of the run on."""
+    deadline, config, now = Deadline(100.0, 100_000, fits=True), with_steps(PLAIN, 5000), 0.0
+    for done in itertools.count():
+        found = deadline.steps(config, done, now)
+        config = with_steps(config, found)
+        if done >= found:
+            break
+        now += 0.02 * (factor if done > found / 3 else 1.0)
+    assert 85 <= now <= 100
+
+
+def test_a_settled_number_of_steps_ends_only_with_the_time() -> None:
+    deadline, now = Deadline(10.0, 1000, fits=False), 0.0
+    config = with_steps(PLAIN, 1000)
+    for done in range(1000):
+        found = deadline.steps(config, done, now)
+        if found == done:
+            break
+        assert found == 1000
+        now += 0.05
+    assert 9.8 < now <= 10.0
+    assert "200" in deadline.kept(200, now) or "199" in deadline.kept(199, now)
+
+
+def test_what_happens_once_is_neither_missed_nor_redone() -> None:
+    dynamic = PLAIN.model_copy(update={"model": DynamicModel(coarse=0.1)})
+    longer, shorter = with_steps(dynamic, 20_000), with_steps(dynamic, 16_000)
+    assert [same_phase(longer, shorter, done) for done in (1500, 1800, 2100)] == [True, False, True]
+    thrifty = PLAIN.model_copy(update={"colour": AutoColour(measure_at=0.5)})
+    assert not same_phase(with_steps(thrifty, 1000), with_steps(thrifty, 1200), 550)
+    assert same_phase(with_steps(thrifty, 1000), with_steps(thrifty, 1200), 650)
+
+
+def test_no_limit_no_deadline() -> None:
+    assert deadline_of(PLAIN, None) is None
+    found = deadline_of(timed(PLAIN, 2), 300)
+    assert (found and (found.seconds, found.most_steps, found.fits)) == (120, 300, True)
+    settled = deadline_of(timed(PLAIN, 2), None)
+    assert settled is not None
+    assert not settled.fits
+
+
+@pytest.mark.parametrize("kind", ["skeleton", "trajectory"])
+def test_refitted_is_where_it_was_on_other_schedules(kind: str, moving: Path, tmp_path: Path) -> None:
+    config = busy_config(moving, tmp_path, kind)
+    trainer = assemble(config)
+    for _ in range(10):
+        trainer.step()
+    longer = refitted(trainer, with_steps(config, config.train.steps + 6))
+    same = refitted(trainer, config)
+    assert longer.done == same.done == trainer.done == 10
+    assert longer.config.train.steps == config.train.steps + 6
+    before, after = trainer.checkpoint().tensors, same.checkpoint().tensors
+    assert before.keys() == after.keys()
+    assert all(torch.equal(x, after[name]) for name, x in before.items() if "rng" in name or "gaussians" in name)
+    assert trainer.step().loss == same.step().loss
+
+
+def _slowed(monkeypatch: pytest.MonkeyPatch, seconds: float) -> list[float]:
+    """A clock that only steps advance, by ``seconds`` each; its time."""
+    clock, real = [0.0], Trainer.step
+
+    def stepping(trainer: Trainer) -> StepReport:
+        clock[0] += seconds
+        return real(trainer)
+
+    monkeypatch.setattr(Trainer, "step", stepping)
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
+    return clock
+
+
+def test_a_first_fit_keeps_or_lowers_the_steps_or_refuses(
+    moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = busy_config(moving, tmp_path, "trajectory")
+    wanted = config.train.steps
+    _slowed(monkeypatch, 1.0)
+    assert wanted < FEWEST_STEPS
+    assert first_fit(timed(config, 1000.0), assemble(config), 0.0).train.steps == wanted
+    with pytest.raises(DyngsError, match=r"budget.max_minutes=0.1: about \d+ steps would fit.* would do") as refused:
+        first_fit(timed(config, 0.1), assemble(config), 0.0)
+    would_do = float(str(refused.value).split(";")[1].split()[0])
+    assert first_fit(timed(config, would_do), assemble(config), 0.0).train.steps == wanted
+    long = with_steps(config, 1000)
+    fitted = first_fit(timed(long, 20.0), assemble(long), 0.0).train.steps
+    assert FEWEST_STEPS <= fitted < 1000
+    assert seconds_left(long, 0, fitted, 1.0) <= AIM * 1200
+
+
+def test_a_run_that_gets_slow_ends_in_time_and_stays_ended(
+    moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a clock that only steps advance: fitted at first to all steps, then they take ten times as long."""
+    config = timed(busy_config(moving, tmp_path / "run", "trajectory"), 2.0)
+    wanted = config.train.steps
+    clock, real = _slowed(monkeypatch, 0.1), Trainer.step
+
+    def slower(trainer: Trainer) -> StepReport:
+        clock[0] += 10.0 if trainer.done >= wanted // 2 and clock[0] > 0.1 * (22 + wanted // 2) else 0.0
+        return real(trainer)
+
+    monkeypatch.setattr(Trainer, "step", slower)
+    folder = train(config)
+    run = load_run(folder)
+    assert wanted // 2 < run.step < wanted
+    assert run.seconds_train <= 120
+    assert load_resolved(folder).train.steps == run.step
+    train(load_resolved(folder), resume_from=folder)
+    assert load_run(folder).step == run.step

@@ -1,0 +1,341 @@
+"""Configuration files: what is read is what was meant, what is wrong is named, what is saved comes back."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from itertools import permutations
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dyngs.config import (
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    DynamicModel,
+    HexplaneField,
+    McmcStrategy,
+    MlpField,
+    OptimConfig,
+    RandomInit,
+    RunConfig,
+    SkeletonField,
+    StaticModel,
+    TrainConfig,
+    TrajectoryField,
+)
+from dyngs.config.io import find_preset, load_config, load_resolved, packaged_preset, save_config
+from dyngs.conventions import RasterizeMode
+from dyngs.errors import DyngsError
+
+PRESETS = ("static", "blender", "colmap", "static_mcmc", "mip")
+ROOT = "data.root=capture"
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "mine.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refusal(preset: Path | None, *overrides: str) -> str:
+    """The one line that a bad configuration is answered with."""
+    with pytest.raises(DyngsError) as caught:
+        load_config(preset, overrides)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+# ---------------------------------------------------------------------------------------------------- presets
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_packaged_presets_load_from_an_empty_folder(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = load_config(Path(f"configs/{name}.yaml"), [ROOT])
+    assert config.run.name == name
+    assert config.data.root == tmp_path / "capture"
+    assert load_config(Path(name), [ROOT]) == config
+
+
+def test_a_file_of_ones_own_goes_before_the_packaged_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "static.yaml").write_text("train: {steps: 123}")
+    assert load_config(Path("static.yaml"), [ROOT]).train.steps == 123
+    assert load_config(packaged_preset("static"), [ROOT]).train.steps == 7000
+
+
+def test_published_protocols() -> None:
+    blender = load_config(packaged_preset("blender"), [ROOT])
+    assert blender.train.steps == 30_000
+    assert blender.data.background == "white"
+    assert blender.init == RandomInit(num_random=100_000, half_extent=1.3)
+    assert (blender.strategy, blender.optim) == (DefaultStrategy(), OptimConfig())
+    colmap = load_config(packaged_preset("colmap"), [ROOT])
+    assert (colmap.train.steps, colmap.data.test_every, colmap.data.longest_side) == (30_000, 8, 1600)
+    mip = load_config(packaged_preset("mip"), [ROOT]).model
+    assert (mip.rasterize_mode, mip.eps2d, mip.filter_3d) == (RasterizeMode.ANTIALIASED, 0.1, True)
+    assert isinstance(load_config(packaged_preset("static_mcmc"), [ROOT]).strategy, McmcStrategy)
+
+
+def test_a_mistyped_path_is_not_taken_for_a_packaged_preset(tmp_path: Path) -> None:
+    message = refusal(tmp_path / "static.yaml")
+    assert "no such preset" in message
+    assert "static_mcmc" in message
+    with pytest.raises(DyngsError, match="did you mean 'blender'"):
+        find_preset(Path("blendr"))
+
+
+# ---------------------------------------------------------------------------------------------------- overrides
+
+
+def test_overrides_are_laid_over_the_preset(tmp_path: Path) -> None:
+    preset = write(tmp_path, "data: {root: a}\ntrain:\n  steps: 10\n  ssim_weight: 0.5\n")
+    config = load_config(preset, ["train.steps=20", "data.longest_side=null", "optim.lr_means=1e-4", "train.steps=30"])
+    assert (config.train.steps, config.train.ssim_weight, config.optim.lr_means) == (30, 0.5, 1e-4)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [("strategy.kind=mcmc", "strategy.max_gaussians=9"), ("strategy.max_gaussians=9", "strategy.kind=mcmc")],
+)
+def test_another_kind_replaces_its_section_in_any_order(overrides: tuple[str, ...], tmp_path: Path) -> None:
+    preset = write(tmp_path, "strategy: {absgrad: true, max_gaussians: 5}\n")
+    assert load_config(preset, [ROOT, *overrides]).strategy == McmcStrategy(max_gaussians=9)
+
+
+def test_the_same_kind_keeps_its_section(tmp_path: Path) -> None:
+    preset = write(tmp_path, "strategy: {kind: mcmc, max_gaussians: 5}\n")
+    assert load_config(preset, [ROOT, "strategy.kind=mcmc"]).strategy == McmcStrategy(max_gaussians=5)
+
+
+def test_a_section_can_be_given_as_a_whole() -> None:
+    config = load_config(None, [ROOT, "strategy={max_gaussians: 4, kind: mcmc}", "init={kind: random}"])
+    assert config.strategy == McmcStrategy(max_gaussians=4)
+    assert isinstance(config.init, RandomInit)
+
+
+@pytest.mark.parametrize("order", list(permutations(["kind=dynamic", "deform.kind=mlp", "deform.width=64"])))
+def test_nested_kinds_in_any_order(order: tuple[str, ...], tmp_path: Path) -> None:
+    expected = DynamicModel(deform=MlpField(width=64))
+    overrides = [f"model.{text}" for text in order]
+    assert load_config(None, [ROOT, *overrides]).model == expected
+    preset = write(tmp_path, "model: {sh_degree: 1}\n")
+    assert load_config(preset, [ROOT, *overrides]).model == expected, "the static model's keys are dropped"
+
+
+def test_an_inner_kind_replaces_nothing_outside_it(tmp_path: Path) -> None:
+    preset = write(tmp_path, "model:\n  kind: dynamic\n  sh_degree: 1\n  deform: {channels: 8, width: 32}\n")
+    assert load_config(preset, [ROOT, "model.deform.kind=mlp"]).model == DynamicModel(sh_degree=1, deform=MlpField())
+    same = load_config(preset, [ROOT, "model.deform.kind=hexplane", "model.kind=dynamic", "model.deform.levels=[4, 2]"])
+    expected = DynamicModel(sh_degree=1, deform=HexplaneField(channels=8, width=32, levels=(4, 2)))
+    assert same.model == expected
+    assert load_config(preset, [ROOT, "model.kind=static", "model.eps2d=0.1"]).model == StaticModel(eps2d=0.1)
+
+
+def test_a_nested_section_can_be_given_as_a_whole() -> None:
+    expected = DynamicModel(sh_degree=2, deform=TrajectoryField(fourier=2))
+    whole = "model={sh_degree: 2, deform: {fourier: 2, kind: trajectory}, kind: dynamic}"
+    assert load_config(None, [ROOT, whole]).model == expected
+    split = ["model.sh_degree=2", "model.deform={fourier: 2, kind: trajectory}", "model={kind: dynamic}"]
+    assert load_config(None, [ROOT, *split]).model == expected
+    assert load_config(None, [ROOT, "model.kind=dynamic", "model={}", "model.deform={}"]).model == DynamicModel()
+
+
+@pytest.mark.parametrize("text", ["2024-01-01", "007", "yes", "1e3", "null-ish", "[x", "C:\\scans", "a b"])
+def test_names_and_paths_are_taken_as_written(text: str) -> None:
+    config = load_config(None, [f"data.root={text}", f"run.name={text}"])
+    assert config.run.name == text
+    assert config.data.root.name == text
+
+
+def test_home_is_expanded() -> None:
+    assert load_config(None, ["data.root=~/scans"]).data.root == Path.home() / "scans"
+
+
+# ---------------------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("train.stesp=5", ["unknown key 'train.stesp'", "did you mean 'train.steps'"]),
+        ("trian.steps=5", ["unknown key 'trian'", "did you mean 'train.steps'"]),
+        ("steps=5", ["did you mean 'train.steps'"]),
+        ("train.seed=5", ["did you mean 'run.seed'"]),
+        ("train.steps=0", ["train.steps must be an integer >= 1", "not 0"]),
+        ("train.steps=many", ["train.steps must be an integer >= 1", "not 'many'"]),
+        ("train.ssim_weight=2", ["a number >= 0 and <= 1"]),
+        ("optim.lr_means=inf", ["optim.lr_means must be a number > 0"]),
+        ("optim.lr_means=.nan", ["optim.lr_means must be a number > 0"]),
+        ("data.background=whit", ["one of auto, white, black, random", "did you mean 'white'"]),
+        ("model.rasterize_mode=antialias", ["one of classic, antialiased", "did you mean 'antialiased'"]),
+        ("strategy.kind=mcm", ["strategy.kind must be one of default, mcmc", "did you mean 'mcmc'"]),
+        ("strategy.noise=1", ["strategy.noise belongs to strategy.kind=mcmc, not to default"]),
+        ("model.deform.width=64", ["model.deform belongs to model.kind=dynamic, not to static"]),
+        ("model.width=64", ["unknown key 'model.width'", "did you mean 'model.deform.width'"]),
+        ("deform.width=64", ["unknown key 'deform'", "did you mean 'model.deform.width'"]),
+        ("train=5", ["train is a section", "steps"]),
+        ("model=5", ["model is a section", "sh_degree", "deform"]),
+        ("train.steps.x=5", ["train.steps"]),
+        ("train.steps", ["section.key=value"]),
+        ("=5", ["section.key=value"]),
+    ],
+)
+def test_wrong_overrides_are_named_with_what_is_allowed(override: str, parts: list[str]) -> None:
+    message = refusal(None, ROOT, override)
+    assert override in message
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("model.deform.kind=mpl", ["model.deform.kind must be one of hexplane, mlp, traj", "did you mean 'mlp'"]),
+        ("model.deform.chanels=5", ["unknown key 'model.deform.chanels'", "did you mean 'model.deform.channels'"]),
+        ("model.defrom.width=5", ["unknown key 'model.defrom'", "did you mean 'model.deform.width'"]),
+        ("model.defrom.kind=mlp", ["unknown key 'model.defrom'", "did you mean 'model.deform.kind'"]),
+        ("model.deform.fourier=5", ["model.deform.fourier belongs to model.deform.kind=trajectory, not to hexplane"]),
+        ("model.deform.channels=0", ["model.deform.channels must be an integer >= 1, not 0"]),
+        ("model.deform.levels=[1, 0]", ["model.deform.levels must be a non-empty list of integers >= 1, not [1, 0]"]),
+        ("model.deform.levels=2", ["model.deform.levels must be a non-empty list of integers >= 1, not 2"]),
+        ("model.deform.levels=[]", ["model.deform.levels must be a non-empty list of integers >= 1, not []"]),
+        ("model.deform=mlp", ["model.deform is a section", "kind", "polynomial"]),
+        ("model.dynamic=1", ["unknown key 'model.dynamic'"]),
+    ],
+)
+def test_wrong_nested_overrides_are_named_with_what_is_allowed(override: str, parts: list[str]) -> None:
+    message = refusal(None, ROOT, "model.kind=dynamic", override)
+    assert message.startswith(f"{override}: ")
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "part"),
+    [
+        ("train:\n\tsteps: 5\n", 2, "tab"),
+        ("train:\n  steps: 5\n  steps: 6\n", 3, "duplicate key train.steps"),
+        ("train:\n  steps: 5\n  stesp: 6\n", 3, "did you mean 'train.steps'"),
+        ("train:\n  steps: [1\n", 3, "not valid YAML"),
+        ("run: &a {seed: 1}\ntrain: *a\n", 2, "aliases"),
+        ("run:\n  name: !!python/object/apply:os.getcwd []\n", 2, "constructor"),
+        ("train.steps: 5\n", 1, "nested"),
+        ("? [a]\n: 1\n", 1, "keys must be plain words"),
+        ("run: {seed: -1}\n", 1, "run.seed must be an integer >= 0"),
+        ("model:\n  deform:\n    width: 5\n", 3, "model.deform belongs to model.kind=dynamic"),
+        ("model:\n  kind: dynamic\n  deform:\n    levels:\n      - x\n", 4, "list of integers >= 1, not ['x']"),
+        ("model:\n  kind: dynamic\n  deform:\n    kind: mlp\n    widht: 5\n", 5, "did you mean 'model.deform.width'"),
+    ],
+)
+def test_wrong_files_are_named_with_the_line(text: str, line: int, part: str, tmp_path: Path) -> None:
+    preset = write(tmp_path, text)
+    message = refusal(preset, ROOT)
+    assert message.startswith(f"{preset}:{line}: ")
+    assert part in message
+
+
+@pytest.mark.parametrize("content", [b"- a\n- b\n", b"\xff\xfe\x00", b"[" * 5000, b"just text"])
+def test_files_that_are_no_configuration_are_refused(content: bytes, tmp_path: Path) -> None:
+    preset = tmp_path / "mine.yaml"
+    preset.write_bytes(content)
+    assert str(preset) in refusal(preset, ROOT)
+
+
+@pytest.mark.parametrize("text", ["", "# nothing\n", "train:\n", "train: {}\n"])
+def test_empty_means_the_defaults(text: str, tmp_path: Path) -> None:
+    assert load_config(write(tmp_path, text), [ROOT]) == load_config(None, [ROOT])
+
+
+def test_a_missing_capture_is_asked_for() -> None:
+    assert "data.root is missing" in refusal(None)
+
+
+def test_several_faults_are_counted() -> None:
+    assert refusal(None, ROOT, "train.steps=0", "run.seed=-1", "data.downscale=0").endswith("(and 2 more)")
+
+
+@settings(max_examples=25, deadline=None)
+@given(text=st.text(max_size=60))
+def test_any_text_gives_a_configuration_or_a_dyngs_error(text: str) -> None:
+    with suppress(DyngsError):
+        load_config(None, [ROOT, text])
+
+
+# ---------------------------------------------------------------------------------------------------- saving
+
+rates = st.floats(min_value=1e-30, max_value=1e30)
+fractions = st.floats(min_value=0, max_value=1)
+names = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=20)
+configs = st.builds(
+    Config,
+    data=st.builds(
+        DataConfig,
+        root=st.text("abc: #'\"~-é", min_size=1).map(lambda s: Path("x" + s)),
+        longest_side=st.none() | st.integers(1, 9999),
+    ),
+    model=st.builds(StaticModel, rasterize_mode=st.sampled_from(RasterizeMode), filter_3d=st.booleans())
+    | st.builds(
+        DynamicModel,
+        coarse=fractions,
+        deform=st.builds(HexplaneField, levels=st.lists(st.integers(1, 9), min_size=1).map(tuple), lr_planes=rates)
+        | st.builds(MlpField, lr=rates, move_scales=st.booleans())
+        | st.builds(TrajectoryField, lr_means=rates)
+        | st.builds(SkeletonField, rigidity=rates),
+    ),
+    init=st.builds(RandomInit, half_extent=rates),
+    strategy=st.builds(McmcStrategy, noise=rates) | st.builds(DefaultStrategy, prune_opacity=fractions),
+    optim=st.builds(OptimConfig, lr_means=rates, eps=rates),
+    train=st.builds(TrainConfig, steps=st.integers(1, 10**9), ssim_weight=fractions),
+    run=st.builds(RunConfig, name=names, seed=st.integers(0, 2**63 - 1)),
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(config=configs)
+def test_what_is_saved_comes_back(config: Config, tmp_path_factory: pytest.TempPathFactory) -> None:
+    folder = tmp_path_factory.mktemp("run")
+    save_config(config, folder / "config.yaml")
+    assert load_resolved(folder) == config
+    assert [f.name for f in folder.iterdir()] == ["config.yaml"]
+
+
+@pytest.mark.parametrize("name", ["a\x85b", "\u2028", "\u2029é", "é", "a\nb", "\ufeff", "😀"])
+def test_odd_names_come_back(name: str, tmp_path: Path) -> None:
+    config = load_config(None, [ROOT]).model_copy(update={"run": RunConfig(name=name)})
+    save_config(config, tmp_path / "config.yaml")
+    assert load_resolved(tmp_path) == config
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="not a run folder"):
+        load_resolved(tmp_path)
+    with pytest.raises(DyngsError, match="not a run folder"):
+        load_resolved(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("text", ["", "train: {steps: 3}", "data:"])
+def test_an_emptied_config_of_a_run_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(DyngsError, match=r"config\.yaml: does not say which capture .*restore"):
+        load_resolved(tmp_path)
+
+
+def test_a_failed_save_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "config.yaml"
+    config = load_config(None, [ROOT])
+    save_config(config, path)
+    before = path.read_bytes()
+
+    def full_disk(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", full_disk)
+    with pytest.raises(DyngsError, match="No space left"):
+        save_config(config.model_copy(update={"train": TrainConfig(steps=1)}), path)
+    assert path.read_bytes() == before
+    assert [f.name for f in tmp_path.iterdir()] == ["config.yaml"]

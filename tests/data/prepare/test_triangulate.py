@@ -1,0 +1,104 @@
+"""Triangulated points lie on the surfaces of a scene whose shape is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dyngs.config import DataConfig
+from dyngs.data.capture import View
+from dyngs.data.prepare.triangulate import triangulated_points, views_of_a_moment
+from dyngs.data.read import read_capture
+from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
+from dyngs.data.synthetic.scenes import scene_at
+from dyngs.errors import DyngsError
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> DataConfig:
+    """A furnished corner, a moment from eight cameras."""
+    folder = tmp_path_factory.mktemp("room") / "capture"
+    options = DynamicOptions(size=160, num_times=1, num_cameras=8, num_val=0, num_test=0, samples=1)
+    return DataConfig(root=write_dynamic_capture("room", folder, options))
+
+
+def train_views(options: DataConfig) -> list[View]:
+    return list(read_capture(options).splits["train"])
+
+
+def distances_to_surface(points: np.ndarray, views: list[View], time: float) -> np.ndarray:
+    """Along the rays of the camera that sees each point best."""
+    best = np.full(len(points), np.inf)
+    for view in views:
+        center = -view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3]
+        offset = points - center
+        far = np.linalg.norm(offset, axis=1)
+        origins, rays = np.tile(center.astype(np.float32), (len(points), 1)), (offset / far[:, None]).astype(np.float32)
+        hits = np.min([thing.intersect(origins, rays) for thing in scene_at("room", time).primitives], axis=0)
+        best = np.minimum(best, np.abs(hits - far))
+    return best
+
+
+def test_points_lie_on_the_surfaces(room: DataConfig) -> None:
+    views = views_of_a_moment(train_views(room), 24)
+    found = triangulated_points(views, room.model_copy(update={"longest_side": 20}))
+    assert found is not None
+    assert len(found.xyz) > 50
+    assert found.rgb.shape == found.xyz.shape
+    assert found.rgb.dtype == np.uint8
+    distances = distances_to_surface(found.xyz, views, views[0].time or 0.0)
+    # A pixel covers 0.02, and far more in depth; tiles and wallpaper repeat, so some matches join different ones.
+    assert np.median(distances) < 0.05
+    assert np.mean(distances < 0.1) > 0.7
+    shifted = found.xyz + np.array([0.3, -0.3, 0.3])
+    assert np.mean(distances_to_surface(shifted, views, 0.0) < 0.1) < 0.4
+
+
+def test_the_same_pictures_give_the_same_points(room: DataConfig) -> None:
+    views = views_of_a_moment(train_views(room), 24)
+    first, second = (triangulated_points(views, room) for _ in range(2))
+    assert first is not None
+    assert second is not None
+    np.testing.assert_array_equal(first.xyz, second.xyz)
+    np.testing.assert_array_equal(first.rgb, second.rgb)
+
+
+def test_two_places_are_too_few(room: DataConfig) -> None:
+    views = views_of_a_moment(train_views(room), 24)
+    assert triangulated_points(views[:2] * 3, room) is None
+    assert triangulated_points([], room) is None
+
+
+def test_pictures_without_features_have_no_points(blender_root: Path) -> None:
+    options = DataConfig(root=blender_root)
+    assert triangulated_points(train_views(options), options) is None
+
+
+def test_a_handful_of_points_is_none(room: DataConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model that begins with them would have to grow all the rest."""
+    views = views_of_a_moment(train_views(room), 24)
+    monkeypatch.setattr("dyngs.data.prepare.triangulate.MIN_POINTS", 100_000)
+    assert triangulated_points(views, room) is None
+
+
+def test_a_missing_picture_is_named(room: DataConfig, tmp_path: Path) -> None:
+    views = views_of_a_moment(train_views(room), 24)
+    views[1] = replace(views[1], image_path=tmp_path / "gone.png")
+    with pytest.raises(DyngsError, match=r"gone\.png"):
+        triangulated_points(views, room)
+
+
+def test_the_moment_is_the_middle_one_of_those_with_most_views(room: DataConfig) -> None:
+    view = train_views(room)[0]
+    views = [replace(view, time=time) for time in (0.0, 0.2, 0.2, 0.4, 0.4, 0.6, 0.6, 0.8)]
+    assert [chosen.time for chosen in views_of_a_moment(views, 24)] == [0.4, 0.4]
+    assert len(views_of_a_moment(views, 1)) == 1
+    assert views_of_a_moment(views, 0) == views_of_a_moment([], 24) == []
+
+
+def test_without_times_the_views_are_evenly_chosen(room: DataConfig) -> None:
+    views = [replace(view, time=None, name=str(i)) for i, view in enumerate((train_views(room) * 2)[:12])]
+    assert [view.name for view in views_of_a_moment(views, 4)] == ["0", "3", "6", "9"]

@@ -1,0 +1,172 @@
+"""PeopleSnapshot folders."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from tiny_captures import HEIGHT, WIDTH, pixel_of, write_video
+
+from dyngs.data.readers.people import PersonView, cut_out
+from dyngs.data.readers.people_snapshot import is_people_snapshot, read_people_snapshot
+from dyngs.errors import DyngsError
+
+h5py = pytest.importorskip("h5py", reason="needs dyngs[people]")
+
+FRAMES = 6
+
+
+def write_camera(root: Path, **changes: Any) -> None:
+    fields = {
+        "camera_t": np.array([0.1, 0.2, 0.3]),
+        "camera_rt": np.array([0.0, 0.4, 0.0]),
+        "camera_f": np.array([20.0, 21.0]),
+        "camera_c": np.array([8.0, 6.0]),
+        "camera_k": np.array([0.1, 0.0, 0.0, 0.0, 0.0]),
+        "width": WIDTH,
+        "height": HEIGHT,
+    } | changes
+    (root / "camera.pkl").write_bytes(pickle.dumps({k: v for k, v in fields.items() if v is not None}, 2))
+
+
+def write_hdf5(path: Path, **arrays: np.ndarray | None) -> None:
+    with h5py.File(path, "w") as file:
+        for name, value in arrays.items():
+            if value is not None:
+                file.create_dataset(name, data=value, compression="lzf")
+
+
+def write_poses(root: Path, **changes: np.ndarray | None) -> None:
+    """One row more than the video has frames, which was never fitted, as in the real files."""
+    numbers = np.append(1.0 + np.arange(FRAMES), 0.0)[:, None]
+    fields = {"pose": numbers * np.ones(72), "trans": numbers * np.ones(3), "betas": np.ones(10)}
+    write_hdf5(root / "reconstructed_poses.hdf5", **(fields | changes))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A subject with 6 frames of 16x12, its mask one pixel that moves."""
+    subject = tmp_path / "female-3-casual"
+    write_video(subject / "female-3-casual.mp4", FRAMES)
+    masks = np.zeros((FRAMES, HEIGHT, WIDTH), np.uint8)
+    masks[range(FRAMES), 2, range(FRAMES)] = 1
+    write_hdf5(subject / "masks.hdf5", masks=masks)
+    write_camera(subject)
+    write_poses(subject)
+    return subject
+
+
+def test_frames_masks_and_parameters_go_together(root: Path) -> None:
+    assert is_people_snapshot(root)
+    capture = read_people_snapshot(root)
+    assert (capture.format, capture.warnings, set(capture.splits)) == ("people_snapshot", (), {"train"})
+    views = capture.splits["train"]
+    assert [(v.frame, v.time) for v in views] == [(f, f / 5) for f in range(FRAMES)]
+    assert views[2].name == "female-3-casual/frame_000002"
+    body: Any = capture.body
+    assert body["train"].frames == tuple(range(FRAMES))
+    assert body["train"].trans[:, 0].tolist() == [1, 2, 3, 4, 5, 6]
+    assert (body["train"].kind, body["train"].turns, body["train"].betas.tolist()) == ("smpl", None, [1] * 10)
+    for frame, view in enumerate(views):
+        assert isinstance(view, PersonView)
+        assert view.silhouette is not None
+        alpha = cut_out(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), view.silhouette)[..., 3]
+        assert alpha.nonzero().tolist() == [[2, frame]]
+
+
+def test_camera(root: Path) -> None:
+    view = read_people_snapshot(root).splits["train"][0]
+    point = np.array([0.1, -0.2, 3.0])
+    x, y, z = np.add(Rotation.from_rotvec([0, 0.4, 0]).apply(point), (0.1, 0.2, 0.3))
+    assert pixel_of(view, point.tolist()) == pytest.approx([20 * x / z + 8, 21 * y / z + 6])
+    assert (view.lens.model, view.lens.params[0], view.width, view.height) == ("opencv", 0.1, WIDTH, HEIGHT)
+
+
+def test_frames_without_mask_or_fit_are_left_out(root: Path) -> None:
+    write_hdf5(root / "masks.hdf5", masks=np.ones((4, HEIGHT, WIDTH), np.uint8))
+    numbers = np.array([1.0, 0, 3, 4])[:, None]
+    write_poses(root, pose=numbers * np.ones(72), trans=numbers * np.ones(3))
+    capture = read_people_snapshot(root)
+    assert [view.frame for view in capture.splits["train"]] == [0, 2, 3]
+    assert capture.warnings == ("female-3-casual.mp4: 3 of 6 frames lack a mask or a pose and are left out",)
+
+
+def test_smaller_video(root: Path) -> None:
+    write_camera(root, width=2 * WIDTH, height=2 * HEIGHT)
+    capture = read_people_snapshot(root)
+    assert capture.splits["train"][0].intrinsics[0, 0] == 10
+    assert "another size than their intrinsics" in capture.warnings[0]
+
+
+def test_videos(root: Path) -> None:
+    write_video(root / "other.mp4", 2)
+    assert len(read_people_snapshot(root).splits["train"]) == FRAMES
+    (root / "female-3-casual.mp4").rename(root / "another.mp4")
+    with pytest.raises(DyngsError, match=r"2 videos in it; keep one, called female-3-casual\.mp4"):
+        read_people_snapshot(root)
+    (root / "another.mp4").unlink()
+    (root / "other.mp4").unlink()
+    with pytest.raises(DyngsError, match="no video in it"):
+        read_people_snapshot(root)
+
+
+def test_missing_files(root: Path) -> None:
+    for name in ("masks.hdf5", "reconstructed_poses.hdf5"):
+        content = (root / name).read_bytes()
+        (root / name).unlink()
+        assert is_people_snapshot(root)
+        with pytest.raises(DyngsError, match=f"{name}: no such file"):
+            read_people_snapshot(root)
+        (root / name).write_bytes(content)
+    (root / "camera.pkl").unlink()
+    assert not is_people_snapshot(root)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"pose": None}, "the data set 'pose' is missing"),
+        ({"pose": np.ones((3, 72))}, "'pose' has 3 rows but 'trans' 7"),
+        ({"pose": np.ones((7, 63))}, "'poses' has 63 numbers per frame"),
+        ({"trans": np.full((7, 3), np.nan)}, "'trans' of frame 0 holds NaN"),
+        ({"pose": np.zeros((7, 72)), "trans": np.zeros((7, 3))}, "holds no frame"),
+    ],
+)
+def test_bad_parameters(root: Path, change: dict[str, Any], line: str) -> None:
+    write_poses(root, **change)
+    with pytest.raises(DyngsError, match=line) as caught:
+        read_people_snapshot(root)
+    assert "reconstructed_poses.hdf5" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"camera_f": None}, "the key 'camera_f' is missing"),
+        ({"camera_f": np.array([0.0, 1.0])}, "fl_x must be positive"),
+        ({"camera_k": np.zeros(4)}, "'camera_k' must hold 5 finite numbers"),
+        ({"camera_t": np.array([0, np.nan, 0])}, "'camera_t' must hold 3 finite numbers"),
+        ({"width": "wide"}, "'width' must hold 1 finite numbers"),
+        ({"width": 3 * WIDTH}, "but its intrinsics are for 48x12"),
+    ],
+)
+def test_bad_camera(root: Path, change: dict[str, Any], line: str) -> None:
+    write_camera(root, **change)
+    with pytest.raises(DyngsError, match=line) as caught:
+        read_people_snapshot(root)
+    assert "camera.pkl" in str(caught.value)
+
+
+def test_no_frame_has_everything(root: Path) -> None:
+    write_hdf5(root / "masks.hdf5", masks=np.ones((1, HEIGHT, WIDTH), np.uint8))
+    poses = np.zeros((7, 72))
+    poses[3:] = 1
+    write_poses(root, pose=poses, trans=poses[:, :3])
+    with pytest.raises(DyngsError, match=r"no frame of female-3-casual\.mp4 has both a mask and body parameters"):
+        read_people_snapshot(root)

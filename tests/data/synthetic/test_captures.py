@@ -1,0 +1,208 @@
+"""The captures of the embedded scenes: files against their layout, cameras, times, what the reader makes of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from dyngs.cli import main
+from dyngs.cli.data import SYNTHETIC_SCENES
+from dyngs.config import DataConfig
+from dyngs.data.capture import Capture
+from dyngs.data.inspect import inspect_capture
+from dyngs.data.poses import camera_center
+from dyngs.data.read import read_capture
+from dyngs.data.synthetic.captures import (
+    CAMERA_ANGLE_X,
+    DynamicOptions,
+    SceneName,
+    StillOptions,
+    hemisphere_cameras,
+    render_scene,
+    scene_at,
+    write_dynamic_capture,
+    write_still_capture,
+)
+from dyngs.errors import DyngsError
+
+NAMES: tuple[SceneName, ...] = get_args(SceneName)
+TINY = DynamicOptions(size=16, num_times=5, num_test=3, num_val=2, num_cameras=3, samples=1)
+
+
+def _files(root: Path) -> dict[str, bytes]:
+    return {p.relative_to(root).as_posix(): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+
+def _read(root: Path) -> Capture:
+    return read_capture(DataConfig(root=root))  # type: ignore[call-arg]
+
+
+def _pixels(path: Path) -> np.ndarray:
+    return oiio.ImageBuf(str(path)).get_pixels(oiio.UINT8)
+
+
+def test_capture_has_blender_layout_and_repeats_bytewise(tmp_path: Path) -> None:
+    options = StillOptions(size=24, num_train=3, num_val=1, num_test=2, samples=2)
+    first, second = (write_still_capture(tmp_path / name, options) for name in ("a", "b"))
+    assert _files(first) == _files(second)
+    assert len(_files(first)) == 3 + 1 + 2 + 3
+    for split, count in (("train", 3), ("val", 1), ("test", 2)):
+        document = json.loads((first / f"transforms_{split}.json").read_text())
+        assert document["camera_angle_x"] == CAMERA_ANGLE_X
+        assert len(document["frames"]) == count
+        for frame in document["frames"]:
+            assert set(frame) == {"file_path", "transform_matrix"}
+            pose = np.array(frame["transform_matrix"])
+            np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+            np.testing.assert_allclose(
+                pose[:3, 3], 4.0 * pose[:3, 2], atol=1e-12
+            )  # OpenGL: z points away from the scene
+            spec = oiio.ImageBuf(str(first / (frame["file_path"] + ".png"))).spec()
+            assert (spec.width, spec.height, spec.nchannels) == (24, 24, 4)
+
+
+def test_cameras_differ_by_seed_only_in_azimuth() -> None:
+    a, b = hemisphere_cameras(7, 4.0, 0), hemisphere_cameras(7, 4.0, 1)
+    assert not np.allclose(a, b)
+    np.testing.assert_allclose(a[:, 2, 3], b[:, 2, 3])
+    assert (a[:, 2, 3] > 0).all()
+
+
+# ------------------------------------------------------------------------------------------------ scenes that move
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_seed_gives_the_same_bytes_and_another_one_other_cameras(name: SceneName, tmp_path: Path) -> None:
+    first, second = (write_dynamic_capture(name, tmp_path / part, TINY) for part in ("a", "b"))
+    assert _files(first) == _files(second)
+    other = write_dynamic_capture(name, tmp_path / "c", DynamicOptions(**(vars(TINY) | {"seed": 1})))
+    assert _files(other).keys() == _files(first).keys()
+    assert _files(other)["transforms_train.json"] != _files(first)["transforms_train.json"]
+
+
+@pytest.mark.parametrize("name", ["spin", "wave", "merge"])
+def test_one_camera_per_time_is_read_back_as_it_was_written(name: SceneName, tmp_path: Path) -> None:
+    capture = _read(write_dynamic_capture(name, tmp_path / "out", TINY))
+    assert capture.has_alpha
+    assert capture.warnings == ()
+    times = {split: [view.time or 0.0 for view in views] for split, views in capture.splits.items()}
+    assert times["train"] == [0.0, 0.25, 0.5, 0.75, 1.0]
+    assert times["val"] == [0.0, 1.0]
+    assert set(times["test"]) <= {0.125, 0.375, 0.625, 0.875}, "midway between training times"
+    assert times["test"] == sorted(set(times["test"]))
+    centers = {s: np.array([camera_center(v.cam_from_world) for v in views]) for s, views in capture.splits.items()}
+    for kept in centers.values():
+        np.testing.assert_allclose(np.linalg.norm(kept, axis=1), 4.0)
+    np.testing.assert_array_equal(centers["val"][0], centers["val"][1])
+    heights = centers["train"][:, 2]
+    assert not (np.diff(heights) > 0).all(), "the height of the camera must not tell the time"
+    assert len(np.unique(heights.round(6))) == 5
+
+
+def test_the_room_is_filmed_by_fixed_cameras_of_which_one_is_for_testing(tmp_path: Path) -> None:
+    capture = _read(write_dynamic_capture("room", tmp_path / "out", TINY))
+    assert not capture.has_alpha
+    assert capture.warnings == ()
+    seen = {split: {(v.camera_id, v.time) for v in views} for split, views in capture.splits.items()}
+    assert seen["train"] == {(camera, i / 4) for camera in range(3) for i in range(5)}
+    assert seen["test"] == {(3, i / 4) for i in range(5)}
+    assert seen["val"] == {(4, i / 4) for i in range(5)}
+    poses: dict[int, set[bytes]] = {}
+    for views in capture.splits.values():
+        for view in views:
+            poses.setdefault(view.camera_id, set()).add(view.cam_from_world.tobytes())
+    assert [len(poses[camera]) for camera in range(5)] == [1] * 5, "fixed"
+    assert len(set.union(*poses.values())) == 5, "each somewhere else"
+    azimuths = {}
+    for camera, kept in poses.items():
+        x, y, _ = camera_center(np.frombuffer(next(iter(kept))).reshape(4, 4))
+        azimuths[camera] = np.degrees(np.arctan2(y, x))
+    assert azimuths[0] < azimuths[3] < azimuths[2], "the test camera stands between training cameras"
+    assert min(abs(azimuths[3] - azimuths[camera]) for camera in range(3)) > 5
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_picture_shows_its_scene_at_its_time(name: SceneName, tmp_path: Path) -> None:
+    root = write_dynamic_capture(name, tmp_path / "out", TINY)
+    for split in ("train", "val", "test"):
+        frame = json.loads((root / f"transforms_{split}.json").read_text())["frames"][-1]
+        expected = render_scene(scene_at(name, frame["time"]), np.array(frame["transform_matrix"]), 16, 1)
+        found = _pixels(root / (frame["file_path"] + ".png"))
+        np.testing.assert_array_equal(found, expected[..., : found.shape[2]])
+        assert found.shape[2] == (3 if name == "room" else 4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_inspection_finds_nothing_suspicious(name: SceneName, tmp_path: Path) -> None:
+    assert inspect_capture(write_dynamic_capture(name, tmp_path / "out", TINY), deep=True).problems == ()
+
+
+def test_one_time_and_many_test_pictures_are_allowed(tmp_path: Path) -> None:
+    options = DynamicOptions(size=4, num_times=1, num_test=4, samples=1)
+    capture = _read(write_dynamic_capture("spin", tmp_path / "out", options))
+    assert [view.time for view in capture.splits["train"]] == [0.0]
+    assert [view.time for view in capture.splits["test"]] == [0.5] * 4
+
+
+def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path: Path) -> None:
+    used = tmp_path / "used"
+    used.mkdir()
+    (used / "mine.txt").write_text("keep")
+    with pytest.raises(DyngsError, match="used exists already"):
+        write_dynamic_capture("spin", used, TINY)
+    with pytest.raises(DyngsError, match="nosuch"):
+        write_dynamic_capture("nosuch", tmp_path / "new", TINY)  # type: ignore[arg-type]
+    with pytest.raises(DyngsError, match="num_times"):
+        write_dynamic_capture("room", tmp_path / "new", DynamicOptions(num_times=0))
+    assert [p.name for p in tmp_path.rglob("*")] == ["used", "mine.txt"]
+
+
+# ------------------------------------------------------------------------------------------------ dyngs data synth
+
+
+def test_the_command_knows_all_scenes() -> None:
+    assert ("still", *get_args(SceneName), "human") == SYNTHETIC_SCENES
+
+
+@pytest.mark.parametrize(
+    ("words", "pictures", "preset"),
+    [(["spin", "--views", "3"], 3, "dynamic"), (["room", "--views", "2", "--cameras", "3"], 6, "dynamic")],
+)
+def test_command_writes_and_says_what_is_next(
+    words: list[str], pictures: int, preset: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, *options = words
+    assert main(["data", "synth", name, str(tmp_path / "new"), "--size", "8", *options]) == 0
+    assert f"dyngs train configs/{preset}.yaml data.root={tmp_path / 'new'}" in capsys.readouterr().out
+    capture = _read(tmp_path / "new")
+    assert len(capture.splits["train"]) == pictures
+    assert {(view.width, view.height) for view in capture.splits["train"]} == {(8, 8)}
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("nosuch new", "'nosuch'"),
+        ("spin used", "exists already"),
+        ("spin new --views 0", "--views"),
+        ("spin new --seed -1", "--seed"),
+        ("spin new --cameras 3", "--cameras"),
+        ("room new --cameras 0", "--cameras"),
+    ],
+)
+def test_command_refuses_in_one_line(
+    words: str, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("used").mkdir()
+    Path("used/mine.txt").write_text("keep")
+    assert main(["data", "synth", *words.split()]) != 0
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert part in lines[0]
+    assert not Path("new").exists()

@@ -1,0 +1,243 @@
+"""Evaluation: known scores, the report file, and what happens with nothing to evaluate."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from moving_scene import TEST_TIMES, Sliding, moving_scene, still_scene, write_moving_run
+
+from dyngs.camera import Cameras
+from dyngs.config import Config, DataConfig, StaticModel
+from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.conventions import RasterizeMode
+from dyngs.data.capture import Capture
+from dyngs.data.loader import Picture
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.deform.trained import TrainedScene
+from dyngs.errors import DyngsError
+from dyngs.evaluate.metrics import Lpips, psnr
+from dyngs.evaluate.report import (
+    evaluate_run,
+    parameter_megabytes,
+    render_options,
+    report_path,
+    score_views,
+    split_views,
+)
+from dyngs.gaussians import Gaussians
+from dyngs.rendering import RenderOptions, render
+from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
+
+NO_LPIPS = Lpips("alex", "no weights here")
+
+
+def some_gaussians(count: int = 12, degree: int = 0) -> Gaussians:
+    random = torch.Generator().manual_seed(3)
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=random) * 2 - 1
+
+    sh = uniform(count, (degree + 1) ** 2, 3)
+    return Gaussians(uniform(count, 3), uniform(count, 4), uniform(count, 3) * 0.3 - 1.5, uniform(count) + 1, sh)
+
+
+def as_scene(gaussians: Gaussians) -> TrainedScene:
+    return TrainedScene(gaussians, torch.zeros(0, dtype=torch.long))
+
+
+def camera(width: int = 20, height: int = 14, distance: float = 4.0) -> Cameras:
+    pose = torch.eye(4)
+    pose[2, 3] = distance
+    intrinsics = torch.tensor([[20.0, 0, width / 2], [0, 20, height / 2], [0, 0, 1]])
+    return Cameras(pose[None], intrinsics[None], width, height)
+
+
+def picture(rgb: torch.Tensor, cameras: Cameras, name: str = "a", mask: torch.Tensor | None = None) -> Picture:
+    return Picture(name=name, cameras=cameras, rgb_premultiplied=rgb, alpha=None, mask=mask, time=None)
+
+
+def write_run(folder: Path, gaussians: Gaussians, background: str = "auto") -> Path:
+    """A run folder with a 16x16 capture of 2 train and 3 test pictures beside it."""
+    root = write_still_capture(folder / "capture", StillOptions(size=16, num_train=2, num_test=3, samples=1))
+    run_dir = folder / "run"
+    config = Config(data=DataConfig.model_validate({"root": root, "background": background}))
+    save_config(config, run_dir / RESOLVED_NAME)
+    tensors = {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
+    save_checkpoint(run_dir, Checkpoint(CheckpointInfo(7, 1.0, (0.0, 0.0, 0.0), "white", "classic"), tensors), 12.5)
+    return run_dir
+
+
+def test_scores_are_those_of_the_pictures() -> None:
+    gaussians, cameras, options = some_gaussians(), camera(), RenderOptions()
+    background = torch.tensor([0.2, 0.4, 0.6])
+    rendered = render(gaussians, cameras, options, background=background).rgb[0].clamp(0, 1)
+    darker = rendered * 0.5
+    pictures = [picture(rendered, cameras, "same"), picture(darker, cameras, "darker")]
+    scores, reasons = score_views(as_scene(gaussians), pictures, options, background, NO_LPIPS)
+    same, other = scores
+    assert (same.name, same.psnr, same.width, same.height) == ("same", 100.0, 20, 14)
+    assert same.ssim == pytest.approx(1.0, abs=1e-6)
+    assert other.psnr == psnr(rendered, darker)
+    assert other.ssim < 0.99
+    assert same.lpips is None
+    assert reasons["lpips"] == "no weights here"
+    assert (same.flip is None) == ("flip" in reasons)
+    assert same.flip in (None, 0.0)
+    assert all(score.render_seconds > 0 for score in scores)
+
+
+def test_masks_reach_every_metric() -> None:
+    gaussians, cameras, options = some_gaussians(), camera(), RenderOptions()
+    rendered = render(gaussians, cameras, options).rgb[0].clamp(0, 1)
+    mask = torch.ones(14, 20)
+    mask[:, :10] = 0
+    spoiled = torch.where(mask[..., None] > 0, rendered, 1 - rendered)
+    scores, _ = score_views(
+        as_scene(gaussians), [picture(spoiled, cameras, mask=mask)], options, torch.zeros(3), NO_LPIPS
+    )
+    assert scores[0].psnr == 100.0
+    assert scores[0].ssim == pytest.approx(1.0, abs=1e-6)
+    assert scores[0].flip in (None, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("truth", "mask", "message"),
+    [
+        (torch.full((14, 20, 3), math.nan), None, "view 'a': psnr is not finite, the picture holds"),
+        (torch.zeros(14, 20, 3), torch.zeros(14, 20), "view 'a': psnr is not finite, its mask ignores every pixel"),
+    ],
+)
+def test_values_that_are_not_finite_are_refused(truth, mask, message) -> None:
+    pictures = [picture(truth, camera(), mask=mask)]
+    with pytest.raises(DyngsError, match=message):
+        score_views(as_scene(some_gaussians()), pictures, RenderOptions(), torch.zeros(3), NO_LPIPS)
+
+
+def test_report_of_a_run(tmp_path) -> None:
+    gaussians = some_gaussians(degree=1)
+    run_dir = write_run(tmp_path, gaussians)
+    report = evaluate_run(run_dir)
+    stored = json.loads((run_dir / "metrics.json").read_text())
+    assert stored == json.loads(report.to_json())
+    keys = "split num_views width height background psnr ssim flip lpips lpips_net num_gaussians model_mb fps"
+    over_time = (
+        "num_moving moving_share field_mb deform_share flicker flicker_error psnr_per_time psnr_person ssim_person"
+    )
+    rest = {"seconds_train", "step", "reasons", "notes", "per_view", "colour_floats", "stored_mb"}
+    assert set(keys.split()) | set(over_time.split()) | rest == set(stored)
+    facts = {"split": "test", "num_views": 3, "width": 16, "height": 16, "background": "white", "lpips_net": "alex"}
+    facts |= {"num_gaussians": 12, "step": 7, "seconds_train": 12.5}
+    assert {key: stored[key] for key in facts} == facts
+    assert stored["model_mb"] == pytest.approx(12 * 4 * (3 + 4 + 3 + 1 + 12) / 1e6)
+    assert stored["psnr"] == pytest.approx(sum(view["psnr"] for view in stored["per_view"]) / 3)
+    assert stored["ssim"] == pytest.approx(sum(view["ssim"] for view in stored["per_view"]) / 3)
+    for name in ("flip", "lpips", "flicker", "flicker_error"):
+        assert (stored[name] is None) == (name in stored["reasons"])
+    assert stored["fps"] > 0
+    assert 0 <= stored["deform_share"] < 1
+    assert (stored["num_moving"], stored["moving_share"], stored["field_mb"]) == (0, 0, 0)
+    assert stored["psnr_per_time"] == []
+    assert {view["time"] for view in stored["per_view"]} == {None}
+    assert len({view["name"] for view in stored["per_view"]}) == 3
+    again = evaluate_run(run_dir)
+    assert (again.psnr, again.ssim, again.flip) == (report.psnr, report.ssim, report.flip)
+
+
+def test_other_splits_and_backgrounds(tmp_path) -> None:
+    run_dir = write_run(tmp_path, some_gaussians(), background="random")
+    report = evaluate_run(run_dir, "train", lpips_net="vgg", threads=1)
+    assert report_path(run_dir, "train") == run_dir / "metrics_train.json"
+    stored = json.loads((run_dir / "metrics_train.json").read_text())
+    assert (stored["split"], stored["num_views"], stored["background"]) == ("train", 2, "black")
+    assert report.notes == ("trained on random backgrounds, evaluated on black",)
+    assert report.lpips_net == "vgg"
+    assert not (run_dir / "metrics.json").exists()
+    with pytest.raises(DyngsError, match=r"the split 'val' has no views; there is train \(2 views\), test \(3 views\)"):
+        evaluate_run(run_dir, "val")
+    assert not (run_dir / "metrics_val.json").exists()
+
+
+def test_no_run() -> None:
+    with pytest.raises(DyngsError, match="nowhere"):
+        evaluate_run(Path("nowhere"))
+
+
+def test_report_is_strict_json(tmp_path) -> None:
+    report = evaluate_run(write_run(tmp_path, some_gaussians()))
+    with pytest.raises(ValueError, match="JSON"):
+        replace(report, psnr=math.inf).to_json()
+
+
+def test_options_are_those_of_training() -> None:
+    model = StaticModel(rasterize_mode=RasterizeMode.ANTIALIASED, eps2d=0.1, near=0.05)
+    options = render_options(model)
+    assert (options.mode, options.eps2d, options.near) == (RasterizeMode.ANTIALIASED, 0.1, 0.05)
+    assert options.depth == "none"
+    assert render_options(StaticModel()) == RenderOptions()
+    cut = render_options(StaticModel(alpha_min=0.02, transmittance_min=0.01))
+    assert (cut.alpha_min, cut.transmittance_min) == (0.02, 0.01)
+
+
+def test_cut_offs_are_the_runs_own_and_runs_from_before_have_the_usual(tmp_path) -> None:
+    run_dir = write_run(tmp_path, some_gaussians())
+    file, config, usual = run_dir / RESOLVED_NAME, load_resolved(run_dir), evaluate_run(run_dir).psnr
+    file.write_text("\n".join(line for line in file.read_text().splitlines() if "_min:" not in line))
+    assert load_resolved(run_dir) == config
+    save_config(load_resolved(run_dir, ["model.alpha_min=0.5"]), file)
+    assert evaluate_run(run_dir).psnr != usual
+
+
+def test_size_is_that_of_the_papers() -> None:
+    assert parameter_megabytes(as_scene(some_gaussians(1000, degree=3))) == pytest.approx(0.236)
+
+
+def test_capture_without_any_views(tmp_path) -> None:
+    with pytest.raises(DyngsError, match="there is none"):
+        split_views(Capture(tmp_path, "blender", {"train": ()}), "test")
+
+
+def test_report_of_a_moving_run(tmp_path) -> None:
+    run_dir = write_moving_run(tmp_path, standing=True)
+    report = evaluate_run(run_dir)
+    stored = json.loads((run_dir / "metrics.json").read_text())
+    assert (report.num_gaussians, report.num_moving, report.moving_share) == (5, 2, 0.4)
+    assert report.field_mb == pytest.approx(4e-6 * 2 * 3)
+    assert report.model_mb == pytest.approx(4e-6 * (5 * 14 + 6))
+    assert [view.time for view in report.per_view] == list(TEST_TIMES)
+    assert [(at["time"], at["num_views"]) for at in stored["psnr_per_time"]] == [(t, 1) for t in TEST_TIMES]
+    assert [at["psnr"] for at in stored["psnr_per_time"]] == [view["psnr"] for view in stored["per_view"]]
+    assert report.flicker is not None
+    assert report.flicker_error is not None
+    assert report.flicker_error > 0
+    assert 0 < report.deform_share < 1
+    assert report.notes == ()
+
+
+def test_still_models_of_moving_captures(tmp_path) -> None:
+    report = evaluate_run(write_moving_run(tmp_path / "static", moves=False))
+    assert (report.flicker, report.num_moving, report.notes) == (0.0, 0, ())
+    assert "stands still" in report.reasons["flicker_error"]
+    assert len(report.psnr_per_time) == len(TEST_TIMES)
+    run_dir = write_moving_run(tmp_path / "dynamic", moves=False)
+    config = (run_dir / RESOLVED_NAME).read_text().replace("kind: static", "kind: dynamic")
+    (run_dir / RESOLVED_NAME).write_text(config)
+    (note,) = evaluate_run(run_dir).notes
+    assert "nothing moves" in note
+
+
+def test_views_are_drawn_at_their_own_times() -> None:
+    scene, options, black = moving_scene(Sliding()), RenderOptions(), torch.zeros(3)
+    pictures = [
+        replace(picture(render(scene.at(t), camera(), options).rgb[0].clamp(0, 1), camera()), time=t)
+        for t in (0.0, 0.8)
+    ]
+    scores, _ = score_views(scene, pictures, options, black, NO_LPIPS)
+    assert [(s.psnr, s.time) for s in scores] == [(100.0, 0.0), (100.0, 0.8)]
+    scores, _ = score_views(still_scene(), pictures, options, black, NO_LPIPS)
+    assert scores[1].psnr < 40
+    assert all(s.deform_seconds <= s.render_seconds for s in scores)

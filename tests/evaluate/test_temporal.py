@@ -1,0 +1,170 @@
+"""Measures over time: known answers for scenes that stand, slide and blink."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from moving_scene import (
+    TEST_TIMES,
+    Blinking,
+    Sliding,
+    camera,
+    moving_scene,
+    still_scene,
+    write_timed_capture,
+)
+
+from dyngs.config import DataConfig
+from dyngs.data.frame_selection import standing_cameras
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.read import read_capture
+from dyngs.errors import DyngsError
+from dyngs.evaluate.temporal import (
+    Drawing,
+    TimeScore,
+    clamped_times,
+    flicker,
+    flicker_error,
+    flicker_of_split,
+    psnr_per_time,
+)
+from dyngs.rendering import RenderOptions
+
+
+def drawing(scene) -> Drawing:
+    return Drawing(scene, RenderOptions(), torch.zeros(3))
+
+
+def even(count: int) -> tuple[float, ...]:
+    return tuple(torch.linspace(0, 1, count, dtype=torch.float64).tolist())
+
+
+@pytest.fixture
+def split(tmp_path):
+    """Loader and views of a test split whose camera stands."""
+    config = DataConfig.model_validate({"root": write_timed_capture(tmp_path / "capture", standing=True)})
+    views = read_capture(config).splits["test"]
+    return PictureLoader(views, config), views
+
+
+def test_psnr_per_time_is_the_mean_of_the_views_of_each_time() -> None:
+    scores = [(0.5, 30.0), (0.0, 10.0), (0.5, 20.0), (None, 99.0), (0.0, 11.0), (1.0, 5.0)]
+    assert psnr_per_time(scores) == (TimeScore(0.0, 10.5, 2), TimeScore(0.5, 25.0, 2), TimeScore(1.0, 5.0, 1))
+    assert psnr_per_time([(None, 3.0)]) == ()
+
+
+def test_a_still_scene_does_not_flicker() -> None:
+    assert flicker(drawing(still_scene()), camera(), even(5)).value == 0.0
+
+
+@pytest.mark.parametrize("count", [3, 5, 61, 100])
+def test_blinking_is_twice_the_difference_of_its_two_pictures(count: int) -> None:
+    scene = drawing(moving_scene(Blinking(0.5, num_times=count), times=even(count)))
+    dark, bright = scene.picture(camera(), 0.0), scene.picture(camera(), 1 / (count - 1))
+    wanted = 2 * 255 * float((bright - dark).abs().double().mean())
+    assert wanted > 1
+    assert flicker(scene, camera(), even(count)).value == pytest.approx(wanted, rel=1e-5)
+
+
+def test_smooth_motion_flickers_less_the_finer_it_is_sampled() -> None:
+    scene = drawing(moving_scene(Sliding(0.5)))
+    coarse, fine = (flicker(scene, camera(), even(n)).value or 0.0 for n in (5, 9))
+    assert coarse > 0
+    assert fine < 0.5 * coarse  # a second difference falls with the square of the step
+
+
+def test_a_linear_change_does_not_flicker_however_it_is_sampled() -> None:
+    """Of a colour that rises linearly, uneven moments see no second difference either."""
+
+    class Brightening(Sliding):
+        def offsets(self, means, time, rows=None):
+            shift = torch.full((len(means), 3), 0.4 * time)
+            return replace(super().offsets(means, 0.0), colors=shift)
+
+    times = (0.0, 0.1, 0.15, 0.6, 1.0)
+    assert flicker(drawing(moving_scene(Brightening())), camera(), times).value == pytest.approx(0, abs=1e-3)
+
+
+def test_at_most_sixty_pictures_are_drawn() -> None:
+    motion = Sliding()
+    flicker(drawing(moving_scene(motion)), camera(8, 6), even(200))
+    assert motion.calls <= 60
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_times_are_a_reason(count: int) -> None:
+    found = flicker(drawing(moving_scene(Sliding())), camera(), (0.0, 1.0)[:count])
+    assert found.value is None
+    assert f"there are {count}" in (found.reason or "")
+
+
+def test_flicker_error_is_that_of_the_differences(split) -> None:
+    loader, views = split
+    assert [v.time for v in views] == list(TEST_TIMES)
+    truth = [loader[i].composite(torch.zeros(3)) for i in range(3)]
+    scene = drawing(moving_scene(Sliding()))
+    rendered = [scene.picture(loader[i].cameras, views[i].time) for i in range(3)]
+    steps = [(rendered[i + 1] - rendered[i]) - (truth[i + 1] - truth[i]) for i in range(2)]
+    wanted = 255 * float(torch.stack(steps).abs().double().mean())
+    assert wanted > 0.1
+    assert flicker_error(scene, loader, views).value == pytest.approx(wanted, rel=1e-4)
+    assert flicker_error(scene, loader, views[::-1]).value is not None
+
+
+def test_what_stands_where_the_truth_moves_is_wrong_by_the_truths_change(split) -> None:
+    loader, views = split
+    truth = torch.stack([loader[i].composite(torch.zeros(3)) for i in range(3)])
+    wanted = 255 * float(truth.diff(dim=0).abs().double().mean())
+    assert wanted > 0.1
+    assert flicker_error(drawing(still_scene()), loader, views).value == pytest.approx(wanted, rel=1e-4)
+
+
+def test_masks_leave_pixels_out_of_the_flicker_error(split) -> None:
+    loader, views = split
+
+    class Masked(PictureLoader):
+        def __getitem__(self, index: int) -> Picture:
+            mask = torch.ones(16, 16)
+            mask[:, : 4 + 4 * index] = 0
+            return replace(super().__getitem__(index), mask=mask)
+
+    masked = Masked(views, DataConfig(root=views[0].image_path.parent))
+    truth = torch.stack([loader[i].composite(torch.zeros(3)) for i in range(3)]).diff(dim=0).abs().double()
+    total = truth[0, :, 8:].sum() + truth[1, :, 12:].sum()
+    wanted = 255 * float(total) / (3 * 16 * (8 + 4))
+    assert flicker_error(drawing(still_scene()), masked, views).value == pytest.approx(wanted, rel=1e-4)
+
+
+def test_cameras_that_stand_are_found_whatever_the_order(split) -> None:
+    _, views = split
+    moved = replace(views[1], cam_from_world=views[1].cam_from_world + 0.5)
+    assert standing_cameras([views[2], moved, views[0]]) == [[2, 0]]
+    assert standing_cameras([views[0], views[0]]) == []
+    assert standing_cameras([replace(v, time=None) for v in views]) == []
+
+
+def test_reasons_where_there_is_nothing_to_measure(split) -> None:
+    loader, views = split
+    scene = drawing(moving_scene(Sliding()))
+    untimed = [replace(v, time=None) for v in views]
+    for found in (flicker_error(scene, loader, untimed), flicker_of_split(scene, loader, untimed)):
+        assert (found.value, found.reason) == (None, "the pictures have no times")
+    assert "stands still" in (flicker_error(scene, loader, views[:1]).reason or "")
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=8))
+def test_clamping_changes_only_what_lies_outside_and_says_so(times: list[float]) -> None:
+    inside, warnings = clamped_times(times)
+    assert all(0 <= t <= 1 for t in inside)
+    assert all(a == b for a, b in zip(times, inside, strict=True) if 0 <= a <= 1)
+    assert bool(warnings) == any(not 0 <= t <= 1 for t in times)
+
+
+@pytest.mark.parametrize("time", [float("nan"), float("inf")])
+def test_times_that_are_not_finite_are_refused(time: float) -> None:
+    with pytest.raises(DyngsError, match="finite"):
+        clamped_times((0.5, time))

@@ -1,0 +1,30 @@
+"""The limits of files from others, and the variable that raises them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dyngs.errors import DyngsError
+from dyngs.files.limits import VARIABLE, allowed, require_at_most
+
+
+def test_what_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(VARIABLE, raising=False)
+    assert allowed(100) == 100
+    require_at_most(Path("a.x"), 100, 100, "things")
+    line = r"a\.x: asks for 1,001 things, of which 100 are read at most; .* DYNGS_LIMITS=11$"
+    with pytest.raises(DyngsError, match=line):
+        require_at_most(Path("a.x"), 1001, 100, "things")
+    monkeypatch.setenv(VARIABLE, "11")
+    require_at_most(Path("a.x"), 1001, 100, "things")
+    with pytest.raises(DyngsError, match=r"over 10\^18 things, of which 1,100 .*=N"):
+        require_at_most(Path("a.x"), 10**5000, 100, "things")
+
+
+@pytest.mark.parametrize("text", ["", "x", "nan", "0", "-1", "0.5", "inf", "1e300"])
+def test_a_variable_that_means_nothing(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    monkeypatch.setenv(VARIABLE, text)
+    with pytest.raises(DyngsError, match=r"DYNGS_LIMITS=.* must be a number from 1 to 1e6"):
+        allowed(1)

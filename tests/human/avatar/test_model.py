@@ -1,0 +1,180 @@
+"""The avatar in training: it learns, repeats to the byte, resumes exactly, follows edits, and plays its clip back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from synthetic_bodies import model, write_npz
+from torch import Tensor
+
+from dyngs.build import assemble
+from dyngs.config import Config, DataConfig, DefaultStrategy, HumanModel, OptimConfig, RunConfig, TrainConfig
+from dyngs.errors import DyngsError
+from dyngs.evaluate.report import evaluate_run
+from dyngs.gaussians import TopologyEdit
+from dyngs.human.avatar.model import HumanScene
+from dyngs.human.avatar.trained import AvatarScene
+from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.runs.checkpoint import load_run, save_checkpoint, stored_scene
+from dyngs.static.densify import EditResult
+from dyngs.train.step import Trainer
+from dyngs.train.trainer import train
+from dyngs.view.playing import at_rest, playing_motion
+
+BUSY = DefaultStrategy(start=1, stop=30_000, every=4, max_gaussians=1, prune_opacity=0.11)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture") / "person"
+    return write_human_capture(folder, HumanOptions(size=32, num_frames=3, num_new=2, num_cameras=3, num_test=1))
+
+
+def tiny(capture: Path, run_dir: Path | None = None, steps: int = 10, **changes: object) -> Config:
+    model = {"resolution": 24, "heights": (0.0, 0.02), "carve": 0.0, "refine_from": 0.2, "sh_degree": 0} | changes
+    return Config(
+        data=DataConfig(root=capture),
+        model=HumanModel(**model),  # type: ignore[arg-type]
+        strategy=BUSY,
+        optim=OptimConfig(lr_sh_dc=0.02),
+        train=TrainConfig(steps=steps, log_every=1, alpha_weight=0.1),
+        run=RunConfig(dir=run_dir, threads=1),
+    )
+
+
+def human(trainer: Trainer) -> HumanScene:
+    assert isinstance(trainer.model, HumanScene)
+    return trainer.model
+
+
+def tensors_after(trainer: Trainer, steps: int) -> dict[str, Tensor]:
+    for _ in range(steps):
+        trainer.step()
+    return {name: x.clone() for name, x in trainer.checkpoint().tensors.items()}
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.mark.parametrize("pose_offsets", [False, True])
+def test_a_seed_decides_every_byte_and_resuming_changes_none(capture: Path, pose_offsets: bool) -> None:
+    config = tiny(capture, pose_offsets=pose_offsets)
+    straight = tensors_after(assemble(config), 10)
+    assert same(straight, tensors_after(assemble(config), 10))
+    first = assemble(config)
+    tensors_after(first, 6)
+    resumed = assemble(config)
+    resumed.restore(first.checkpoint())
+    assert same(straight, tensors_after(resumed, 4))
+    counts = {len(assemble(config).optimizer.parameters), len(straight["gaussians.means"])}
+    assert len(counts) == 2, "some must be pruned, or this test shows little"
+    learned = [straight[f"model.learned.{name}"] for name in ("poses", "trans", "turns", "joints", "weights")]
+    assert all(bool((x != 0).any()) for x in learned)
+
+
+def test_training_learns_and_evaluates_on_both_splits(capture: Path, tmp_path: Path) -> None:
+    config = tiny(capture, tmp_path / "run", steps=60)
+    start = stored_scene(assemble(config).checkpoint(), config.model)
+    run = load_run(train(config))
+    assert isinstance(run.scene, AvatarScene)
+    assert isinstance(start, AvatarScene)
+    assert float((run.scene.clip.poses - start.clip.poses).abs().max()) > 0
+    for split in ("test", "pose"):
+        report = evaluate_run(tmp_path / "run", split)
+        assert report.psnr > 18
+        assert report.psnr_person is not None
+        assert report.psnr_person < report.psnr
+        assert len(report.psnr_per_time) == (3 if split == "test" else 2)
+
+
+@pytest.mark.parametrize("pose_offsets", [False, True])
+@pytest.mark.parametrize("own_body", [False, True])
+def test_what_is_played_back_is_what_was_trained(
+    capture: Path, tmp_path: Path, pose_offsets: bool, own_body: bool
+) -> None:
+    body = write_npz(tmp_path / "model.npz", model("smplx")) if own_body else None
+    trainer = assemble(tiny(capture, pose_offsets=pose_offsets, body=body))
+    assert (human(trainer).subject.shapes is not None) == own_body
+    tensors_after(trainer, 8)
+    parameters, picture = trainer.optimizer.parameters, trainer.pictures[4]
+    drawn = human(trainer).gaussians_at(parameters, picture, trainer.done + 1).gaussians
+    scene = stored_scene(trainer.checkpoint(), trainer.config.model)
+    played = scene.at(picture.time)
+    torch.testing.assert_close(played.means, drawn.means.detach(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(played.log_scales.sum(1), drawn.log_scales.detach().sum(1), rtol=0, atol=1e-4)
+    assert not scene.is_still
+    assert len(scene.rows) == len(scene)
+
+
+def test_anchors_and_weights_follow_the_set(capture: Path) -> None:
+    trainer = assemble(tiny(capture))
+    tensors_after(trainer, 3)
+    model = human(trainer)
+    points, weights = model.anchors.points, model.corrections.learned["weights"].detach().clone()
+    source = torch.tensor([5, 2, 2, 9])
+    is_new = torch.tensor([False, False, True, False])
+    model.after_step(trainer.optimizer.parameters, 0, EditResult(TopologyEdit(source, is_new)))
+    assert torch.equal(model.anchors.points, points[source])
+    assert torch.equal(model.corrections.learned["weights"].detach(), weights[source])
+    assert len(trainer.model.state()["anchors.size"]) == 4
+
+
+def test_without_refinement_nothing_is_learned_about_the_fit(capture: Path) -> None:
+    found = tensors_after(assemble(tiny(capture, refine=False)), 6)
+    assert not any(bool(found[f"model.learned.{name}"].any()) for name in ("poses", "trans", "turns", "joints"))
+
+
+def test_penalties_are_zero_at_the_start_and_grow_with_offsets(capture: Path) -> None:
+    trainer = assemble(tiny(capture))
+    parameters = trainer.optimizer.parameters
+    model, picture = human(trainer), trainer.pictures[0]
+    first = model.gaussians_at(parameters, picture, 1).penalties
+    assert first["offset"].item() == 0
+    assert first["smoothness"].item() == 0
+    away = parameters.replace(means=parameters.means.detach() + torch.tensor([0.01, 0.0, 0.0]))
+    later = model.gaussians_at(away, picture, 1).penalties
+    assert later["offset"].item() == pytest.approx(model.options.offset_weight, rel=1e-4)
+    assert later["smoothness"].item() == pytest.approx(0, abs=1e-9)
+
+
+def test_scaffolds_outside_the_silhouette_are_carved(capture: Path) -> None:
+    counts = {}
+    for height in (0.02, 0.5):
+        config = tiny(capture, heights=(0.0, height), carve=0.9)
+        counts[height] = len(assemble(config).optimizer.parameters)
+    skin = len(assemble(tiny(capture, heights=(0.0,))).optimizer.parameters)
+    assert counts[0.5] - skin < 0.05 * skin
+    assert counts[0.02] > counts[0.5]
+
+
+def test_a_capture_without_bodies_is_an_error(capture: Path, tmp_path: Path) -> None:
+    from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+
+    write_still_capture(tmp_path / "still", StillOptions(size=16, num_train=2, num_test=1, samples=1))
+    with pytest.raises(DyngsError, match="has no body parameters"):
+        assemble(tiny(tmp_path / "still"))
+
+
+def test_colours_beyond_degree_1_are_refused(capture: Path) -> None:
+    with pytest.raises(DyngsError, match="give 0 or 1"):
+        assemble(tiny(capture, sh_degree=2))
+
+
+def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> None:
+    trainer = assemble(tiny(capture))
+    save_checkpoint(tmp_path, trainer.checkpoint(), 0.0)
+    from dyngs.config.io import RESOLVED_NAME, save_config
+
+    save_config(trainer.config, tmp_path / RESOLVED_NAME)
+    run = load_run(tmp_path)
+    own = playing_motion(run, capture / "body_train.npz")
+    assert len(own.run.scene.times) == 3
+    first, again = run.scene.at(0.0), own.run.scene.at(0.0)
+    torch.testing.assert_close(again.log_scales, first.log_scales, rtol=0, atol=1e-4)
+    rest = at_rest(run).scene
+    assert rest.is_still
+    spread = rest.at(None).means.amax(0) - rest.at(None).means.amin(0)
+    assert float(spread[0]) > 1.5, "arms to the sides"

@@ -1,0 +1,107 @@
+"""A trained avatar by itself: equal poses give equal pictures, and corrections that were learned are applied once."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.config import HumanModel
+from dyngs.deform.learned import LearnedTensors
+from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.avatar import Skeleton, first_gaussians
+from dyngs.human.avatar.model import HumanScene, Subject
+from dyngs.human.avatar.refine import Fit, corrected_clip, corrected_posing
+from dyngs.human.avatar.trained import AvatarScene, trained_avatar
+from dyngs.human.motion.clips import Clip, Footage
+from dyngs.human.pose.skinning import rotations
+from dyngs.human.template.body import default_body
+from dyngs.human.template.uv import texels_of
+from dyngs.rendering import render
+from dyngs.static.rates import Rates
+
+
+def random_clip(frames: int, seed: int = 0) -> Clip:
+    generator = torch.Generator().manual_seed(seed)
+    times = torch.linspace(0, 1, frames, dtype=torch.float64)
+    trans = torch.randn(frames, 3, generator=generator)
+    return Clip(times, 0.3 * torch.randn(frames, 55, 3, generator=generator), 0.1 * trans, torch.ones(frames))
+
+
+def stirred() -> tuple[HumanScene, Gaussians, AvatarScene]:
+    """A model whose corrections are not zero, its Gaussians, and what is stored of it."""
+    body = default_body()
+    gaussians, anchors = first_gaussians(texels_of(body, 24), (0.0,), 0)
+    gaussians = gaussians.replace(sh=torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(1)))
+    subject = Subject(Skeleton(body.joints, body.parents), anchors, Footage(random_clip(4), (0, 1, 2, 3)))
+    model = HumanScene(HumanModel(sh_degree=0), subject, Rates(10))
+    generator = torch.Generator().manual_seed(2)
+    for x in model.corrections.learned.values().values():
+        x += 0.05 * torch.randn(x.shape, generator=generator)
+    return model, gaussians, trained_avatar(gaussians, model.state())
+
+
+def seen(gaussians: Gaussians) -> Tensor:
+    pose = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    pose[2, 3] = 3.0
+    cameras = Cameras(pose[None], torch.tensor([[[40.0, 0, 20], [0, 40.0, 20], [0, 0, 1]]]), 40, 40)
+    return render(gaussians, cameras).rgb[0]
+
+
+def test_two_clips_of_the_same_pose_give_the_same_picture() -> None:
+    _, _, scene = stirred()
+    one, other = random_clip(3, seed=5), random_clip(6, seed=6)
+    for name in ("poses", "trans", "scale"):
+        getattr(other, name)[4] = getattr(one, name)[1]
+    first, second = (seen(scene.playing(c).at(t)) for c, t in ((one, 0.5), (other, 0.8)))
+    assert torch.equal(first, second)
+    assert float((first - seen(scene.playing(one).at(0.0))).abs().max()) > 0.05
+    assert float(first.max()) > 0.2
+
+
+def test_baked_corrections_are_those_of_training() -> None:
+    model, _, scene = stirred()
+    clip = model.subject.footage.clip
+    for row in range(len(clip)):
+        posing = corrected_posing(model.corrections.learned, clip, row)
+        torch.testing.assert_close(rotations(scene.clip.poses[row]), posing.rotations, rtol=0, atol=1e-5)
+        torch.testing.assert_close(scene.clip.trans[row], posing.trans)
+        torch.testing.assert_close(scene.clip.scale[row], posing.scale)
+
+
+def test_other_clips_get_what_holds_for_all_poses() -> None:
+    turns = torch.zeros(2, 3)
+    turns[1, 0] = 0.5
+    clip = Clip(torch.zeros(1, dtype=torch.float64), torch.zeros(1, 2, 3), torch.ones(1, 3), torch.ones(1))
+    clip.poses[0, 1, 1] = math.pi / 2
+    found = corrected_clip(Fit(turns, math.log(2)), clip)
+    wanted = (Rotation.from_rotvec([0, math.pi / 2, 0]) * Rotation.from_rotvec([0.5, 0, 0])).as_rotvec()
+    assert found.poses[0, 1].tolist() == pytest.approx(wanted.tolist(), abs=1e-6)
+    assert float(found.scale[0]) == pytest.approx(2)
+    assert torch.equal(found.trans, clip.trans)
+
+
+def test_parts_are_all_or_nothing() -> None:
+    _, _, scene = stirred()
+    assert len(scene.part("moving")) == len(scene)
+    assert len(scene.part("still")) == 0
+    still = scene.playing(random_clip(1))
+    assert still.is_still
+    assert still.moving_share == 0
+    assert len(still.part("still")) == len(scene)
+
+
+def test_penalties_pull_corrections_back() -> None:
+    model, _, _ = stirred()
+    terms = model.corrections.penalties()
+    assert set(terms) == {"pose", "skinning weights"}
+    sum(terms.values()).backward()  # type: ignore[union-attr]
+    learned: LearnedTensors = model.corrections.learned
+    for name in ("poses", "turns", "joints", "weights"):
+        grad = learned[name].grad
+        assert grad is not None
+        assert bool((grad * learned[name].detach() >= 0).all())

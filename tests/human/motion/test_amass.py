@@ -1,0 +1,272 @@
+"""AMASS files: every layout, both up axes, and broken files that end in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from motion_files import random_motion, slow_vertices, tiny_body
+
+from dyngs.errors import DyngsError
+from dyngs.human.motion.amass import read_amass
+from dyngs.human.motion.motion import JOINTS, Motion, Up
+
+SHARED = Path(__file__).parents[3] / "../shared/data"
+MODELS = {24: "smpl", 52: "smplh", 55: "smplx"}
+Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+FRAMES = 4
+
+
+def numbers(count: int = 55, **changes: Any) -> dict[str, object]:
+    """The arrays of a file for a body of so many joints."""
+    motion = random_motion(FRAMES)
+    return {
+        "poses": motion.for_joints(count).poses.reshape(FRAMES, -1).numpy().astype(np.float64),
+        "trans": motion.trans.numpy().astype(np.float64),
+        "betas": np.linspace(-1, 1, 16),
+        "gender": np.array("neutral"),
+        "mocap_framerate": np.array(120.0),
+        "dmpls": np.zeros((FRAMES, 8)),
+        **changes,
+    }
+
+
+def read(path: Path, arrays: dict[str, object], count: int = 55, up: Up = "auto", shapes: int = 0) -> Motion:
+    given = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
+    np.savez(path / "x.npz", **given)  # pyright: ignore[reportArgumentType]
+    return read_amass(path / "x.npz", tiny_body(count, shapes), up)
+
+
+def as_written(arrays: dict[str, object], count: int, scale: float = 1.0) -> Motion:
+    """What the file says, in its own world."""
+    poses = torch.zeros(FRAMES, 55, 3)
+    rows = {24: range(22), 52: [*range(22), *range(25, 55)], 55: range(55)}[count]
+    flat = torch.tensor(np.asarray(arrays["poses"])).float().reshape(FRAMES, -1, 3)
+    poses[:, list(rows)] = flat[:, : len(rows)]
+    trans, betas = (torch.tensor(np.asarray(arrays[key])).float() for key in ("trans", "betas"))
+    return Motion(poses, trans, betas, 120.0, torch.full((FRAMES,), scale))
+
+
+# --- up axis ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [24, 52, 55])
+@pytest.mark.parametrize("shapes", [0, 10, 16])
+def test_z_up_files_are_turned_vertex_by_vertex(tmp_path: Path, count: int, shapes: int) -> None:
+    """(x, y, z) becomes (x, z, -y) for all that is skinned, with the pelvis of the shaped body."""
+    arrays = numbers(count)
+    body = tiny_body(count, shapes)
+    expected = slow_vertices(body, as_written(arrays, count)) @ Y_FROM_Z.T
+    motion = read(tmp_path, arrays, count, shapes=shapes)
+    np.testing.assert_allclose(slow_vertices(body, motion), expected, atol=2e-6)
+    assert len(motion.betas) == shapes
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_turning_heeds_the_scale(tmp_path: Path, scale: float) -> None:
+    arrays = numbers(scale=scale)
+    expected = slow_vertices(tiny_body(), as_written(arrays, 55, scale)) @ Y_FROM_Z.T
+    motion = read(tmp_path, arrays, up="z")
+    np.testing.assert_allclose(slow_vertices(tiny_body(), motion), expected, atol=4e-6)
+    assert motion.scale.tolist() == [scale] * FRAMES
+
+
+@pytest.mark.parametrize(
+    ("changes", "up", "is_turned"),
+    [
+        ({}, "auto", True),
+        ({}, "y", False),
+        ({}, "z", True),
+        ({"scale": 1.0}, "auto", False),
+        ({"scale": 1.0}, "z", True),
+        ({"up_axis": "y"}, "auto", False),
+        ({"up_axis": "z", "scale": 1.0}, "auto", True),
+        ({"up_axis": "z"}, "y", False),
+    ],
+)
+def test_which_files_are_turned(tmp_path: Path, changes: dict[str, Any], up: Up, is_turned: bool) -> None:
+    """AMASS's are; those with a scale, which fits of our own write, are not; the file's word counts more, the caller's
+    most."""
+    arrays = numbers(**changes)
+    motion = read(tmp_path, arrays, up=up)
+    plain = as_written(arrays, 55)
+    assert torch.equal(motion.poses[:, 1:], plain.poses[:, 1:])
+    assert torch.equal(motion.poses[:, 0], plain.poses[:, 0]) == (not is_turned)
+    assert torch.equal(motion.trans, plain.trans) == (not is_turned)
+
+
+def test_motions_of_another_body_land_on_the_floor(tmp_path: Path) -> None:
+    """A file of SMPL-H on SMPL-X: its pelvis lies elsewhere, and its shape means nothing here."""
+    body = tiny_body(55, 10)
+    motion = read(tmp_path, numbers(52), 55, shapes=10)
+    assert slow_vertices(body, motion)[..., 1].min() == pytest.approx(0, abs=1e-6)
+    assert not motion.betas.any()
+    exact = read(tmp_path, numbers(55), 55, shapes=10)
+    assert abs(slow_vertices(body, exact)[..., 1].min()) > 0.01
+    assert exact.betas.any()
+
+
+def test_own_files_stay_where_they_are_on_any_body(tmp_path: Path) -> None:
+    arrays = numbers(scale=0.9)
+    motion = read(tmp_path, arrays, 24)
+    assert torch.equal(motion.trans, as_written(arrays, 55).trans)
+
+
+# --- layouts ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [24, 52, 55])
+def test_joints_of_every_width(tmp_path: Path, count: int) -> None:
+    """Fingers go to their places; the hands of SMPL are left out; what is not there does not turn."""
+    arrays = numbers(count, up_axis="y")
+    motion = read(tmp_path, arrays, count)
+    assert motion.poses.shape == (FRAMES, 55, 3)
+    assert motion.poses.dtype == motion.trans.dtype == torch.float32
+    written = dict(zip(JOINTS, random_motion(FRAMES).poses.unbind(1), strict=True))
+    for i, name in enumerate(JOINTS):
+        is_there = i < 22 or (count == 55) or (count == 52 and name not in ("jaw", "left_eye", "right_eye"))
+        assert torch.equal(motion.poses[:, i], written[name] if is_there else torch.zeros(FRAMES, 3)), name
+
+
+@pytest.mark.parametrize("left_out", [(), ("pose_hand",), ("pose_jaw", "pose_eye", "pose_hand")])
+def test_parts_instead_of_poses(tmp_path: Path, left_out: tuple[str, ...]) -> None:
+    """Root 3, body 63, jaw 3, eyes 6, hands 90, as SMPL-X joins them; missing ones do not turn."""
+    arrays = numbers(up_axis="y")
+    flat = np.asarray(arrays.pop("poses"))
+    cuts = {
+        "root_orient": (0, 3),
+        "pose_body": (3, 66),
+        "pose_jaw": (66, 69),
+        "pose_eye": (69, 75),
+        "pose_hand": (75, 165),
+    }
+    parts = {key: flat[:, a:b] for key, (a, b) in cuts.items() if key not in left_out}
+    expected = flat.copy()
+    for key in left_out:
+        expected[:, slice(*cuts[key])] = 0
+    np.testing.assert_array_equal(
+        read(tmp_path, {**arrays, **parts}).poses.reshape(FRAMES, -1).numpy(), expected.astype(np.float32)
+    )
+
+
+@pytest.mark.parametrize("key", ["mocap_framerate", "mocap_frame_rate"])
+def test_both_names_of_the_frame_rate(tmp_path: Path, key: str) -> None:
+    assert read(tmp_path, numbers(mocap_framerate=None) | {key: np.array(59.94)}).fps == 59.94
+
+
+def test_a_file_without_shape(tmp_path: Path) -> None:
+    assert read(tmp_path, numbers(betas=None, up_axis="y")).betas.tolist() == [0.0] * 10
+
+
+def test_scales_per_frame(tmp_path: Path) -> None:
+    assert read(tmp_path, numbers(scale=np.arange(1.0, 5.0))).scale.tolist() == [1, 2, 3, 4]
+
+
+def test_objects_beside_the_numbers_are_not_touched(tmp_path: Path) -> None:
+    """Some releases hold labels as Python objects."""
+    assert len(read(tmp_path, numbers(labels=np.array([{"a": 1}, None], dtype=object)))) == FRAMES
+
+
+def test_the_motions_at_hand() -> None:
+    """Feet on the floor, head up: they are y up."""
+    folder = SHARED / "body" / "motions"
+    if not folder.is_dir():
+        pytest.skip("the motions of ../shared/data are not here")
+    for path in [*folder.glob("*.npz"), *(SHARED / "human").glob("*/body_*.npz")]:
+        motion = read_amass(path, tiny_body())
+        with np.load(path) as file:
+            np.testing.assert_array_equal(motion.poses.reshape(len(motion), -1).numpy(), file["poses"])
+            np.testing.assert_array_equal(motion.trans.numpy(), file["trans"])
+            assert motion.fps == file["mocap_frame_rate"]
+            assert float(motion.scale[0]) == pytest.approx(float(file["scale"]))
+
+
+# --- broken files -----------------------------------------------------------------------------------------------------
+
+NAN = np.full((FRAMES, 3), np.nan)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"poses": None}, "has neither 'poses' nor 'root_orient'"),
+        ({"poses": None, "root_orient": np.zeros((4, 3))}, "has neither 'poses' nor 'pose_body'"),
+        ({"poses": np.zeros((4, 66))}, "'poses' must have 72, 156 or 165 numbers per frame, has 4 x 66"),
+        ({"poses": np.zeros(165)}, "'poses' must have .* has 165"),
+        ({"poses": np.zeros((0, 165)), "trans": np.zeros((0, 3))}, "has no frames"),
+        ({"poses": np.full((4, 165), "a")}, "'poses' must hold numbers, not <U1"),
+        ({"poses": np.full((4, 165), 1e30)}, "'poses' holds NaN or huge"),
+        ({"poses": np.zeros((4, 165), complex)}, "'poses' must hold numbers"),
+        ({"poses": np.array([{}], object)}, "'poses' is not an array of numbers .*it holds Python objects"),
+        ({"trans": None}, "the key 'trans' is missing"),
+        ({"trans": NAN}, "'trans' holds NaN"),
+        ({"trans": np.zeros((3, 3))}, "'trans' must be 4 x 3 numbers as 'poses' has 4 frames, has 3 x 3"),
+        ({"mocap_framerate": None}, "the key 'mocap_framerate' is missing"),
+        ({"mocap_framerate": 0.0}, "'mocap_framerate' must be one positive number"),
+        ({"mocap_framerate": [30.0, 30.0]}, "'mocap_framerate' must be one positive number"),
+        ({"betas": np.zeros((4, 10))}, "'betas' must be one row of numbers, has 4 x 10"),
+        ({"scale": -1.0}, "'scale' must be one positive number"),
+        ({"scale": np.ones(3)}, "'scale' must be one positive number, or one for each of 4 frames"),
+        ({"mocap_framerate": 1e-310}, "1e-310 frames per second are not those of a motion"),
+        ({"poses": np.zeros((90_910, 72), np.uint8)}, "90910 frames of 55 joints are too many, 5,000,000 poses"),
+        ({"up_axis": np.frombuffer(b"\xff" * 4, "<U1")}, "'up_axis' is not an array .*what is no text"),
+        ({"up_axis": ["y", "z"]}, "'up_axis' must be 'y' or 'z', not"),
+        ({"up_axis": "x"}, "'up_axis' must be 'y' or 'z', not 'x'"),
+        (
+            {"poses": None, "root_orient": np.zeros((4, 3)), "pose_body": np.zeros((4, 60))},
+            "'pose_body' must be 4 x 63 numbers, has 4 x 60",
+        ),
+    ],
+)
+def test_broken_files_say_what_is_wrong(tmp_path: Path, changes: dict[str, object], problem: str) -> None:
+    with pytest.raises(DyngsError, match=problem) as caught:
+        read(tmp_path, numbers() | changes)
+    assert str(caught.value).startswith(str(tmp_path / "x.npz"))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\3\4", b"not an archive", b"\x93NUMPY\1\0"])
+def test_files_of_another_kind(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "x.npz").write_bytes(content)
+    with pytest.raises(DyngsError, match=r"x\.npz: ") as caught:
+        read_amass(tmp_path / "x.npz", tiny_body())
+    assert "\n" not in str(caught.value)
+
+
+def test_a_single_array_and_a_missing_file(tmp_path: Path) -> None:
+    np.save(tmp_path / "x.npy", np.zeros(3))
+    for name in ("x.npy", "none.npz"):
+        with pytest.raises(DyngsError, match=name):
+            read_amass(tmp_path / name, tiny_body())
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_damage_ends_in_one_line(tmp_path: Path, data: st.DataObject) -> None:
+    """Whatever is cut off, and whichever byte is another one."""
+    path = tmp_path / "x.npz"
+    read(tmp_path, numbers())
+    whole = path.read_bytes()
+    place, value = data.draw(st.integers(0, len(whole) - 1)), data.draw(st.integers(0, 255))
+    content = bytearray(whole)
+    content[place] = value
+    path.write_bytes(content if data.draw(st.booleans()) else whole[:place])
+    message = ""
+    try:
+        assert torch.isfinite(read_amass(path, tiny_body()).poses).all()
+    except DyngsError as error:
+        message = str(error)
+    assert "\n" not in message
+
+
+def test_the_turned_root_of_a_person_lying_on_the_back(tmp_path: Path) -> None:
+    """In a z-up world, a standing SMPL body is turned by 90 degrees about x: that becomes no turn at all."""
+    poses = np.zeros((FRAMES, 165))
+    poses[:, 0] = np.pi / 2
+    motion = read(tmp_path, numbers(poses=poses))
+    assert motion.poses.abs().max() < 1e-6

@@ -1,0 +1,194 @@
+"""BVH files: round trips, any order of channels, and broken files that end in one line."""
+
+from __future__ import annotations
+
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from measured import cost_of
+from motion_files import (
+    as_local,
+    depth_first,
+    pelvis_path,
+    random_motion,
+    skeleton,
+    tiny_body,
+    world_rotations,
+    write_bvh,
+)
+from scipy.spatial.transform import Rotation
+
+from dyngs.errors import DyngsError
+from dyngs.human.motion.bvh import read_bvh
+from dyngs.human.motion.motion import JOINTS
+from dyngs.human.motion.retarget import retarget
+
+TWO = """HIERARCHY
+ROOT Hip Bone {
+  OFFSET 1 2 3
+  CHANNELS 4 Yposition Zrotation Xrotation Yrotation
+  JOINT Spine
+  {
+    OFFSET 0 1 0
+    CHANNELS 1 Xrotation
+    End Site
+    {
+      OFFSET 0 1 0
+    }
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.025
+5 90 0 0 0
+5 0 0 0 90
+"""
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> Path:
+    """Two joints, two frames."""
+    path = tmp_path / "two.bvh"
+    path.write_text(TWO)
+    return path
+
+
+def test_known_answer(two: Path) -> None:
+    """Position channels take the place of OFFSET along their axis; a joint turns what hangs on it."""
+    source = read_bvh(two)
+    assert source.names == ("Hip Bone", "Spine")
+    assert source.fps == 40.0
+    assert not source.world_is_y_up
+    np.testing.assert_allclose(source.rest, [[0, 0, 0], [0, 1, 0]])
+    np.testing.assert_allclose(source.positions[:, 0], [[1, 5, 3], [1, 5, 3]])
+    np.testing.assert_allclose(source.positions[:, 1], [[0, 5, 3], [1, 6, 3]], atol=1e-12)
+    np.testing.assert_allclose(
+        source.rotations[0, 1], Rotation.from_euler("z", 90, degrees=True).as_matrix(), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        source.rotations[1, 1], Rotation.from_euler("x", 90, degrees=True).as_matrix(), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("order", ["".join(x) for x in permutations("XYZ")])
+def test_round_trip_of_a_body(tmp_path: Path, order: str) -> None:
+    """World rotations of all joints and the pelvis' path come back, in any order of rotations."""
+    own, motion, body = skeleton(), random_motion(5), tiny_body()
+    path = write_bvh(tmp_path / "x.bvh", own, as_local(motion, own), pelvis_path(body, motion), order, fps=120)
+    found = retarget(read_bvh(path), body)
+    ours, theirs = (world_rotations(x.poses.double().numpy(), own.parents) for x in (found, motion))
+    np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    moved, expected = (x.trans.numpy() - x.trans.numpy()[0] for x in (found, motion))
+    np.testing.assert_allclose(moved, expected, atol=1e-5)
+    assert found.fps == pytest.approx(120, rel=1e-6)
+
+
+def test_a_bent_elbow(tmp_path: Path) -> None:
+    """A T-pose, then the forearm up by a quarter turn about z."""
+    own = skeleton(JOINTS[:22])
+    angles = np.zeros((2, 22, 3))
+    angles[1, JOINTS.index("left_elbow"), 0] = 90
+    local = Rotation.from_euler("ZXY", angles.reshape(-1, 3), degrees=True).as_matrix().reshape(2, 22, 3, 3)
+    motion = retarget(read_bvh(write_bvh(tmp_path / "x.bvh", own, local, np.zeros((2, 3)))), tiny_body())
+    assert motion.poses[0].abs().max() < 1e-6
+    np.testing.assert_allclose(motion.poses[1, JOINTS.index("left_elbow")], (0, 0, np.pi / 2), atol=1e-6)
+
+
+@pytest.mark.parametrize("change", [("\n", "\r\n"), ("  ", "\t"), ("  OFFSET", "  \n\n  offset"), ("{", "\n{\n\n")])
+def test_looks_do_not_matter(two: Path, change: tuple[str, str]) -> None:
+    expected = read_bvh(two)
+    two.write_bytes(b"\xef\xbb\xbf" + TWO.replace(*change).encode())
+    found = read_bvh(two)
+    assert found.names == expected.names
+    np.testing.assert_array_equal(found.positions, expected.positions)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("HIERARCHY", "HIRARCHY", "does not begin with HIERARCHY"),
+        ("MOTION\n", "", "no part MOTION"),
+        ("ROOT Hip Bone", "JOINT Hip Bone", "did not expect 'JOINT Hip Bone'"),
+        ("JOINT Spine", "ROOT Spine", "did not expect 'ROOT Spine'"),
+        ("JOINT Spine", "JOINT", "did not expect 'JOINT'"),
+        ("  JOINT Spine\n  {", "  JOINT Spine\n", "expected a brace before 'OFFSET 0 1 0'"),
+        ("}\nMOTION", "MOTION", "HIERARCHY is cut off"),
+        ("OFFSET 1 2 3", "OFFSET 1 2", "OFFSET of 'Hip Bone' must be three numbers"),
+        ("  OFFSET 1 2 3\n", "", "'Hip Bone' has no OFFSET"),
+        ("OFFSET 1 2 3", "OFFSET 1 2 nan", "NaN or huge"),
+        ("OFFSET 1 2 3", "OFFSET 1 2 x", "could not convert"),
+        ("CHANNELS 4", "CHANNELS 6", "CHANNELS of 'Hip Bone' must be a count"),
+        ("Xrotation Y", "Wrotation Y", "CHANNELS of 'Hip Bone' must be a count"),
+        ("Frames: 2", "Frames: two", "must begin with 'Frames: '"),
+        ("Frames: 2", "Frames: 0", "at least one frame"),
+        ("Frames: 2", "Frames: 3", "says 3 frames of 5 numbers but holds 10"),
+        ("Frames: 2", "Frames: 999999999", "says 999999999 frames"),
+        ("Frame Time: 0.025", "Frame Time: 0", "a positive Frame Time"),
+        ("Frame Time: 0.025", "Frame Time: -1", "a positive Frame Time"),
+        ("Frame Time: 0.025", "Frame Time: 1e-310", "inf frames per second are not those of a motion"),
+        ("Frame Time: 0.025", "Frame Time: 1e-9", "1e.09 frames per second are not those of a motion"),
+        ("Frame Time: 0.025", "Frame Time: 1e8", "1e-08 frames per second are not those of a motion"),
+        ("5 0 0 0 90", "5 0 0 0", "says 2 frames of 5 numbers but holds 9"),
+        ("5 0 0 0 90", "5 0 0 0 inf", "NaN or huge"),
+        ("5 0 0 0 90", "5 0 0 0 1e30", "NaN or huge"),
+        ("5 0 0 0 90", "5 0 0 0 9,5", "could not convert"),
+    ],
+)
+def test_broken_files_say_what_is_wrong(two: Path, old: str, new: str, problem: str) -> None:
+    assert old in TWO
+    two.write_text(TWO.replace(old, new, 1))
+    with pytest.raises(DyngsError, match=problem) as caught:
+        read_bvh(two)
+    assert str(two) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match=r"none\.bvh: cannot be read \(No such file"):
+        read_bvh(tmp_path / "none.bvh")
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(0, len(TWO)), st.binary(max_size=8))
+def test_damage_ends_in_one_line(two: Path, cut: int, junk: bytes) -> None:
+    """Whatever is cut off, and whatever follows."""
+    two.write_bytes(TWO.encode()[:cut] + junk)
+    message = ""
+    try:
+        assert np.isfinite(read_bvh(two).positions).all()
+    except DyngsError as error:
+        message = str(error)
+    assert "\n" not in message
+
+
+HOSTILE = {
+    "frames": (f"{TWO[: TWO.index('Frames')]}Frames: 300000\nFrame Time: 0.03\n" + "0 " * 1_500_000, "too many"),
+    "blank lines": ("HIERARCHY" + "\n" * 1_000_000, "has no part MOTION"),
+    "joints": ("HIERARCHY ROOT a\n{\n" + "JOINT a\n{\n" * 5000 + "MOTION\n", "asks for 4,097 joints"),
+    "a long name": ("HIERARCHY\nROOT " + "a" * 1_000_000 + "\n{\n}\nMOTION", "has no OFFSET"),
+    "a long word": (TWO.replace("0.025", "9" * 1_000_000), "NaN or huge"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_files_cost_little(two: Path, name: str) -> None:
+    text, problem = HOSTILE[name]
+    two.write_text(text)
+
+    def read() -> None:
+        with pytest.raises(DyngsError, match=problem) as caught:
+            read_bvh(two)
+        assert len(str(caught.value)) < 600
+
+    memory, seconds = cost_of(read)
+    assert memory < 150e6
+    assert seconds < 20
+
+
+def test_joints_are_written_depth_first() -> None:
+    """What the writer of these tests relies on."""
+    assert depth_first((-1, 0, 0, 1, 2)) == [0, 1, 3, 2, 4]

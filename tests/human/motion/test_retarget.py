@@ -1,0 +1,275 @@
+"""Retargeting: known answers, and what units, axes and other bones must not change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import permutations, product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from motion_files import (
+    Skeleton,
+    pelvis_path,
+    random_motion,
+    skeleton,
+    slow_vertices,
+    tiny_body,
+    world_rotations,
+)
+from scipy.spatial.transform import Rotation
+
+from dyngs.errors import DyngsError
+from dyngs.human.motion.motion import JOINTS, Motion
+from dyngs.human.motion.retarget import (
+    SourceMotion,
+    least_rotation,
+    on_floor,
+    retarget,
+)
+
+MIDDLE = tuple(name for name in JOINTS if "_" not in name)
+AXES = [
+    np.eye(3)[list(order)] * np.array(signs)[:, None]
+    for order in permutations(range(3))
+    for signs in product((1, -1), repeat=3)
+]
+TURNS = [axes for axes in AXES if np.linalg.det(axes) > 0]
+
+
+def driven(own: Skeleton, poses: np.ndarray, root: np.ndarray) -> SourceMotion:
+    """The motion of a skeleton by local rotations (F, S, 3), its root at (F, 3)."""
+    rotations = world_rotations(poses, own.parents)
+    positions = np.empty((*poses.shape[:2], 3))
+    for i, parent in enumerate(own.parents):
+        bone = own.rest[i] - own.rest[parent]
+        positions[:, i] = root if parent < 0 else positions[:, parent] + rotations[:, parent] @ bone
+    return SourceMotion(Path("x.bvh"), own.names, own.rest, rotations, positions, 30.0, world_is_y_up=False)
+
+
+def at_rest(own: Skeleton, frames: int = 1) -> SourceMotion:
+    return driven(own, np.zeros((frames, len(own.names), 3)), np.tile(own.rest[0], (frames, 1)))
+
+
+def of_motion(motion: Motion, own: Skeleton) -> SourceMotion:
+    """The same rotations on a skeleton of our 55 joints."""
+    return driven(own, motion.poses.double().numpy(), motion.trans.double().numpy() + own.rest[0])
+
+
+def close(found: Motion, expected: Motion, atol: float = 1e-5) -> None:
+    """The same rotations and the same places."""
+    ours, theirs = (world_rotations(x.poses.double().numpy(), skeleton().parents) for x in (found, expected))
+    np.testing.assert_allclose(ours, theirs, atol=atol)
+    np.testing.assert_allclose(found.trans.numpy(), expected.trans.numpy(), atol=atol)
+
+
+# --- known answers ----------------------------------------------------------------------------------------------------
+
+
+def test_a_t_pose_is_the_zero_pose_on_the_floor() -> None:
+    body = tiny_body()
+    motion = retarget(at_rest(skeleton(), 2), body)
+    assert motion.poses.abs().max() < 1e-6  # joints of the body are float32
+    assert motion.poses.shape == (2, 55, 3)
+    assert motion.poses.dtype == motion.trans.dtype == torch.float32
+    torch.testing.assert_close(motion.trans[:, 1], -body.vertices[:, 1].min().expand(2))
+    torch.testing.assert_close(motion.trans[:, ::2], torch.zeros(2, 2))
+    assert motion.fps == 30.0
+    assert motion.scale.tolist() == [1.0, 1.0]
+
+
+def test_a_bent_elbow_is_a_bent_elbow() -> None:
+    """Forearm up by 90 degrees: about z, as the left arm points to +x."""
+    own = skeleton()
+    poses = np.zeros((1, 55, 3))
+    poses[0, JOINTS.index("left_elbow")] = (0, 0, np.pi / 2)
+    motion = retarget(driven(own, poses, own.rest[:1]), tiny_body())
+    np.testing.assert_allclose(motion.poses.numpy(), poses, atol=1e-6)
+
+
+def test_arms_that_hang_at_rest_are_lowered() -> None:
+    """An A-pose at rest comes out as arms 45 degrees down: every bone along the other's, the rest nearly as it was."""
+    own = skeleton()
+    lowered = own.rest.copy()
+    for side, angle in (("left", -45), ("right", 45)):
+        shoulder = JOINTS.index(f"{side}_shoulder")
+        arm = [i for i, name in enumerate(JOINTS) if name.startswith(side) and abs(own.rest[i, 0]) > 0.2]
+        turn = Rotation.from_euler("z", angle, degrees=True)
+        lowered[arm] = own.rest[shoulder] + turn.apply(own.rest[arm] - own.rest[shoulder])
+    motion = retarget(at_rest(replace(own, rest=lowered)), tiny_body())
+    expected = np.zeros((55, 3))
+    expected[JOINTS.index("left_shoulder")] = (0, 0, -np.pi / 4)
+    expected[JOINTS.index("right_shoulder")] = (0, 0, np.pi / 4)
+    np.testing.assert_allclose(motion.poses[0].numpy(), expected, atol=0.1)  # bones are not straight: some twist
+    turned = world_rotations(motion.poses.double().numpy(), own.parents)[0]
+    for start, end in (("left_shoulder", "left_elbow"), ("right_elbow", "right_wrist"), ("left_index1", "left_index2")):
+        i, j = JOINTS.index(start), JOINTS.index(end)
+        np.testing.assert_allclose(turned[i] @ (own.rest[j] - own.rest[i]), lowered[j] - lowered[i], atol=1e-6)
+
+
+def test_hands_without_fingers_go_with_their_arms_and_flat_feet_stay_flat() -> None:
+    own = skeleton([name for name in JOINTS[:22] if "foot" not in name])
+    names = own.names
+    splayed = own.rest.copy()
+    for side, sign in (("left", 1), ("right", -1)):
+        splayed[names.index(f"{side}_wrist")] += (-0.1 * sign, -0.2, 0)
+        splayed[names.index(f"{side}_ankle"), 0] += 0.2 * sign
+    motion = retarget(at_rest(replace(own, rest=splayed)), tiny_body())
+    pose = dict(zip(JOINTS, motion.poses[0].numpy(), strict=True))
+    assert pose["left_elbow"][2] < -0.5
+    assert abs(pose["left_wrist"]).max() < 1e-6
+    assert pose["left_knee"][2] > 0.2
+    np.testing.assert_allclose(pose["left_ankle"], -pose["left_knee"] - pose["left_hip"], atol=1e-6)
+
+
+def test_the_path_shrinks_with_the_legs() -> None:
+    """A giant of twice our size who goes 1 m lets us go half a metre, and a jump of 1 m lifts us by half a metre."""
+    own = skeleton()
+    giant = replace(own, rest=2 * own.rest)
+    root = giant.rest[0] + np.array([[0, 0, 0], [0, 1, 1.0]])
+    motion = retarget(driven(giant, np.zeros((2, 55, 3)), root), tiny_body())
+    np.testing.assert_allclose((motion.trans[1] - motion.trans[0]).numpy(), (0, 0.5, 0.5), atol=1e-6)
+
+
+# --- what must not matter ---------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 99), st.sampled_from(TURNS), st.floats(1e-3, 1e3))
+def test_rotations_are_kept_whatever_the_axes_and_the_unit(seed: int, turn: np.ndarray, unit: float) -> None:
+    """On a skeleton of our proportions; its world and its rest pose have the same axes."""
+    body, original = tiny_body(), random_motion(seed=seed)
+    source = of_motion(original, skeleton())
+    found = retarget(
+        replace(
+            source,
+            rest=unit * source.rest @ turn.T,
+            rotations=turn @ source.rotations @ turn.T,
+            positions=unit * source.positions @ turn.T,
+        ),
+        body,
+    )
+    close(found, on_floor(original, body))
+
+
+@pytest.mark.parametrize("turn", TURNS[::5])
+def test_in_a_world_that_is_y_up_the_axes_of_the_rest_pose_do_not_matter(turn: np.ndarray) -> None:
+    original, body = random_motion(), tiny_body()
+    source = of_motion(original, skeleton())
+    source = replace(source, rest=source.rest @ turn.T, rotations=source.rotations @ turn.T, world_is_y_up=True)
+    close(retarget(source, body), on_floor(original, body))
+
+
+def test_a_rest_pose_that_faces_anywhere_faces_forward() -> None:
+    """Also between axes, beyond the 15 degrees within which they attract."""
+    yaw = Rotation.from_euler("y", 30, degrees=True).as_matrix()
+    own = skeleton()
+    assert abs(retarget(at_rest(replace(own, rest=own.rest @ yaw.T)), tiny_body()).poses).max() < 1e-6
+
+
+def test_a_crooked_rest_pose_does_not_turn_the_world() -> None:
+    """One hip 1 cm before the other is no reason to walk askew."""
+    own = skeleton()
+    crooked = own.rest.copy()
+    crooked[JOINTS.index("left_hip"), 2] += 0.01
+    root = crooked[0] + np.array([[0, 0, 0], [0, 0, 1.0]])
+    motion = retarget(driven(replace(own, rest=crooked), np.zeros((2, 55, 3)), root), tiny_body())
+    np.testing.assert_allclose((motion.trans[1] - motion.trans[0])[:2], 0, atol=1e-6)
+    assert motion.poses[:, JOINTS.index("left_shoulder")].abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("missing", [("spine2",), ("left_collar", "spine1", "head"), JOINTS[22:]])
+def test_joints_that_the_other_lacks_follow_their_parents(missing: tuple[str, ...]) -> None:
+    own = skeleton([name for name in JOINTS if name not in missing])
+    poses = random_motion(2).poses.double().numpy()[:, [JOINTS.index(name) for name in own.names]]
+    source = driven(own, poses, np.zeros((2, 3)))
+    motion = retarget(source, tiny_body())
+    found = world_rotations(motion.poses.double().numpy(), skeleton().parents)
+    for i, name in enumerate(JOINTS):
+        if name in missing:
+            assert motion.poses[:, i].abs().max() < 1e-6
+        else:
+            np.testing.assert_allclose(found[:, i], source.rotations[:, own.names.index(name)], atol=1e-5)
+
+
+def test_joints_in_between_do_not_matter() -> None:
+    """A bone of two parts, such as a twist bone."""
+    source = of_motion(random_motion(), skeleton())
+    halfway = source.rest[[JOINTS.index("left_shoulder"), JOINTS.index("left_elbow")]].mean(0)
+    longer = replace(
+        source,
+        names=("twist", *source.names),
+        rest=np.concatenate([halfway[None], source.rest]),
+        rotations=np.concatenate([source.rotations[:, 9:10], source.rotations], axis=1),
+        positions=np.concatenate([source.positions[:, 9:10], source.positions], axis=1),
+    )
+    close(retarget(longer, tiny_body()), retarget(source, tiny_body()), atol=0)
+
+
+@pytest.mark.parametrize("count", [24, 52])
+def test_bodies_with_fewer_joints(count: int) -> None:
+    """Rotations of the joints that they have are kept."""
+    original, body = random_motion(angle=0.6), tiny_body(count)
+    motion = retarget(of_motion(original, skeleton()), body)
+    close(motion, on_floor(original, body))
+    assert slow_vertices(body, motion)[..., 1].min() == pytest.approx(0, abs=1e-6)
+
+
+# --- floor and small parts --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [24, 52, 55])
+def test_the_lowest_vertex_comes_to_the_floor(count: int) -> None:
+    body = tiny_body(count)
+    motion = replace(random_motion(), scale=torch.tensor([0.5, 1.0, 1.5, 2.0]))
+    landed = on_floor(motion, body)
+    assert slow_vertices(body, landed)[..., 1].min() == pytest.approx(0, abs=1e-6)
+    assert torch.equal(landed.trans[:, ::2], motion.trans[:, ::2])
+    rise = pelvis_path(body, landed) - pelvis_path(body, motion)
+    assert np.ptp(rise[:, 1]) < 1e-6
+
+
+@settings(max_examples=60, deadline=None)
+@example((1.0, 0.0, 0.0), (-1.0, 3e-5, 0.0), False)  # nearly opposite: taken for opposite, so 3e-5 off
+@example((0.0, 0.0, 1.0), (0.0, 4.315011e-238, 1.0), False)  # the product's square vanishes
+@example((1.0, 0.0, 0.0), (-1.0, 5e-5, 0.0), False)  # and just not so: 1e-7 off
+@given(*[st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-2)] * 2, st.booleans())
+def test_the_least_rotation(start: tuple, end: tuple, opposite: bool) -> None:
+    """It takes one direction to the other by the angle between them, also by half a turn."""
+    a = np.array(start) / np.linalg.norm(start)
+    b = -a if opposite else np.array(end) / np.linalg.norm(end)
+    turn = least_rotation(a, b)
+    np.testing.assert_allclose(turn @ a, b, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), rtol=0, atol=1e-14)
+    assert np.linalg.det(turn) == pytest.approx(1)
+    assert Rotation.from_matrix(turn).magnitude() == pytest.approx(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_rest_pose_that_lies_in_a_line_is_refused() -> None:
+    """As in files whose bones all point along x while no joint is turned."""
+    own = skeleton()
+    depth = np.zeros(55)
+    for i, parent in enumerate(own.parents):
+        depth[i] = 0 if parent < 0 else depth[parent] + 0.2
+    line = np.outer(depth, (1, 0, 0))
+    with pytest.raises(DyngsError, match=r"x\.bvh: its rest pose does not stand upright; .*T-pose"):
+        retarget(at_rest(replace(own, rest=line)), tiny_body())
+
+
+def test_a_rest_pose_without_sides_is_refused() -> None:
+    own = skeleton()
+    flat = own.rest * (0, 1, 1)
+    with pytest.raises(DyngsError, match=r"x\.bvh: in its rest pose left and right do not differ"):
+        retarget(at_rest(replace(own, rest=flat)), tiny_body())
+
+
+def test_unknown_names_are_refused() -> None:
+    own = skeleton()
+    with pytest.raises(DyngsError, match=r"x\.bvh: unknown joint names"):
+        retarget(at_rest(replace(own, names=tuple(f"bone{i}" for i in range(55)))), tiny_body())

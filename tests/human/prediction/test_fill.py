@@ -1,0 +1,127 @@
+"""Gaussians from maps: those of an untrained network, and what each of its numbers does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tiny_people import NET, people, person
+from torch import Tensor
+
+from dyngs.human.pose.skinning import rotations
+from dyngs.human.prediction.fill import Avatar, filled, inputs_of, num_channels
+from dyngs.human.prediction.maps import Maps
+from dyngs.human.prediction.network import HEADS, AtlasNetwork
+from dyngs.human.prediction.sitter import Sitter
+
+Shown = tuple[Sitter, Maps]
+MEAN = torch.full((3, NET.resolution, NET.resolution), 0.25)
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
+    filmed = person(people(tmp_path_factory.mktemp("people"), (1,)) / "p1")
+    return filmed.sitter, filmed.look([0, 3, 6])
+
+
+def network(bias: dict[str, float] | None = None) -> AtlasNetwork:
+    """One that says the same everywhere: 0, or ``bias`` in every number of some heads."""
+    made = AtlasNetwork(num_channels(2), 2, (8, 8), torch.Generator().manual_seed(0))
+    names = [name for _ in range(2) for name, count in HEADS.items() for _ in range(count)]
+    with torch.no_grad():
+        made.heads.bias.copy_(torch.tensor([(bias or {}).get(name, 0.0) for name in names]))  # type: ignore[union-attr]
+    return made
+
+
+def predicted(shown: Shown, bias: dict[str, float] | None = None) -> Avatar:
+    with torch.no_grad():
+        return filled(*shown, MEAN, network(bias), 0.9)
+
+
+def matrices(quats: Tensor) -> Tensor:
+    """(N, 3, 3) of unit quaternions."""
+    w, xyz = quats[:, :1].clamp(-1, 1), quats[:, 1:]
+    return rotations(torch.nn.functional.normalize(xyz, dim=1) * 2 * torch.atan2(xyz.norm(dim=1, keepdim=True), w))
+
+
+def test_without_a_network_texels_have_seen_or_mean_colours(shown: Shown) -> None:
+    sitter, maps = shown
+    bare = filled(sitter, maps, MEAN, None, 0.9).gaussians
+    count = len(sitter.texels)
+    seen = maps.seen[0] > 0
+    torch.testing.assert_close(bare.base_rgb[:count][seen], maps.rgb[0][seen])
+    torch.testing.assert_close(bare.base_rgb[:count][~seen], torch.full_like(bare.base_rgb[:count][~seen], 0.25))
+    assert 0.5 < seen.float().mean() < 1
+
+
+def test_an_untrained_network_changes_colours_a_little_and_nothing_else(shown: Shown) -> None:
+    """It trusts pictures by 98 %."""
+    bare, untrained = filled(*shown, MEAN, None, 0.9), predicted(shown)
+    for name in ("means", "log_scales", "logit_opacities"):
+        assert torch.equal(getattr(bare.gaussians, name), getattr(untrained.gaussians, name))
+    torch.testing.assert_close(untrained.gaussians.quats, bare.gaussians.quats)
+    assert 0 < (bare.gaussians.base_rgb - untrained.gaussians.base_rgb).abs().max() < 0.02
+
+
+def test_the_skin_is_whole_and_scaffolds_are_carved(shown: Shown) -> None:
+    """Above the skin: seen, and inside the silhouettes of all three views."""
+    sitter, maps = shown
+    found = predicted(shown).subject.anchors
+    kept = (maps.inside[1] == 1) & (maps.seen[1] > 0)
+    assert (found.points[: len(sitter.texels)] == sitter.texels.points).all()
+    torch.testing.assert_close(
+        found.points[len(sitter.texels) :], (sitter.texels.points + 0.02 * sitter.texels.normals)[kept]
+    )
+    every = filled(sitter, maps, MEAN, None, 0.0).gaussians
+    assert len(found) < len(every) == len(sitter.texels) + int((maps.seen[1] > 0).sum())
+
+
+def test_every_quaternion_is_normalised_by_itself(shown: Shown) -> None:
+    """(1, 0, 0, 0) + 1 in all four is a turn by 2 acos(2 / sqrt 7) about the diagonal of each tangent frame."""
+    bare, turned = predicted(shown).gaussians, predicted(shown, {"turn": 1.0}).gaussians
+    torch.testing.assert_close(turned.quats.norm(dim=1), torch.ones(len(turned)))
+    angle = 2 * torch.tensor(2 / 7**0.5).acos()
+    expected = matrices(bare.quats) @ rotations(torch.ones(3) / 3**0.5 * angle)
+    torch.testing.assert_close(matrices(turned.quats), expected, atol=1e-5, rtol=0)  # float32
+
+
+def test_places_lengths_and_opacities_stay_within_bounds(shown: Shown) -> None:
+    """However loud the network: half way to the next scaffold along the normal, e^1.5 times as long."""
+    sitter, _ = shown
+    bare = predicted(shown).gaussians
+    loud = predicted(shown, {"rise": 50.0, "stretch": 50.0, "opacity": 2.0}).gaussians
+    count = len(sitter.texels)
+    torch.testing.assert_close(loud.means[:count], bare.means[:count] + 0.01 * sitter.texels.normals)
+    torch.testing.assert_close(loud.log_scales, bare.log_scales + 1.5)
+    torch.testing.assert_close(loud.logit_opacities, bare.logit_opacities + 2)
+
+
+def test_unseen_texels_are_painted_and_mistrusted_ones_too(shown: Shown) -> None:
+    sitter, maps = shown
+    seen = maps.seen[0] > 0
+    trusting = predicted(shown, {"paint": 0.5, "trust": 50.0}).gaussians.base_rgb[: len(sitter.texels)]
+    torch.testing.assert_close(trusting[seen], maps.rgb[0][seen])
+    torch.testing.assert_close(trusting[~seen], torch.full_like(trusting[~seen], 0.75))
+    wary = predicted(shown, {"paint": 0.5, "trust": -50.0}).gaussians.base_rgb
+    torch.testing.assert_close(wary, torch.full_like(wary, 0.75))
+
+
+def test_all_heads_learn(shown: Shown) -> None:
+    made = network()
+    avatar = filled(*shown, MEAN, made, 0.9)
+    sum(x.square().sum() for x in avatar.gaussians.tensors().values()).backward()  # type: ignore[union-attr]
+    grad = made.heads.bias.grad
+    assert grad is not None
+    moved = dict(zip(HEADS, grad.view(2, -1)[0].split(tuple(HEADS.values())), strict=True))
+    assert {name for name, x in moved.items() if bool((x == 0).all())} <= {"turn"}, "a turn changes no length"
+
+
+def test_inputs_hold_everything_in_the_atlas(shown: Shown) -> None:
+    sitter, maps = shown
+    found = inputs_of(sitter, maps, MEAN)
+    assert found.shape == (num_channels(2), NET.resolution, NET.resolution)
+    assert found[-1].sum() == len(sitter.texels)
+    other = inputs_of(sitter, replace(maps, rgb=1 - maps.rgb), MEAN)
+    changed = (found != other).flatten(1).any(1)
+    assert changed.tolist() == [True] * 3 + [False] * 2 + [True] * 3 + [False] * 12

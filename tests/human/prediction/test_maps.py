@@ -1,0 +1,166 @@
+"""Maps of pictures: the colours of a painted person, what is hidden, silhouettes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.config import HumanModel
+from dyngs.data.capture import Capture, View
+from dyngs.data.loader import Picture
+from dyngs.data.poses import cam_from_opengl
+from dyngs.data.readers.people import BodyFrames
+from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
+from dyngs.human.avatar.avatar import Posing
+from dyngs.human.motion.motion import JOINTS
+from dyngs.human.prediction.maps import from_atlas, maps_of, to_atlas
+from dyngs.human.prediction.sitter import Sitter, sitter_of
+from dyngs.human.synthetic.capture import PosedMesh, render_mesh
+from dyngs.human.synthetic.clothes import atlas_of, texture_places
+from dyngs.human.template.body import Body, default_body, posed_vertices
+from dyngs.human.template.mesh import interpolated, visible
+
+SIZE = 96
+FRONT = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3.5], [0, 0, 0, 1]])
+RIGHT = np.array([[0.0, 0, -1, -3.5], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""OpenGL poses that look at the middle of the template from before it, and from its right side."""
+
+
+@cache
+def body() -> Body:
+    return default_body()
+
+
+def sitter(poses: Tensor) -> Sitter:
+    """A person of whom there is one view, in the pose (55, 3), scaffolds at 0 and 4 cm."""
+    view = View("v", Path("v.png"), cam_from_opengl(FRONT), np.eye(3), SIZE, SIZE, frame=0)
+    frames = BodyFrames((0,), poses[None].double().numpy(), np.zeros((1, 3)), np.zeros(10), np.ones(1))
+    capture = Capture(Path("person"), "body_json", {"train": (view,)}, has_alpha=True, body={"train": frames})
+    return sitter_of(capture, HumanModel(resolution=64, heights=(0.0, 0.04)), body())
+
+
+def arms_before_the_chest() -> Tensor:
+    """(55, 3): forearms before the chest, across."""
+    poses = torch.zeros(55, 3)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        poses[JOINTS.index(f"{side}_shoulder")] = torch.tensor([0.0, -1.2 * sign, 0.0])
+        poses[JOINTS.index(f"{side}_elbow")] = torch.tensor([0.0, -1.5 * sign, 0.0])
+    return poses
+
+
+def painted(colour_of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    """(256, 256, 3) texture by places (P, 3) of the T-pose and the joint (P,) that moves each."""
+    uv, uv_faces = atlas_of(body())
+    columns, rows = texture_places(uv, 256)
+    hits = visible(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], 256, 256)
+    around = body().faces.numpy()[hits.faces]
+    places = interpolated(hits.shares, body().vertices.double().numpy()[around])
+    joints = interpolated(hits.shares, body().weights.double().numpy()[around]).argmax(1)
+    texture = np.full((256 * 256, 3), 0.5)
+    texture[hits.index] = colour_of(places, joints)
+    return texture.reshape(256, 256, 3)
+
+
+def picture(poses: Tensor, texture: np.ndarray, pose: np.ndarray) -> Picture:
+    exact, (uv, uv_faces) = body().to(torch.float64), atlas_of(body())
+    vertices = posed_vertices(exact, poses[None].double(), torch.zeros(1, 3).double())[0].numpy()
+    pixels = render_mesh(PosedMesh(vertices, body().faces.numpy(), uv, uv_faces, texture), pose, SIZE, 2)
+    rgba = torch.from_numpy(pixels).float()
+    focal = 0.5 * SIZE / np.tan(0.5 * CAMERA_ANGLE_X)
+    intrinsics = torch.tensor([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]]).float()
+    camera = Cameras(torch.from_numpy(cam_from_opengl(pose)).float()[None], intrinsics[None], SIZE, SIZE)
+    return Picture("v", camera, rgba[..., :3] * rgba[..., 3:], rgba[..., 3], None, None, 0)
+
+
+def is_arm(joints: np.ndarray | Tensor) -> np.ndarray:
+    names = np.array(JOINTS)[np.asarray(joints)]
+    arm = ("shoulder", "elbow", "wrist", "index", "middle", "pinky", "ring", "thumb")
+    return np.array([any(part in name for part in arm) for name in names])
+
+
+def posing(of: Sitter) -> Posing:
+    return of.posing(of.views[0])
+
+
+def test_what_is_behind_an_arm_does_not_get_its_colour() -> None:
+    """Arms red, the rest blue: of the texels seen, nearly all have their own colour, and parts of the chest are hidden
+    that are seen when the arms are aside. Mixed colours remain where a pixel covers both."""
+    texture = painted(lambda _, joints: np.where(is_arm(joints)[:, None], [0.9, 0.0, 0.0], [0.0, 0.0, 0.9]))
+    crossed = sitter(arms_before_the_chest())
+    maps = maps_of(crossed, [(picture(arms_before_the_chest(), texture, FRONT), posing(crossed))])
+    arms = torch.from_numpy(is_arm(crossed.texels.weights.argmax(1)))
+    redness = maps.rgb[0, :, 0] / maps.rgb[0].sum(1).clamp_min(1e-6)
+    seen = maps.seen[0] > 0.3
+    assert (redness[seen & arms] > 0.5).float().mean() > 0.9, "fingers are thinner than a pixel"
+    assert (redness[seen & ~arms] < 0.5).float().mean() > 0.98
+    aside = sitter(torch.zeros(55, 3))
+    free = maps_of(aside, [(picture(torch.zeros(55, 3), texture, FRONT), posing(aside))])
+    x, y, _ = aside.texels.points.T
+    chest = (free.seen[0] > 0.8) & ~arms & (x.abs() < 0.2) & ((y - 0.55).abs() < 0.08)
+    assert (maps.seen[0][chest] == 0).float().mean() > 0.1, "forearms cover a part of it"
+
+
+def test_a_texel_has_the_colour_of_its_place() -> None:
+    """A smooth colour over the body, from two sides; up to the light and half a pixel of its change."""
+    texture = painted(lambda places, _: 0.5 + 0.4 * np.sin(3 * places))
+    aside = sitter(torch.zeros(55, 3))
+    shown = [(picture(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
+    maps = maps_of(aside, shown)
+    seen = maps.seen[0] > 0.5
+    truth = 0.5 + 0.4 * torch.sin(3 * aside.texels.points)
+    hue = [x / x.sum(1, keepdim=True).clamp_min(1e-6) for x in (maps.rgb[0][seen], truth[seen])]
+    assert (hue[0] - hue[1]).abs().amax(1).quantile(0.95) < 0.05
+    assert seen.float().mean() > 0.4
+
+
+def test_only_what_faces_a_camera_is_seen() -> None:
+    """From before: nothing of the back, and most of the front; more from two sides than from one."""
+    texture, aside = np.full((8, 8, 3), 0.5), sitter(torch.zeros(55, 3))
+    shown = [(picture(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
+    one, two = maps_of(aside, shown[:1]), maps_of(aside, shown)
+    normals = aside.texels.normals
+    assert (one.seen[0][normals[:, 2] < -0.2] == 0).all()
+    assert (one.seen[0][normals[:, 2] > 0.8] > 0).float().mean() > 0.85, "not inside the mouth"
+    assert (two.seen >= one.seen).all()
+    assert (two.seen[0] > 0).sum() > 1.2 * (one.seen[0] > 0).sum()
+    assert (one.offsets - normals).norm(dim=1).quantile(0.99) < 0.2, "two ways of averaging normals"
+
+
+def test_scaffolds_far_from_the_skin_leave_the_silhouette() -> None:
+    """At 0 nearly all texels are inside, at 4 cm those that point aside are not; a second view carves more."""
+    texture, aside = np.full((8, 8, 3), 0.5), sitter(torch.zeros(55, 3))
+    shown = [(picture(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
+    one, two = maps_of(aside, shown[:1]), maps_of(aside, shown)
+    assert (one.inside[0] == 1).float().mean() > 0.9
+    assert (one.inside[1] == 1).float().mean() < 0.8
+    assert (two.inside[1] == 1).float().mean() < 0.8 * (one.inside[1] == 1).float().mean()
+    body_up = aside.texels.normals[:, 1] > 0.9
+    assert one.inside[1][body_up].mean() < 0.5
+
+
+def test_without_alpha_everything_is_inside() -> None:
+    aside, rest = sitter(torch.zeros(55, 3)), torch.zeros(55, 3)
+    opaque = replace(picture(rest, np.full((8, 8, 3), 0.5), FRONT), alpha=None)
+    assert (maps_of(aside, [(opaque, posing(aside))]).inside == 1).all()
+
+
+def test_no_picture_is_an_error() -> None:
+    with pytest.raises(ValueError, match="must be a picture"):
+        maps_of(sitter(torch.zeros(55, 3)), [])
+
+
+def test_to_the_atlas_and_back() -> None:
+    texels = sitter(torch.zeros(55, 3)).texels
+    values = torch.rand(len(texels), 3, generator=torch.Generator().manual_seed(0))
+    atlas = to_atlas(values, texels)
+    assert atlas.shape == (3, 64, 64)
+    assert torch.equal(from_atlas(atlas, texels), values)
+    assert (atlas != 0).any(0).sum() == len(texels)

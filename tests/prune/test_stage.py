@@ -1,0 +1,173 @@
+"""The last stage of a run: exact, repeatable, the same as compacting the finished run, and drawn with masks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from moving_scene import camera
+from tiny_fields import KINDS, busy_config
+from torch import Tensor
+
+from dyngs.build import assemble
+from dyngs.camera import Cameras
+from dyngs.config import (
+    CompactConfig,
+    Config,
+    DataConfig,
+    McmcStrategy,
+    RandomInit,
+    RunConfig,
+    StaticModel,
+    TrainConfig,
+)
+from dyngs.config.io import load_resolved
+from dyngs.data.frame_selection import spread
+from dyngs.deform.model import DynamicScene
+from dyngs.deform.trained import TrainedScene
+from dyngs.prune.stage import Compaction, compact_, distinct_cameras
+from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
+from dyngs.static.settled import Settled
+from dyngs.train.step import Trainer
+from dyngs.train.trainer import train
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+STAGE = CompactConfig(prune=0.5, max_loss=100.0, steps=6, masks=3, mask_below=1.0)
+
+
+def moving_config(capture: Path, run_dir: Path, kind: str = "skeleton", stage: CompactConfig = STAGE) -> Config:
+    return busy_config(capture, run_dir, kind).model_copy(update={"compact": stage})
+
+
+def still_config(capture: Path, run_dir: Path, stage: CompactConfig = STAGE, **changes: object) -> Config:
+    return Config(
+        data=DataConfig(root=capture),
+        model=StaticModel(sh_degree=1, filter_3d=True),
+        init=RandomInit(num_random=60),
+        train=TrainConfig(steps=8, log_every=1),
+        compact=stage,
+        run=RunConfig(dir=run_dir, threads=1),
+    ).model_copy(update=changes)
+
+
+def final_bytes(run_dir: Path) -> bytes:
+    return checkpoint_paths(run_dir)[-1].read_bytes()
+
+
+def trained(config: Config) -> Trainer:
+    """A trainer at the end of ``train.steps``."""
+    trainer = assemble(config)
+    while trainer.done < config.train.steps:
+        trainer.step()
+    return trainer
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_moving_run_goes_on_with_half_of_it_and_resumes_exactly(kind: str, moving: Path, tmp_path: Path) -> None:
+    """From the checkpoint before the stage, and from one in its middle."""
+    config = moving_config(moving, tmp_path / "run", kind)
+    config = config.model_copy(update={"train": config.train.model_copy(update={"save_every": 27})})
+    folder = train(config)
+    run, paths = load_run(folder), checkpoint_paths(folder)
+    assert [p.stem for p in paths] == ["step_0000027", "step_0000030"]
+    wanted = final_bytes(folder)
+    paths[-1].unlink()
+    assert final_bytes(train(load_resolved(folder), resume_from=folder)) == wanted
+    assert isinstance(run.scene, TrainedScene)
+    if run.scene.is_still:
+        return
+    assert run.scene.masks is not None
+    assert run.scene.masks.count == len(run.scene)
+    assert len(run.scene.masks.times) == 3
+    assert len(run.scene.at(0.4)) == len(run.scene.masks.active(0)) <= len(run.scene)
+    assert len(run.scene.part("moving").at(0.4)) == len(run.scene.rows)
+
+
+def test_a_still_run_has_no_masks_and_resumes_exactly(still: Path, tmp_path: Path) -> None:
+    wanted = final_bytes(train(still_config(still, tmp_path / "whole")))
+    config = still_config(still, tmp_path / "parts")
+    folder = train(config.model_copy(update={"train": config.train.model_copy(update={"save_every": 11})}))
+    assert load_run(folder).step == 14
+    checkpoint_paths(folder)[-1].unlink()
+    assert load_run(folder).step == 11
+    train(load_resolved(folder), resume_from=folder)
+    assert final_bytes(folder) == wanted
+    assert not [name for name in load_checkpoint(checkpoint_paths(folder)[-1]).tensors if "masks" in name]
+
+
+def test_mcmc_stands_still_in_the_stage(still: Path, tmp_path: Path) -> None:
+    """No noise, no relocation: the number stays, and the state of the strategy is gone."""
+    strategy = McmcStrategy(start=1, stop=30_000, every=3, max_gaussians=90)
+    trainer = trained(still_config(still, tmp_path, strategy=strategy))
+    before = len(trainer.optimizer.parameters)
+    found = compact_(trainer)
+    assert found.before == before
+    assert isinstance(trainer.densifier, Settled)
+    for _ in range(4):
+        trainer.step()
+    assert len(trainer.optimizer.parameters) == found.after == before - before // 2
+
+
+def test_without_a_stage_nothing_changes(still: Path, tmp_path: Path) -> None:
+    config = still_config(still, tmp_path / "run", CompactConfig())
+    assert config.total_steps == 8
+    assert load_run(train(config)).step == 8
+
+
+@pytest.mark.parametrize("score", ["variation", "sensitivity", "contribution", "temporal"])
+def test_every_score_keeps_as_many(score: str, moving: Path, tmp_path: Path) -> None:
+    stage = STAGE.model_copy(update={"score": score})
+    trainer = trained(moving_config(moving, tmp_path, "trajectory", stage))
+    before = trainer.optimizer.parameters.detach()
+    found = compact_(trainer)
+    after = trainer.optimizer.parameters
+    assert (found.before, found.after) == (len(before), len(after))
+    assert found.after == len(before) - len(before) // 2
+    assert _all_rows_of(after.means, before.means)
+    assert isinstance(trainer.model, DynamicScene)
+    assert trainer.model.num_moving(len(after)) <= len(after)
+
+
+def _all_rows_of(some: Tensor, everything: Tensor) -> bool:
+    return bool((some[:, None] == everything[None]).all(-1).any(1).all())
+
+
+def test_a_dear_prune_backs_off(moving: Path, tmp_path: Path) -> None:
+    trainer = trained(moving_config(moving, tmp_path, stage=STAGE.model_copy(update={"prune": 0.9, "max_loss": 0.0})))
+    found = compact_(trainer)
+    assert found.share < 0.9
+    assert found.loss <= 0.0
+    assert "not 90%" in str(found)
+
+
+def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
+    """What no key time sees is not drawn, and receives no gradient."""
+    trainer = trained(moving_config(moving, tmp_path, "trajectory"))
+    compact_(trainer)
+    model = trainer.model
+    assert isinstance(model, DynamicScene)
+    assert model.masks is not None
+    picture = trainer.pictures[3]
+    drawn = model.gaussians_at(trainer.optimizer.parameters, picture, trainer.done + 1)
+    active = model.masks.active(model.masks.interval(picture.time or 0.0))
+    assert len(drawn.gaussians) == len(active)
+    drawn.gaussians.means.sum().backward()
+    grad = trainer.optimizer.parameters.means.grad
+    assert grad is not None
+    assert torch.equal(torch.nonzero(grad.any(1))[:, 0], active)
+
+
+def test_what_it_says() -> None:
+    assert str(Compaction(1000, 200, 0.8, 0.8, 1.234, 1.0)) == (
+        "compacted: 1,000 -> 200 Gaussians, 80.0% removed, -1.23 dB before it is trained again"
+    )
+    assert str(Compaction(1000, 500, 0.8, 0.5, 1.0, 0.75)).endswith("; masks let 75% of them through")
+
+
+def test_cameras_of_a_standing_rig_are_taken_once() -> None:
+    one, other = camera(), camera()
+    moved = Cameras(other.cam_from_world + torch.tensor(0.5), other.intrinsics, other.width, other.height)
+    assert distinct_cameras([one, moved, camera(), moved], 8) == [one, moved]
+    assert spread(10, 3) == [0, 3, 6]
+    assert spread(2, 3) == [0, 1]

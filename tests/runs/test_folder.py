@@ -1,0 +1,314 @@
+"""Whatever lies in a folder, no command replaces it unasked, and what a killed process left half written goes."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dyngs.cli import main
+from dyngs.config import Config, DataConfig, RandomInit, RunConfig, StaticModel, TrainConfig
+from dyngs.config.io import load_resolved
+from dyngs.data.synthetic.captures import require_new_folder
+from dyngs.demo import unused_folder
+from dyngs.errors import DyngsError
+from dyngs.export.run import write_moments
+from dyngs.prune.run import compact_run
+from dyngs.runs.checkpoint import KEEP_CHECKPOINTS, checkpoint_paths, latest_checkpoint, load_run, save_checkpoint
+from dyngs.runs.folder import default_folder, new_folder, tidy
+from dyngs.runs.lock import LOCK_NAME, InUseError, writing
+from dyngs.runs.log import RunLog
+from dyngs.storage.run import write_compact
+from dyngs.train.trainer import train
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+FOREIGN = {"notes.txt": "mine", "checkpoints/best.pt": "mine", ".step_7.txt": "mine", "deep/a.png": "mine"}
+OWN = {
+    "config": {"config.yaml": "a: foreign file\n"},
+    "log": {"log.jsonl": '{"step": 1}\n'},
+    "metrics": {"metrics.json": "{}"},
+    "scene": {"scene.dyngs": "a model"},
+    "small": {"small/scene.dyngs": "a model"},
+    "checkpoint": {"checkpoints/step_0000009.safetensors": "a model"},
+    "checkpoints is a file": {"checkpoints": "mine"},
+    "timing": {"timing.json": "{}"},
+}
+
+
+def config_of(capture: Path, run_dir: Path, seed: int = 42, steps: int = 4) -> Config:
+    return Config(
+        data=DataConfig(root=capture),
+        model=StaticModel(sh_degree=0),
+        init=RandomInit(num_random=30),
+        train=TrainConfig(steps=steps, log_every=1, save_every=2),
+        run=RunConfig(dir=run_dir, threads=1, seed=seed),
+    )
+
+
+@pytest.fixture(scope="module")
+def run_dir(still: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(config_of(still, tmp_path_factory.mktemp("runs") / "run"))
+
+
+def _filled(folder: Path, files: dict[str, str]) -> Path:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    if folder.is_file():
+        return {"": folder.read_bytes()}
+    return {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
+
+
+Command = Callable[[Path, Path, Path], object]
+"""Of the capture, a run, and where to."""
+COMMANDS: dict[str, Command] = {
+    "train": lambda capture, run, out: train(config_of(capture, out)),
+    "compact": lambda capture, run, out: compact_run(
+        run, out, ("compact.prune=0.5", "compact.max_loss=100", "compact.steps=1", "run.threads=1")
+    ),
+    "export": lambda capture, run, out: write_compact(run, out),
+    "resume": lambda capture, run, out: train(config_of(capture, out), resume_from=out),
+    "synth": lambda capture, run, out: require_new_folder(out),
+    "sequence": lambda capture, run, out: write_moments(load_run(run), out, (0.0, 1.0)),
+    "demo": lambda capture, run, out: _require(unused_folder(out) == out),
+}
+
+
+def _require(holds: bool) -> None:
+    if not holds:
+        raise DyngsError("another one is taken")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("state", OWN)
+def test_what_a_run_would_replace_is_never_replaced(
+    still: Path, run_dir: Path, tmp_path: Path, command: str, state: str
+) -> None:
+    out = _filled(tmp_path / "out", OWN[state])
+    before = _contents(out)
+    if command == "sequence":  # it writes no such names
+        COMMANDS[command](still, run_dir, out)
+        assert before.items() <= _contents(out).items()
+        return
+    with pytest.raises(DyngsError) as caught:
+        COMMANDS[command](still, run_dir, out)
+    assert "\n" not in str(caught.value)
+    assert _contents(out) == before
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_files_of_others_stay(still: Path, run_dir: Path, tmp_path: Path, command: str) -> None:
+    out = _filled(tmp_path / "out", FOREIGN)
+    before = _contents(out)
+    if command in ("compact", "synth", "demo", "resume"):
+        with pytest.raises(DyngsError):
+            COMMANDS[command](still, run_dir, out)
+        assert _contents(out) == before
+        return
+    COMMANDS[command](still, run_dir, out)
+    assert before.items() <= _contents(out).items()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_file_in_place_of_the_folder_stays(still: Path, run_dir: Path, tmp_path: Path, command: str) -> None:
+    (tmp_path / "out").write_text("mine")
+    with pytest.raises(DyngsError) as caught:
+        COMMANDS[command](still, run_dir, tmp_path / "out")
+    assert "\n" not in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+@pytest.mark.parametrize("command", ["train", "compact", "export", "resume", "sequence"])
+def test_a_folder_that_cannot_be_written_is_told(still: Path, run_dir: Path, tmp_path: Path, command: str) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    out.chmod(0o500)
+    if os.access(out, os.W_OK):
+        pytest.skip("may write anywhere, as root does")
+    try:
+        with pytest.raises(DyngsError) as caught:
+            COMMANDS[command](still, run_dir, out)
+        assert "\n" not in str(caught.value)
+    finally:
+        out.chmod(0o700)
+
+
+def test_a_finished_run_that_cannot_be_written_is_finished(run_dir: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(run_dir, run)
+    before = _contents(run)
+    run.chmod(0o500)
+    try:
+        assert train(load_resolved(run), resume_from=run) == run
+        assert _contents(run) == before
+    finally:
+        run.chmod(0o700)
+
+
+def test_a_run_that_is_only_stored_stays(still: Path, run_dir: Path, tmp_path: Path) -> None:
+    """Its folder holds config.yaml and scene.dyngs, and no checkpoints."""
+    out = tmp_path / "out"
+    write_compact(run_dir, out)
+    before = _contents(out)
+    assert before.keys() == {"config.yaml", "scene.dyngs"}
+    for resume in (None, out):
+        with pytest.raises(DyngsError, match=r"scene\.dyngs|no checkpoints"):
+            train(config_of(still, out), resume_from=resume)
+    assert _contents(out) == before
+    write_compact(run_dir, out)  # the same run may be exported again
+    assert _contents(out) == before
+    other = train(config_of(still, tmp_path / "other", seed=7))
+    with pytest.raises(DyngsError, match="another run"):
+        write_compact(other, out)
+    with pytest.raises(DyngsError, match="another run"):
+        write_compact(other, run_dir)
+    assert _contents(out) == before
+
+
+def test_a_run_stopped_before_its_first_checkpoint_is_taken_up(still: Path, run_dir: Path, tmp_path: Path) -> None:
+    """By the same command or by --resume, and by nothing else."""
+    end = checkpoint_paths(run_dir)[-1].read_bytes()
+    for resumes in (False, True):
+        out = tmp_path / str(resumes)
+        out.mkdir()
+        shutil.copyfile(run_dir / "config.yaml", out / "config.yaml")
+        (out / "log.jsonl").write_text((run_dir / "log.jsonl").read_text()[:50])
+        before = _contents(out)
+        with pytest.raises(DyngsError, match=r"before its first checkpoint.*--resume"):
+            train(config_of(still, out, seed=1))
+        assert _contents(out) == before
+        train(config_of(still, out), resume_from=out if resumes else None)
+        assert checkpoint_paths(out)[-1].read_bytes() == end
+        assert (out / "config.yaml").read_bytes() == (run_dir / "config.yaml").read_bytes()
+        assert (out / "log.jsonl").read_text().count("\n") == 4
+
+
+def test_a_finished_run_is_not_begun_again(still: Path, run_dir: Path) -> None:
+    before = _contents(run_dir)
+    with pytest.raises(DyngsError, match="already holds a run"):
+        train(config_of(still, run_dir))
+    train(load_resolved(run_dir), resume_from=run_dir)
+    assert _contents(run_dir) == before
+
+
+def test_what_a_kill_leaves_goes_when_the_run_goes_on(run_dir: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(run_dir, run)
+    newest = checkpoint_paths(run)[-1]
+    for step in (1, 2):  # a kill between the last rename and the removal of older ones
+        shutil.copyfile(newest, newest.with_name(f"step_000000{step}.safetensors"))
+    left = ["checkpoints/.step_0000002.77.safetensors", "checkpoints/.step_0000004.77-abcdef.dyngs.safetensors"]
+    left += ["checkpoints/.tmpaB3dE6"]
+    left += [".timing.77-abcdef.dyngs.json", LOCK_NAME]
+    kept = [".metrics.77-abcdef.dyngs.json", ".timing.json.swp", "checkpoints/.step_best.safetensors"]
+    for name in (*left, *kept):
+        (run / name).write_text("half")
+    train(load_resolved(run), resume_from=run)
+    assert [path.name for path in checkpoint_paths(run)] == [path.name for path in checkpoint_paths(run_dir)]
+    assert len(checkpoint_paths(run)) == KEEP_CHECKPOINTS
+    assert [name for name in left if (run / name).exists()] == []
+    assert [name for name in kept if not (run / name).exists()] == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links")
+def test_nothing_is_removed_through_a_link(tmp_path: Path) -> None:
+    outside = _filled(tmp_path / "outside", {".step_0000002.77.safetensors": "mine", ".a.1-abcdef.dyngs.json": "mine"})
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "checkpoints").symlink_to(outside)
+    before = _contents(outside)
+    tidy(tmp_path / "run", sole_writer=True)
+    assert _contents(outside) == before
+
+
+def test_a_torn_last_line_of_the_log_is_dropped_once(run_dir: Path, tmp_path: Path) -> None:
+    lines = (run_dir / "log.jsonl").read_text().splitlines()
+    for cut in range(1, len(lines[3]) + 1):
+        (tmp_path / "log.jsonl").write_text("\n".join(lines[:3]) + "\n" + lines[3][:cut])
+        with RunLog(tmp_path, 4):
+            pass
+        whole = 4 if cut == len(lines[3]) else 3  # only its end of line lacked
+        assert (tmp_path / "log.jsonl").read_text() == "".join(line + "\n" for line in lines[:whole])
+
+
+def test_the_time_of_a_checkpoint_is_there_as_soon_as_it_is(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kill right after its rename loses no time of training, which budget.max_minutes counts."""
+    checkpoint = latest_checkpoint(run_dir)
+    real = os.replace
+
+    def killed_after_checkpoint(source: Path, target: Path) -> None:
+        real(source, target)
+        if target.name.startswith("step_"):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", killed_after_checkpoint)
+    shutil.copy(run_dir / "config.yaml", tmp_path / "config.yaml")
+    with pytest.raises(KeyboardInterrupt):
+        save_checkpoint(tmp_path, checkpoint, 12.5)
+    assert load_run(tmp_path).seconds_train == 12.5
+
+
+def test_a_new_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(DyngsError), new_folder(out) as started:
+        _require(not _filled(started, {"a": ""}).is_dir())
+    assert not list(tmp_path.iterdir())
+    out.mkdir()
+    (out / LOCK_NAME).touch()  # of a process that was killed
+    with new_folder(out) as started:
+        (started / "a").touch()
+    assert [path.name for path in out.iterdir()] == ["a"]
+    with pytest.raises(DyngsError, match="exists already"), new_folder(tmp_path / "new") as started:
+        _filled(tmp_path / "new", {"b": "of somebody else"})
+    assert _contents(tmp_path) == {"out/a": b"", "new/b": b"of somebody else"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="forks")
+def test_a_few_kills_lose_nothing(tmp_path: Path) -> None:
+    """The first seconds of benchmarks/soak.py, which does this for long."""
+    soak = Path(__file__).parents[2] / "benchmarks" / "soak.py"
+    words = [sys.executable, str(soak), "--kills", "8", "--minutes", "1", "--jobs", "static,compact,export"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"^\d kills in .*, 0 lost$", done.stdout, re.MULTILINE)
+
+
+@pytest.mark.parametrize("command", ["train", "export", "resume"])
+def test_nothing_is_written_while_another_writes(still: Path, run_dir: Path, tmp_path: Path, command: str) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(run_dir, out)
+    with writing(out):
+        before = _contents(out)
+        with pytest.raises(InUseError, match=f"process {os.getpid()} on "):
+            COMMANDS[command](still, out if command == "export" else run_dir, out)
+        assert _contents(out) == before
+
+
+def test_the_command_says_it_in_one_line(still: Path, run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "static", f"data.root={still}", f"run.dir={run_dir}"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "--resume" in told
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a/../..", "/a"])
+def test_a_name_that_is_no_folder_below_runs_is_refused(name: str) -> None:
+    with pytest.raises(DyngsError, match=r"run\.name=.* must name a folder below runs"):
+        default_folder(name)
+
+
+def test_a_name_may_have_folders() -> None:
+    assert default_folder("scans/bench") == Path("runs/scans/bench")

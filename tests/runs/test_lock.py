@@ -1,0 +1,151 @@
+"""One writer at a time in a run folder, by real processes."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from dyngs.errors import DyngsError
+from dyngs.evaluate.report import evaluate_run
+from dyngs.runs import lock as run_lock
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.runs.lock import LOCK_NAME, InUseError, writing
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+HOLD = "import sys, time; from pathlib import Path; from dyngs.runs.lock import writing\n"
+HOLD += "with writing(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+
+
+@contextmanager
+def _holder(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that has the lock of ``folder``."""
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "held\n"
+            yield process
+        finally:
+            process.kill()
+
+
+def _train(capture: Path, run_dir: Path, *words: str) -> list[str]:
+    """A command line of a run that is not soon over."""
+    keys = (f"data.root={capture}", f"run.dir={run_dir}", "run.threads=1", "train.steps=100000", "train.save_every=5")
+    more = ("init.kind=random", "init.num_random=50", "model.sh_degree=0", "train.log_every=5")
+    return [sys.executable, "-m", "dyngs", "train", "static", *keys, *more, *words]
+
+
+def test_the_second_is_told_who_holds_it(tmp_path: Path) -> None:
+    with _holder(tmp_path / "run") as process, pytest.raises(InUseError) as caught, writing(tmp_path / "run"):
+        raise AssertionError("both have it")
+    told = str(caught.value)
+    assert f"process {process.pid} on " in told
+    assert "wait" in told
+    assert "\n" not in told
+
+
+def test_a_killed_owner_frees_it(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with _holder(run) as process:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert json.loads((run / LOCK_NAME).read_text())["pid"] == process.pid
+        with writing(run) as is_sole_writer:
+            assert is_sole_writer
+            assert json.loads((run / LOCK_NAME).read_text())["pid"] == os.getpid()
+    assert not run.exists() or not list(run.iterdir())
+
+
+def test_what_came_of_nothing_leaves_nothing(tmp_path: Path) -> None:
+    with writing(tmp_path / "a" / "b"):
+        assert (tmp_path / "a" / "b" / LOCK_NAME).is_file()
+    assert not (tmp_path / "a").exists()
+    with writing(tmp_path / "c"):
+        (tmp_path / "c" / "mine").touch()
+    assert [path.name for path in (tmp_path / "c").iterdir()] == ["mine"]
+
+
+def test_one_process_cannot_have_it_twice(tmp_path: Path) -> None:
+    with writing(tmp_path), pytest.raises(InUseError, match=f"process {os.getpid()}"), writing(tmp_path):
+        raise AssertionError
+
+
+@pytest.mark.skipif(not hasattr(os, "O_NOFOLLOW"), reason="follows links")
+def test_a_lock_file_that_is_none_is_told_and_left(tmp_path: Path) -> None:
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    for name, make in {
+        "link": lambda path: path.symlink_to(precious),
+        "folder": lambda path: path.mkdir(),
+        "pipe": lambda path: os.mkfifo(path),
+    }.items():
+        (tmp_path / name).mkdir()
+        make(tmp_path / name / LOCK_NAME)
+        with pytest.raises(DyngsError, match=LOCK_NAME), writing(tmp_path / name):
+            raise AssertionError
+        assert os.path.lexists(tmp_path / name / LOCK_NAME)
+    assert precious.read_text() == "mine"
+    with pytest.raises(DyngsError, match="not a folder"), writing(precious):
+        raise AssertionError
+
+
+def test_without_locks_a_line_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def no_locks(file: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(run_lock, "_lock", no_locks)
+    with writing(tmp_path / "run") as is_sole_writer:
+        assert not is_sole_writer
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "no locks" in told
+
+
+def test_of_many_that_want_it_at_once_one_has_it(tmp_path: Path) -> None:
+    """Also while the lock file is removed and made anew all the time."""
+    code = HOLD.partition("\n")[0] + (
+        "\nfrom dyngs.errors import DyngsError\nfolder, count = Path(sys.argv[1]), 0\nwhile count < 100:\n"
+        "    try:\n        with writing(folder):\n            count += 1\n"
+        "            n = int((folder / 'n').read_text()); time.sleep(1e-4); (folder / 'n').write_text(str(n + 1))\n"
+        "    except DyngsError: pass\n"
+    )
+    (tmp_path / "n").write_text("0")
+    processes = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(3)]
+    assert [process.wait() for process in processes] == [0, 0, 0]
+    assert (tmp_path / "n").read_text() == "300"
+
+
+def test_two_trainings_into_one_folder(still: Path, tmp_path: Path) -> None:
+    """The second ends at once with one line; readers may read; the first goes on, and can be resumed after a kill."""
+    run = tmp_path / "run"
+    first = subprocess.Popen(_train(still, run), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        while not checkpoint_paths(run):
+            assert first.poll() is None
+            time.sleep(0.05)
+        resume = [sys.executable, "-m", "dyngs", "train", "--resume", str(run)]
+        for command in (_train(still, run, "run.seed=1"), resume):
+            second = subprocess.run(command, capture_output=True, text=True, check=False)
+            assert second.returncode == 2
+            assert second.stderr.count("\n") == 1
+            assert f"process {first.pid} on " in second.stderr
+        for _ in range(5):
+            assert load_run(run).step > 0
+        assert evaluate_run(run).num_views == 1
+        assert first.poll() is None
+    finally:
+        first.kill()
+        first.wait()
+    assert load_run(run).step % 5 == 0

@@ -1,0 +1,206 @@
+"""What a configuration is turned into."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dyngs.build import (
+    assemble,
+    resolved_background,
+    surroundings,
+    training_cameras,
+    training_times,
+    with_points,
+)
+from dyngs.config import (
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    DynamicModel,
+    McmcStrategy,
+    PointsInit,
+    RandomInit,
+    StaticModel,
+    TrainConfig,
+)
+from dyngs.conventions import RasterizeMode
+from dyngs.data.loader import PictureLoader
+from dyngs.data.read import read_capture
+from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
+from dyngs.deform.model import DynamicScene
+from dyngs.deform.residual import residuals_of
+from dyngs.static.densify import DefaultDensifier
+from dyngs.static.mcmc import McmcDensifier
+from dyngs.static.model import StaticScene
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture")
+    write_still_capture(folder, StillOptions(size=16, num_train=5, num_test=1, samples=1, distance=4.0))
+    return folder
+
+
+def test_training_cameras_are_those_of_the_pictures(capture: Path) -> None:
+    options = DataConfig(root=capture, downscale=2)
+    views = read_capture(options).splits["train"]
+    pictures = PictureLoader(views, options)
+    for camera, picture in zip(training_cameras(views, options), (pictures[i] for i in range(5)), strict=True):
+        assert (camera.width, camera.height) == (picture.cameras.width, picture.cameras.height) == (8, 8)
+        assert torch.equal(camera.intrinsics, picture.cameras.intrinsics)
+        assert torch.equal(camera.cam_from_world, picture.cameras.cam_from_world)
+
+
+def test_surroundings_of_a_blender_capture(capture: Path) -> None:
+    scene = surroundings(read_capture(DataConfig(root=capture)))
+    np.testing.assert_allclose(np.linalg.norm(scene.camera_centers, axis=1), 4.0, rtol=1e-5)
+    assert scene.around_origin
+    assert scene.extent < 1.1 * 8
+
+
+def test_parts_follow_the_config(capture: Path) -> None:
+    config = Config(
+        data=DataConfig(root=capture),
+        model=StaticModel(rasterize_mode=RasterizeMode.ANTIALIASED, eps2d=0.1, near=0.5, sh_degree=2, alpha_min=0.01),
+        init=PointsInit(num_random=40),
+        strategy=DefaultStrategy(absgrad=True),
+    )
+    trainer = assemble(config)
+    assert isinstance(trainer.densifier, DefaultDensifier)
+    assert (trainer.options.mode, trainer.options.eps2d, trainer.options.near) == (RasterizeMode.ANTIALIASED, 0.1, 0.5)
+    assert trainer.options.absgrad
+    assert trainer.options.alpha_min == 0.01
+    assert trainer.optimizer.parameters.sh.shape == (40, 9, 3)
+    assert (trainer.background, trainer.has_test_views, len(trainer.pictures)) == ("white", True, 5)
+    mcmc = assemble(config.model_copy(update={"strategy": McmcStrategy(max_gaussians=30)}))
+    assert isinstance(mcmc.densifier, McmcDensifier)
+    assert len(mcmc.optimizer.parameters) == 30
+    assert not mcmc.options.absgrad
+
+
+def test_auto_background_is_white_only_behind_alpha(capture: Path) -> None:
+    read = read_capture(DataConfig(root=capture))
+    config = Config(data=DataConfig(root=capture))
+    assert resolved_background(config, read) == "white"
+    assert resolved_background(config, read.replace(has_alpha=False)) == "black"
+    chosen = Config(data=DataConfig(root=capture, background="random"))
+    assert resolved_background(chosen, read) == "random"
+
+
+def _with_times(capture: Path, out: Path, times: list[float] | None) -> Path:
+    """A copy of the capture whose training pictures have these times, and whose test pictures are taken at 0.5."""
+    shutil.copytree(capture, out)
+    for split in ("train", "test"):
+        file = out / f"transforms_{split}.json"
+        document = json.loads(file.read_text())
+        for i, frame in enumerate(document["frames"]):
+            frame |= {} if times is None else {"time": times[i] if split == "train" else 0.5}
+        file.write_text(json.dumps(document))
+    return out
+
+
+def _dynamic(capture: Path, **changes: object) -> Config:
+    config = Config(
+        data=DataConfig(root=capture),
+        model=DynamicModel(sh_degree=1),
+        init=RandomInit(num_random=50),
+        strategy=DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6),
+        train=TrainConfig(steps=12),
+    )
+    return config.model_copy(update=changes)
+
+
+def test_times_make_a_dynamic_model(capture: Path, tmp_path: Path) -> None:
+    root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
+    assert training_times(read_capture(DataConfig(root=root))) == (0.0, 0.25, 0.5, 0.5, 1.0)
+    model = assemble(_dynamic(root)).model
+    assert isinstance(model, DynamicScene)
+    assert model.times == (0.0, 0.25, 0.5, 1.0)
+    assert model.schedule.rates.steps == 12
+    assert isinstance(assemble(_dynamic(root, model=StaticModel())).model, StaticScene)
+
+
+@pytest.mark.parametrize("times", [None, [0.5] * 5], ids=["no times", "one time"])
+@pytest.mark.parametrize("filter_3d", [False, True])
+def test_without_times_a_dynamic_config_is_a_static_one(
+    capture: Path, tmp_path: Path, times: list[float] | None, filter_3d: bool
+) -> None:
+    """The same bytes after some steps, among them changes of the set."""
+    root = _with_times(capture, tmp_path / "capture", times)
+    results = []
+    for model in (DynamicModel(sh_degree=1, filter_3d=filter_3d), StaticModel(sh_degree=1, filter_3d=filter_3d)):
+        trainer = assemble(_dynamic(root, model=model))
+        assert isinstance(trainer.model, StaticScene)
+        for _ in range(8):
+            trainer.step()
+        results.append(trainer.checkpoint())
+    assert len(results[0].tensors["gaussians.means"]) != 50
+    assert results[0].info == results[1].info
+    assert results[0].tensors.keys() == results[1].tensors.keys()
+    assert all(torch.equal(x, results[1].tensors[name]) for name, x in results[0].tensors.items())
+
+
+def test_motion_is_looked_for_in_pictures_from_all_over_the_clip(capture: Path, tmp_path: Path) -> None:
+    """Drawn as in training, on the background of the evaluation."""
+    root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
+    trainer = assemble(_dynamic(root, data=DataConfig(root=root, background="white")))
+    assert isinstance(trainer.model, DynamicScene)
+    gaussians = trainer.optimizer.parameters.detach()
+    found = trainer.model.capture.residuals(lambda _: gaussians)
+    pictures = [trainer.pictures[i] for i in range(5)]
+    expected = residuals_of(lambda _: gaussians, pictures, trainer.options, torch.ones(3))
+    assert torch.equal(found.most, expected.most)
+    assert torch.equal(found.usual, expected.usual)
+    assert found.most.shape == (50,)
+    assert found.most.max() > 0.01
+
+
+def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: Path) -> None:
+    """As many Gaussians as points, of the room and not of a cube; a still Blender scene begins with random ones."""
+    options = DynamicOptions(size=96, num_times=2, num_cameras=8, num_val=0, num_test=0, samples=1)
+    root = write_dynamic_capture("room", tmp_path / "room", options)
+    config = _dynamic(root, init=PointsInit(num_random=7))
+    found = with_points(read_capture(config.data), config).points
+    assert found is not None
+    assert len(assemble(config).optimizer.parameters) == len(found.xyz) > 7
+    without = config.model_copy(update={"init": PointsInit(num_random=7, triangulate=0)})
+    assert len(assemble(without).optimizer.parameters) == 7
+
+
+def test_no_points_are_triangulated_for_what_is_restored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And it goes on as if they had been."""
+    options = DynamicOptions(size=96, num_times=2, num_cameras=8, num_val=0, num_test=0, samples=1)
+    config = _dynamic(write_dynamic_capture("room", tmp_path / "room", options), init=PointsInit(num_random=7))
+    trainer = assemble(config)
+    trainer.step()
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("triangulated again")
+
+    monkeypatch.setattr("dyngs.build.triangulated_points", refuse)
+    again = assemble(config, restored=True)
+    again.restore(trainer.checkpoint())
+    assert again.step().loss == trainer.step().loss
+    tensors = trainer.checkpoint().tensors
+    assert all(torch.equal(x, tensors[name]) for name, x in again.checkpoint().tensors.items())
+
+
+def test_a_still_blender_scene_begins_with_random_points(capture: Path) -> None:
+    config = Config(data=DataConfig(root=capture), init=PointsInit(num_random=7))
+    assert with_points(read_capture(config.data), config).points is None
+
+
+def test_the_coarse_phase_is_static_training(capture: Path, tmp_path: Path) -> None:
+    """Until something moves, a dynamic run is a static one, byte by byte, on all views."""
+    root = _with_times(capture, tmp_path / "timed", [0.0, 0.25, 0.5, 0.75, 1.0])
+    static, dynamic = (assemble(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(coarse=1.0)))
+    for _ in range(8):
+        assert static.step().loss == dynamic.step().loss
+    mine, others = static.optimizer.state(), dynamic.optimizer.state()
+    assert all(torch.equal(x, others[name]) for name, x in mine.items())
