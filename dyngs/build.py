@@ -15,8 +15,8 @@ from dyngs.colour.network import box_around
 from dyngs.colour.thrift import ThriftyColours
 from dyngs.config import AutoColour, Config, DataConfig, DcacColour, DynamicModel, HumanModel, McmcStrategy, PointsInit
 from dyngs.data.capture import Capture, View
-from dyngs.data.frame_selection import spread
-from dyngs.data.intrinsics import scaled_intrinsics
+from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.geometry.intrinsics import scaled_intrinsics
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.pictures.images import target_size
 from dyngs.data.prepare.triangulate import triangulated_points, views_of_a_moment
@@ -215,7 +215,7 @@ def _colours(config: Config, capture: Capture, gaussians: Gaussians, generator: 
 
 def _first_pictures(pictures: PictureLoader) -> Iterator[Picture]:
     """At most ``FIRST_VIEWS`` of the pictures, evenly chosen."""
-    return (pictures[i] for i in spread(len(pictures), FIRST_VIEWS))
+    return (pictures[i] for i in evenly_spaced(len(pictures), FIRST_VIEWS))
 
 
 def _densifier(config: Config, background: str, extent: float) -> Densifier:

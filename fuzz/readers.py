@@ -58,7 +58,7 @@ class Reader:
 def read_whole_capture(root: Path) -> object:
     """As ``dyngs data inspect --deep`` and the first steps of ``dyngs train``: report, views, points, pictures."""
     from dyngs.config import DataConfig
-    from dyngs.data.inspect import format_report, inspect_capture
+    from dyngs.data.inspection.report import format_report, inspect_capture
     from dyngs.data.loader import PictureLoader
     from dyngs.data.read import read_capture
     from dyngs.errors import DyngsError

@@ -19,7 +19,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0, RasterizeMode
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.rebase import rebase
+from dyngs.data.geometry.recenter import recenter
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.ops.projection import Projection, ProjectionOptions, project
@@ -331,13 +331,13 @@ def picture_of(capture: Capture) -> Tensor:
 def test_world_origin_far_away_is_rebased_on_load() -> None:
     """Subtracted in float64 the offset costs 1e-9 units; kept, float32 cannot even resolve 0.25 units there."""
     near, far = capture_at(np.zeros(3)), capture_at(GEOREFERENCED)
-    rebased = rebase(far)
+    rebased = recenter(far)
     truth = picture_of(near)
     assert np.linalg.norm(rebased.world_offset - GEOREFERENCED) < 10
     assert (picture_of(rebased) - truth).abs().quantile(0.99) < 1e-4
     assert (picture_of(rebased) - truth).abs().max() < 2 / 255
     assert (picture_of(far) - truth).abs().max() > 0.1
-    assert near is rebase(near)
+    assert near is recenter(near)
 
 
 # --- many of them -----------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.errors import reading
-from dyngs.files.archives import read_arrays
+from dyngs.files.numpy_files import read_arrays
 from dyngs.files.write import write_text
 from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.ops.projection import Projection, ProjectionOptions, project

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dyngs.budget.limits import CLOSE, most_gaussians
 from dyngs.config import CompactConfig, Config
-from dyngs.data.frame_selection import spread
+from dyngs.data.frame_selection import evenly_spaced
 from dyngs.deform.trained import TrainedScene
 from dyngs.prune.score import worth
 from dyngs.prune.selection import best
@@ -131,5 +131,5 @@ def scores_now(trainer: Trainer) -> Tensor:
 @torch.no_grad()
 def training_quality(trainer: Trainer) -> float:
     """Mean PSNR of at most 16 training pictures, dB."""
-    pictures = [trainer.pictures[i] for i in spread(len(trainer.pictures), PROBED_VIEWS)]
+    pictures = [trainer.pictures[i] for i in evenly_spaced(len(trainer.pictures), PROBED_VIEWS)]
     return quality_of(trainer, scene_now(trainer), pictures, None)

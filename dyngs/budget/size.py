@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyngs.config import CompactConfig
 from dyngs.config.io import RESOLVED_NAME, save_config
-from dyngs.data.frame_selection import spread
+from dyngs.data.frame_selection import evenly_spaced
 from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.prune.score import worth
@@ -96,7 +96,7 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
     """
     whole = trainer.checkpoint()
     scene = stored_scene(whole, trainer.config.model)
-    pictures = [trainer.pictures[i] for i in spread(len(trainer.pictures), PROBED_VIEWS)]
+    pictures = [trainer.pictures[i] for i in evenly_spaced(len(trainer.pictures), PROBED_VIEWS)]
     before = quality_of(trainer, scene, pictures, None)
     tensors, precision = precision_of(trainer.config, whole, None)
 

@@ -20,7 +20,7 @@ from dyngs.budget.count import scene_now, scores_now, stage, training_quality
 from dyngs.budget.limits import CLOSE
 from dyngs.build import training_cameras
 from dyngs.config import Config, DynamicModel
-from dyngs.data.frame_selection import spread
+from dyngs.data.frame_selection import evenly_spaced
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.deform.trained import TrainedScene
@@ -241,7 +241,7 @@ def drawing_seconds(trainer: Trainer, scene: Scene, views: int = VIEWS) -> float
     In between each picture is judged, as evaluation does: drawing is faster where caches still hold all it needs.
     """
     config = trainer.config
-    chosen = [trainer.pictures.views[i] for i in spread(len(trainer.pictures), views)]
+    chosen = [trainer.pictures.views[i] for i in evenly_spaced(len(trainer.pictures), views)]
     cameras = training_cameras(chosen, config.data)
     drawing = Drawing(scene, render_options(config.model), torch.zeros(3))
     drawing.picture(cameras[0], chosen[0].time)
@@ -271,7 +271,7 @@ def _few(trainer: Trainer) -> Scene:
     """``FEW`` of the Gaussians of ``trainer``, which a new field moves where times differ."""
     whole, count = trainer.checkpoint(), len(trainer.optimizer.parameters)
     kept = torch.zeros(count, dtype=torch.bool)
-    kept[list(spread(count, FEW))] = True
+    kept[list(evenly_spaced(count, FEW))] = True
     trainer.keep(kept)
     scene = scene_now(trainer)
     trainer.restore(whole)

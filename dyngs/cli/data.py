@@ -98,7 +98,7 @@ def _add_synth(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Print the report on a capture, and draw it if asked to."""
-    from dyngs.data.inspect import format_report, inspect_capture
+    from dyngs.data.inspection.report import format_report, inspect_capture
 
     given = {"root": arguments.path, "format": arguments.format}
     options = _keys_of_data(arguments.overrides).model_copy(update=given)
@@ -109,7 +109,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
         raise DyngsError(report.problems[0])
     print(format_report(report))
     if arguments.picture is not None:
-        from dyngs.data.camera_picture import draw_cameras
+        from dyngs.data.inspection.camera_plot import draw_cameras
 
         draw_cameras(report.capture, arguments.picture)
         print(f"written: {arguments.picture}")

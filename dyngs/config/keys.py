@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from dyngs.conventions import RasterizeMode
-from dyngs.files.trust import MAX_MEGAPIXELS
+from dyngs.files.containment import MAX_MEGAPIXELS
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from dyngs.data.readers.people import BodyFrames
-
 Split = Literal["train", "val", "test", "pose"]
 """A "pose" split shows a person in another clip than the others: with times and frame numbers of its own."""
+
+BodyKind = Literal["smpl", "smplh", "smplx"]
+
+BODY_KINDS: dict[int, BodyKind] = {24: "smpl", 52: "smplh", 55: "smplx"}
+"""Number of joints to the body model that has so many."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,22 @@ class VideoFrame:
 
     video: Path
     number: int
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """Where a person is in a picture.
+
+    Attributes:
+        path: a picture of the same size, or an HDF5 file whose data set ``masks`` has a row (H, W) per frame.
+        person: how the person's pixels are marked: "white" (grey levels count as shares), "black" (as "white",
+            inverted), or "nonzero" (labels: everything but 0).
+        row: of the data set, None for a picture.
+    """
+
+    path: Path
+    person: Literal["white", "black", "nonzero"]
+    row: int | None = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +91,37 @@ class PointCloud:
 
     xyz: np.ndarray
     rgb: np.ndarray
+
+
+@dataclass(frozen=True)
+class BodyFrames:
+    """Body parameters of the frames of one clip, float64, in the world and the unit of the cameras of that clip.
+
+    A point x of the shaped template at rest comes to ``scale * turn(LBS(x; poses)) + trans``. LBS turns everything by
+    ``poses[:, 0]`` about the pelvis (joint 0), ``turn`` about the template's origin; ``about_pelvis`` does without.
+
+    Attributes:
+        frames: (F,) numbers, ascending, as in ``View.frame`` of the views of the same clip.
+        poses: (F, J, 3) axis-angle, radians, J = 24, 52 or 55.
+        trans: (F, 3).
+        betas: (B,) shape coefficients.
+        scale: (F,) world units per metre of the template, positive.
+        turns: (F, 3) axis-angle, radians; None where there is nothing to turn.
+        pelvis: (3,) where the pelvis of the body that was fitted is at rest, None where the files do not say.
+    """
+
+    frames: tuple[int, ...]
+    poses: np.ndarray
+    trans: np.ndarray
+    betas: np.ndarray
+    scale: np.ndarray
+    turns: np.ndarray | None = None
+    pelvis: np.ndarray | None = None
+
+    @property
+    def kind(self) -> BodyKind:
+        """The model whose joints these are."""
+        return BODY_KINDS[self.poses.shape[1]]
 
 
 @dataclass(frozen=True)

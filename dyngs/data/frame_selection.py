@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections import defaultdict
-from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from dyngs.data.capture import Split, View
+from dyngs.data.times import distinct_times
 from dyngs.errors import DyngsError, printable
 
 Splits = dict[Split, tuple[View, ...]]
-
-SAME_TIME = 1e-6
-"""Times in [0, 1] that lie no farther apart are one time (files of one capture are often rounded differently)."""
 
 
 def parse_frames(text: str) -> slice:
@@ -69,32 +64,7 @@ def select_frames(root: Path, splits: Splits, frames: str) -> Splits:
     return selected
 
 
-def distinct_times(views: Iterable[View]) -> dict[float, float]:
-    """Every time that a view has, to the first of those that count as the same time."""
-    distinct: dict[float, float] = {}
-    before = first = -math.inf
-    for time in sorted({view.time for view in views if view.time is not None}):
-        if time - before > SAME_TIME:
-            first = time
-        distinct[time] = first
-        before = time
-    return distinct
-
-
-def spread(length: int, count: int) -> list[int]:
+def evenly_spaced(length: int, count: int) -> list[int]:
     """At most ``count`` of the indices below ``length``, evenly chosen."""
     count = min(count, length)
     return [i * length // count for i in range(count)]
-
-
-def standing_cameras(views: Sequence[View]) -> list[list[int]]:
-    """Indices of the views, in order of time, of each camera (pose, lens and size) that has pictures of several times.
-
-    Of several views with one pose and time, the first counts.
-    """
-    cameras: defaultdict[tuple[object, ...], dict[float, int]] = defaultdict(dict)
-    for i, view in enumerate(views):
-        if view.time is not None:
-            pose, intrinsics = (x.round(9).tobytes() for x in (view.cam_from_world, view.intrinsics))
-            cameras[pose, intrinsics, view.lens, view.width, view.height].setdefault(view.time, i)
-    return [[at[t] for t in sorted(at)] for at in cameras.values() if len(at) > 1]

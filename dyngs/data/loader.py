@@ -13,7 +13,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.config import DataConfig
 from dyngs.data.capture import View
-from dyngs.data.intrinsics import scaled_intrinsics
+from dyngs.data.geometry.intrinsics import scaled_intrinsics
 from dyngs.data.pictures.images import (
     area_downscale,
     check_picture,
@@ -24,9 +24,9 @@ from dyngs.data.pictures.images import (
     target_size,
 )
 from dyngs.data.pictures.lens import LensMap, is_pinhole, undistort, undistort_map
-from dyngs.data.readers.people import PersonView, cut_out
+from dyngs.data.pictures.silhouettes import PersonView, cut_out
 from dyngs.errors import DyngsError
-from dyngs.files.trust import pictures_up_to
+from dyngs.files.containment import pictures_up_to
 
 ALL_COUNTS = 1 - 1e-4
 """Mean of a mask from which all that a shrunk pixel covers counts."""

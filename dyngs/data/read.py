@@ -10,8 +10,10 @@ import numpy as np
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, PointCloud, Split, View
 from dyngs.data.frame_selection import select_frames
+from dyngs.data.geometry.recenter import recenter
 from dyngs.data.pictures.frame_cache import decode_frames
 from dyngs.data.pictures.images import read_header
+from dyngs.data.pictures.silhouettes import PersonView
 from dyngs.data.readers.blender import is_blender, read_blender
 from dyngs.data.readers.body_json import is_body_json, read_body_json
 from dyngs.data.readers.camera_folders import CALIBRATION, is_camera_folders, read_camera_folders
@@ -20,13 +22,11 @@ from dyngs.data.readers.llff import POSES, is_llff, read_llff
 from dyngs.data.readers.nerfies import is_nerfies, read_nerfies
 from dyngs.data.readers.nerfstudio import is_nerfstudio, read_nerfstudio
 from dyngs.data.readers.neuman import is_neuman, read_neuman
-from dyngs.data.readers.people import PersonView
 from dyngs.data.readers.people_snapshot import is_people_snapshot, read_people_snapshot
 from dyngs.data.readers.zju_mocap import is_zju_mocap, read_zju_mocap
-from dyngs.data.rebase import rebase
 from dyngs.data.times import sequence_warnings, still_if_constant, unit_times
 from dyngs.errors import DyngsError, reading
-from dyngs.files.trust import inside, pictures_up_to, staying_within
+from dyngs.files.containment import inside, pictures_up_to, staying_within
 
 Splits = dict[Split, tuple[View, ...]]
 
@@ -125,7 +125,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         has_alpha=_first_has_alpha(splits["train"]),
         warnings=(*warnings, *notes, *more),
     )
-    return rebase(capture)
+    return recenter(capture)
 
 
 def _check_places(view: View) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from dyngs.errors import DyngsError
 
 Splits = dict[Split, tuple[View, ...]]
 
+SAME_TIME = 1e-6
+"""Times in [0, 1] that lie no farther apart are one time (files of one capture are often rounded differently)."""
 _MAX_NAMED = 5
 
 
@@ -59,6 +62,31 @@ def sequence_warnings(splits: Splits) -> list[str]:
     """What is suspicious about cameras and times: pictures that only differ by chance, cameras that lack frames."""
     views = [view for view in _all(splits) if view.time is not None]
     return [*_repeated(views), *_frame_counts(views)]
+
+
+def distinct_times(views: Iterable[View]) -> dict[float, float]:
+    """Every time that a view has, to the first of those that count as the same time."""
+    distinct: dict[float, float] = {}
+    before = first = -math.inf
+    for time in sorted({view.time for view in views if view.time is not None}):
+        if time - before > SAME_TIME:
+            first = time
+        distinct[time] = first
+        before = time
+    return distinct
+
+
+def static_cameras(views: Sequence[View]) -> list[list[int]]:
+    """Indices of the views, in order of time, of each camera (pose, lens and size) that has pictures of several times.
+
+    Of several views with one pose and time, the first counts.
+    """
+    cameras: defaultdict[tuple[object, ...], dict[float, int]] = defaultdict(dict)
+    for i, view in enumerate(views):
+        if view.time is not None:
+            pose, intrinsics = (x.round(9).tobytes() for x in (view.cam_from_world, view.intrinsics))
+            cameras[pose, intrinsics, view.lens, view.width, view.height].setdefault(view.time, i)
+    return [[at[t] for t in sorted(at)] for at in cameras.values() if len(at) > 1]
 
 
 def _repeated(views: list[View]) -> list[str]:

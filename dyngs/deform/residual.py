@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from dyngs.data.capture import View
-from dyngs.data.frame_selection import spread, standing_cameras
+from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture
+from dyngs.data.times import static_cameras
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, Shader, render
 
@@ -97,16 +98,16 @@ def _errors_in(
 
 def cameras_in_place(views: Sequence[View]) -> list[list[int]]:
     """Per camera that stands and took ``MIN_SAME`` views or more, the indices of these."""
-    return [seen for seen in standing_cameras(views) if len(seen) >= MIN_SAME]
+    return [seen for seen in static_cameras(views) if len(seen) >= MIN_SAME]
 
 
 def views_to_compare(views: Sequence[View], limit: int = 50) -> list[int]:
     """Indices of at most ``limit`` views, evenly chosen; where cameras stay in place, ``MOMENTS`` of each or more."""
     cameras = cameras_in_place(views)
     if not cameras:
-        return spread(len(views), limit)
-    chosen = [cameras[i] for i in spread(len(cameras), max(limit // MOMENTS, 1))]
-    return [seen[i] for seen in chosen for i in spread(len(seen), limit // len(chosen))]
+        return evenly_spaced(len(views), limit)
+    chosen = [cameras[i] for i in evenly_spaced(len(cameras), max(limit // MOMENTS, 1))]
+    return [seen[i] for seen in chosen for i in evenly_spaced(len(seen), limit // len(chosen))]
 
 
 def _median_pictures(pictures: Sequence[Picture], background: Tensor) -> dict[bytes, Tensor]:

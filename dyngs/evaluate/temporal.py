@@ -18,8 +18,8 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.capture import View
-from dyngs.data.frame_selection import standing_cameras
 from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.times import static_cameras
 from dyngs.errors import DyngsError
 from dyngs.evaluate.metrics import MetricValue
 from dyngs.rendering import RenderOptions
@@ -126,7 +126,7 @@ def flicker_error(drawing: Drawing, loader: PictureLoader, views: Sequence[View]
     if all(view.time is None for view in views):
         return MetricValue(None, _NO_TIMES)
     total, weight = 0.0, 0.0
-    for indices in standing_cameras(views):
+    for indices in static_cameras(views):
         errors = (_signed_error(drawing, loader[i]) for i in indices)
         before, counted = next(errors)
         for now, counts in errors:

@@ -24,7 +24,7 @@ import torch
 from dyngs.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
 from dyngs.errors import DyngsError, reading
 from dyngs.export.ply_header import PlyHeader, read_header
-from dyngs.files.write import whole_file
+from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
 
 _MODE_OF_NAME = {"default": RasterizeMode.CLASSIC, "mip": RasterizeMode.ANTIALIASED}
@@ -87,7 +87,7 @@ def write_ply(
     if world_offset is not None and np.any(np.asarray(world_offset)):
         notes.append("world_offset: " + " ".join(repr(float(x)) for x in world_offset))
     header = _header([*notes, *comments], len(table), gaussians.sh.shape[1])
-    with whole_file(path) as temporary, open(temporary, "wb") as file:
+    with atomic_file(path) as temporary, open(temporary, "wb") as file:
         file.write(header)
         file.write(table.data)
     return path

@@ -11,7 +11,7 @@ import torch
 
 from dyngs.errors import DyngsError
 from dyngs.export.run import scene_part
-from dyngs.files.write import whole_file
+from dyngs.files.write import atomic_file
 from dyngs.scene import Scene
 
 MAX_BYTES = 4_000_000_000
@@ -75,7 +75,7 @@ def write_tracks(path: Path, tracks: Tracks) -> Path:
     """
     if not np.isfinite(tracks.positions).all():
         raise DyngsError(f"{path}: not written, there are positions that are not finite")
-    with whole_file(path) as temporary, open(temporary, "wb") as file:
+    with atomic_file(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **asdict(tracks))
     return path
 

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.files.archives import require_text
 from dyngs.files.limits import require_at_most
+from dyngs.files.numpy_files import require_text
 
 _MOST_ENTRIES = 1 << 24
 """Of the sparse matrices of a file together, zeros included. The regressors of bodies have half a million."""

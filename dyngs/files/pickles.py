@@ -11,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 
 from dyngs.errors import DyngsError
-from dyngs.files.pickle_machine import Machine
+from dyngs.files.unpickler import Machine
 
 
 def read_pickle(path: Path) -> object:

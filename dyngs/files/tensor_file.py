@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError, reason, require_regular
 from dyngs.files.temporary import remove_quietly, temporary_folder_beside
-from dyngs.files.write import whole_file
+from dyngs.files.write import atomic_file
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def write_tensors(
     """
     full = {"format": kind.version, **header}
     full["digest"] = _digest(tensors, full)
-    with whole_file(path, durable=True) as temporary:
+    with atomic_file(path, durable=True) as temporary:
         # The library begins a file under a name of its own, which a kill would leave: so in a folder known as ours.
         folder = temporary_folder_beside(path.with_suffix(""))
         try:

@@ -15,7 +15,7 @@ from dyngs.files.temporary import temporary_beside
 
 
 @contextmanager
-def whole_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
+def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """A temporary path beside ``path`` that takes its place when the block ends well, and vanishes otherwise.
 
     The folder is made where it is missing; the temporary name keeps the suffix, by which writers choose the format.
@@ -64,8 +64,8 @@ def _flush_folder(folder: Path) -> None:
 
 
 def write_text(path: Path, text: str, *, durable: bool = False) -> None:
-    """Write ``text`` as UTF-8, atomically; ``durable`` as in ``whole_file``."""
-    with whole_file(path, durable=durable) as temporary:
+    """Write ``text`` as UTF-8, atomically; ``durable`` as in ``atomic_file``."""
+    with atomic_file(path, durable=durable) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
@@ -92,7 +92,7 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, kind)
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    with whole_file(path) as temporary:
+    with atomic_file(path) as temporary:
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:
             picture_error(oiio)  # fetched, or it would be printed when the program ends

@@ -14,7 +14,7 @@ import torch
 from dyngs.config import CompactConfig, HumanNetModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.data.capture import Capture
-from dyngs.data.frame_selection import spread
+from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
@@ -127,4 +127,4 @@ def _views(runs: Sequence[LoadedRun], capture: Capture, split: str) -> list[tupl
     loader = PictureLoader(split_views(capture, split), config.data)
     _, colour = evaluation_background(config.data.background, capture.has_alpha)
     drawings = [Drawing(scene_of_split(r, capture, split), render_options(r.config.model), colour) for r in runs]
-    return [(loader[i], drawings) for i in spread(len(loader), COMPARED_VIEWS)]
+    return [(loader[i], drawings) for i in evenly_spaced(len(loader), COMPARED_VIEWS)]

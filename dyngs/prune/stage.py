@@ -17,7 +17,7 @@ from torch import Tensor
 from dyngs.build import training_cameras
 from dyngs.camera import Cameras
 from dyngs.config import CompactConfig
-from dyngs.data.frame_selection import spread
+from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture
 from dyngs.deform.masks import KeyMasks
 from dyngs.deform.model import DynamicScene
@@ -96,7 +96,7 @@ def _pruning(trainer: Trainer, scene: Scene) -> Pruning:
     """What may go of ``scene``."""
     options = trainer.config.compact
     found = worth(survey_of(trainer, scene), slopes=options.score == "sensitivity")
-    pictures = [trainer.pictures[i] for i in spread(len(trainer.pictures), PROBED_VIEWS)]
+    pictures = [trainer.pictures[i] for i in evenly_spaced(len(trainer.pictures), PROBED_VIEWS)]
     whole = quality_of(trainer, scene, pictures, None)
 
     def loss_of(kept: Tensor) -> float:
@@ -121,14 +121,14 @@ def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
         numbers = torch.cat([camera.cam_from_world[0, :3], camera.intrinsics[0]], dim=1)
         found.setdefault(numbers.numpy().tobytes(), camera)
     different = list(found.values())
-    return [different[i] for i in spread(len(different), count)]
+    return [different[i] for i in evenly_spaced(len(different), count)]
 
 
 def survey_of(trainer: Trainer, scene: Scene, times: Sequence[float | None] | None = None) -> Survey:
     """All pairs of some training cameras and some times; with no times all that matters are cameras."""
     background = background_colour(trainer.background)
     if times is None:
-        times = [None] if scene.is_still else [scene.times[i] for i in spread(len(scene.times), MOVING_TIMES)]
+        times = [None] if scene.is_still else [scene.times[i] for i in evenly_spaced(len(scene.times), MOVING_TIMES)]
     views = STILL_VIEWS if scene.is_still else MOVING_VIEWS
     cameras = distinct_cameras(training_cameras(trainer.pictures.views, trainer.config.data), views)
     return Survey(scene.at, scene.shader_at, cameras, times, trainer.options, background)

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from dyngs.config import SceneModel
 from dyngs.errors import DyngsError, require_regular
-from dyngs.files.write import whole_file
+from dyngs.files.write import atomic_file
 from dyngs.storage.coding import Packing, compressed, decompressed, packed, unpacked
 from dyngs.storage.drawable import completed, drawable, in_storage_order
 from dyngs.storage.tensors import (
@@ -118,7 +118,7 @@ class StoredScene:
 
 def write_scene(path: Path, data: bytes) -> None:
     """Write what ``encoded`` made, atomically. Raises DyngsError for a full disk and the like."""
-    with whole_file(path, durable=True) as temporary:
+    with atomic_file(path, durable=True) as temporary:
         temporary.write_bytes(data)
 
 

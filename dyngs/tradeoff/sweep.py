@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import cast
 
 from dyngs.config.io import load_resolved
-from dyngs.data.frame_selection import spread
+from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
@@ -164,7 +164,7 @@ class _Bench:
         return Drawer(scene, options_of(variant, run.config.model), self._background, variant.scale)
 
     def _pictures(self, count: int) -> list[Picture]:
-        return [self._loader[i] for i in spread(len(self._loader), count)]
+        return [self._loader[i] for i in evenly_spaced(len(self._loader), count)]
 
     def _path(self, variant: Variant) -> Path:
         return self._models.out / "points" / f"{variant.slug}.json"

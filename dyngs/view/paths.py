@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.data.focus import focus_point, share_in_front
-from dyngs.data.poses import cam_from_opengl, checked_pose
+from dyngs.data.geometry.focus import focus_point, share_in_front
+from dyngs.data.geometry.poses import cam_from_opengl, checked_pose
 from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.write import write_text
 from dyngs.view.keyframes import Keyframes, interpolate_keyframes

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dyngs.data.capture import Split, View
-from dyngs.data.frame_selection import distinct_times, parse_frames, select_frames
+from dyngs.data.frame_selection import parse_frames, select_frames
+from dyngs.data.times import distinct_times
 from dyngs.errors import DyngsError
 
 ROOT = Path("capture")

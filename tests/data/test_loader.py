@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from tiny_captures import random_pixels, write_picture
 
 from dyngs.config import DataConfig
-from dyngs.data.capture import Lens, View
+from dyngs.data.capture import Lens, Silhouette, View
 from dyngs.data.loader import PictureLoader
-from dyngs.data.readers.people import Silhouette, person_view
+from dyngs.data.pictures.silhouettes import person_view
 from dyngs.errors import DyngsError
 
 

@@ -16,8 +16,8 @@ from tiny_captures import (
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
+from dyngs.data.geometry.poses import camera_center
 from dyngs.data.loader import PictureLoader
-from dyngs.data.poses import camera_center
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 

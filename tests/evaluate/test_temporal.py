@@ -19,9 +19,9 @@ from moving_scene import (
 )
 
 from dyngs.config import DataConfig
-from dyngs.data.frame_selection import standing_cameras
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
+from dyngs.data.times import static_cameras
 from dyngs.errors import DyngsError
 from dyngs.evaluate.temporal import (
     Drawing,
@@ -142,9 +142,9 @@ def test_masks_leave_pixels_out_of_the_flicker_error(split) -> None:
 def test_cameras_that_stand_are_found_whatever_the_order(split) -> None:
     _, views = split
     moved = replace(views[1], cam_from_world=views[1].cam_from_world + 0.5)
-    assert standing_cameras([views[2], moved, views[0]]) == [[2, 0]]
-    assert standing_cameras([views[0], views[0]]) == []
-    assert standing_cameras([replace(v, time=None) for v in views]) == []
+    assert static_cameras([views[2], moved, views[0]]) == [[2, 0]]
+    assert static_cameras([views[0], views[0]]) == []
+    assert static_cameras([replace(v, time=None) for v in views]) == []
 
 
 def test_reasons_where_there_is_nothing_to_measure(split) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from dyngs.data.pictures.images import read_picture
 from dyngs.errors import DyngsError
-from dyngs.files.write import to_uint8, whole_file, write_image, write_text
+from dyngs.files.write import atomic_file, to_uint8, write_image, write_text
 
 
 def test_png_keeps_straight_alpha_exactly(tmp_path: Path) -> None:
@@ -46,7 +46,7 @@ def test_failure_leaves_the_former_file(tmp_path: Path) -> None:
 
 
 def _write_half(path: Path) -> None:
-    with whole_file(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_text("half")
         raise RuntimeError
 
@@ -61,5 +61,5 @@ def test_full_disk_is_one_line(tmp_path: Path) -> None:
     full = Path("/dev/full")
     if not full.exists():
         pytest.skip("this system has no /dev/full")
-    with pytest.raises(DyngsError, match="No space left"), whole_file(tmp_path / "a.txt"):
+    with pytest.raises(DyngsError, match="No space left"), atomic_file(tmp_path / "a.txt"):
         full.write_text("x")

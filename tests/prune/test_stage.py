@@ -23,7 +23,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
-from dyngs.data.frame_selection import spread
+from dyngs.data.frame_selection import evenly_spaced
 from dyngs.deform.model import DynamicScene
 from dyngs.deform.trained import TrainedScene
 from dyngs.prune.stage import Compaction, compact_, distinct_cameras
@@ -169,5 +169,5 @@ def test_cameras_of_a_standing_rig_are_taken_once() -> None:
     one, other = camera(), camera()
     moved = Cameras(other.cam_from_world + torch.tensor(0.5), other.intrinsics, other.width, other.height)
     assert distinct_cameras([one, moved, camera(), moved], 8) == [one, moved]
-    assert spread(10, 3) == [0, 3, 6]
-    assert spread(2, 3) == [0, 1]
+    assert evenly_spaced(10, 3) == [0, 3, 6]
+    assert evenly_spaced(2, 3) == [0, 1]

@@ -23,9 +23,9 @@ import numpy as np
 from dyngs.data.capture import VideoFrame
 from dyngs.data.pictures.video import VideoInfo, probe_video, read_numbered_frames
 from dyngs.errors import DyngsError, reading
+from dyngs.files.containment import inside
 from dyngs.files.picture_errors import picture_error
-from dyngs.files.trust import inside
-from dyngs.files.write import whole_file, write_text
+from dyngs.files.write import atomic_file, write_text
 
 try:
     import fcntl
@@ -145,7 +145,7 @@ def _write_png(path: Path, rgb: np.ndarray) -> None:
 
     spec = oiio.ImageSpec(rgb.shape[1], rgb.shape[0], 3, oiio.UINT8)
     spec.attribute("png:compressionLevel", 1)
-    with whole_file(path) as temporary, reading(path, "the disk may be full"):
+    with atomic_file(path) as temporary, reading(path, "the disk may be full"):
         output = oiio.ImageOutput.create(str(temporary))
         written = output is not None and output.open(str(temporary), spec) and output.write_image(rgb)
         problem = picture_error(oiio if output is None else output)

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError, reading
+from dyngs.files.containment import check_size, max_decoded_mb
 from dyngs.files.picture_errors import picture_error
-from dyngs.files.trust import check_size, max_decoded_mb
 
 if TYPE_CHECKING:
     import OpenImageIO

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from dyngs.errors import DyngsError, reading, reason
-from dyngs.files.trust import check_size
+from dyngs.files.containment import check_size
 
 if TYPE_CHECKING:
     import av

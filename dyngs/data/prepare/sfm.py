@@ -14,9 +14,9 @@ import numpy as np
 from dyngs.data.pictures.images import read_header
 from dyngs.data.pictures.video import read_frames
 from dyngs.errors import DyngsError, reading
+from dyngs.files.containment import MAX_MEGAPIXELS, check_size, inside, pictures_up_to, staying_within
 from dyngs.files.picture_errors import any_text, picture_error
 from dyngs.files.temporary import temporary_folder_beside
-from dyngs.files.trust import MAX_MEGAPIXELS, check_size, inside, pictures_up_to, staying_within
 from dyngs.files.write import write_image
 
 if TYPE_CHECKING:

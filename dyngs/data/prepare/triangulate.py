@@ -13,7 +13,7 @@ import torch
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import PointCloud, View
-from dyngs.data.frame_selection import spread
+from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
@@ -40,7 +40,7 @@ def views_of_a_moment(views: Sequence[View], limit: int) -> list[View]:
     most = max(shown.values(), default=0)
     moments = [time for time in shown if shown[time] == most]
     of_moment = [view for view in views if moments and view.time == moments[len(moments) // 2]]
-    return [of_moment[i] for i in spread(len(of_moment), limit)]
+    return [of_moment[i] for i in evenly_spaced(len(of_moment), limit)]
 
 
 def triangulated_points(views: Sequence[View], options: DataConfig) -> PointCloud | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyngs.data.capture import Capture, Split, View
-from dyngs.data.readers.transforms import read_frame_file, read_views
+from dyngs.data.readers.shared.transforms import read_frame_file, read_views
 
 
 def is_blender(root: Path) -> bool:
@@ -19,7 +19,7 @@ def read_blender(root: Path) -> Capture:
     Intrinsics: ``camera_angle_x``, or ``w, h, fl_x, fl_y, cx, cy`` of the file or the frame.
 
     Raises:
-        DyngsError: see ``dyngs.data.readers.transforms.read_views``.
+        DyngsError: see ``dyngs.data.readers.shared.transforms.read_views``.
     """
     splits: dict[Split, tuple[View, ...]] = {}
     warnings: list[str] = []

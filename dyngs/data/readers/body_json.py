@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import cast
 
-from dyngs.data.capture import Capture, Split, View
+from dyngs.data.body_frames import body_frames, rows_of
+from dyngs.data.capture import BodyFrames, Capture, Split, View
 from dyngs.data.readers.blender import read_blender
-from dyngs.data.readers.people import BodyFrames, body_frames, read_npz, rows_of
-from dyngs.data.readers.transforms import read_frame_file, read_views
+from dyngs.data.readers.shared.transforms import read_frame_file, read_views
 from dyngs.errors import DyngsError, reading
+from dyngs.files.numpy_files import read_npz
 
 _TRAIN = "body_train.npz"
 _NEW_POSES = cast(Split, "pose")
@@ -29,7 +30,7 @@ def read_body_json(root: Path) -> Capture:
     one world (unlike in AMASS files nothing is turned to make it y up).
 
     Raises:
-        DyngsError: missing or bad parameters, and see ``dyngs.data.readers.transforms.read_views``.
+        DyngsError: missing or bad parameters, and see ``dyngs.data.readers.shared.transforms.read_views``.
     """
     with reading(root):
         return _read(root)

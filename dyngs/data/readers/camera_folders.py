@@ -1,46 +1,20 @@
-"""Reader for videos from several cameras at rest: a folder or a video file per camera, and ``cameras.json``.
-
-What is common to such captures, however they are calibrated, is here, too; see also ``dyngs.data.readers.llff``.
-"""
+"""Reader for videos from several cameras at rest: a folder or a video file per camera, and ``cameras.json``."""
 
 from __future__ import annotations
 
-import math
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.capture import Capture, Split, VideoFrame, View
-from dyngs.data.intrinsics import match_size, rescale_warning
-from dyngs.data.pictures.frame_cache import VideoFrames, planned_frames
-from dyngs.data.pictures.images import SUFFIXES
-from dyngs.data.pictures.video import VIDEO_SUFFIXES, VideoInfo
-from dyngs.data.poses import checked_pose, inverse_rigid
-from dyngs.data.readers.transforms import Frame, FrameFile, read_views
+from dyngs.data.capture import Capture, Split, View
+from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV, checked_pose, inverse_rigid
+from dyngs.data.readers.shared.camera_sequences import find_cameras, open_camera, sequence_views
 from dyngs.errors import DyngsError
-from dyngs.files.json_object import read_json_object
+from dyngs.files.json_files import read_json_object
 
 CALIBRATION = "cameras.json"
-OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _MIN_TO_HOLD_ONE_OUT = 3
-
-
-@dataclass(frozen=True)
-class CameraSource:
-    """The pictures of one camera.
-
-    Attributes:
-        name: of its folder, or of its video without the suffix.
-        pictures: frame number to file; the files of a video may have to be decoded first.
-        video: its frames, None for a folder.
-    """
-
-    name: str
-    pictures: dict[int, Path]
-    video: VideoFrames | None = None
 
 
 def is_camera_folders(root: Path) -> bool:
@@ -86,114 +60,6 @@ def calibrated_fps(root: Path) -> float | None:
         return None
     fps = _read_calibration(root / CALIBRATION).get("fps")
     return None if fps is None else float(fps)  # type: ignore[arg-type]
-
-
-def find_cameras(root: Path) -> dict[str, Path]:
-    """Camera name to its folder of pictures, or to its video file where it has no such folder; sorted by name.
-
-    Pictures lie in the folder itself or in ``images`` below it.
-
-    Raises:
-        DyngsError: two videos for one camera.
-    """
-    found: dict[str, Path] = {}
-    for path in sorted(root.iterdir()):
-        if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() and not path.name.startswith("."):
-            if path.stem in found:
-                raise DyngsError(f"{root}: {found[path.stem].name} and {path.name} are one camera; remove one of them")
-            found[path.stem] = path
-    for path in sorted(root.iterdir()):
-        if path.is_dir() and not path.name.startswith("."):
-            folder = next((f for f in (path, path / "images") if _pictures(f)), None)
-            if folder is not None:
-                found[path.name] = folder
-    return dict(sorted(found.items()))
-
-
-def open_camera(name: str, path: Path) -> CameraSource:
-    """The pictures of the camera that ``find_cameras`` found at ``path``.
-
-    Raises:
-        DyngsError: a picture without a number, two with the same one, or a video that cannot be opened.
-    """
-    if path.is_file():
-        planned = planned_frames(path)
-        return CameraSource(name, dict(enumerate(planned.paths)), planned)
-    pictures: dict[int, Path] = {}
-    for picture in _pictures(path):
-        digits = re.findall(r"\d+", picture.stem)
-        if not digits:
-            raise DyngsError(f"{picture}: no frame number in its name; call it frame_0000{picture.suffix} or the like")
-        other = pictures.setdefault(int(digits[-1]), picture)
-        if other != picture:
-            raise DyngsError(f"{path}: {other.name} and {picture.name} have the same frame number; remove one of them")
-    return CameraSource(name, pictures)
-
-
-def sequence_views(
-    path: Path, cameras: Sequence[CameraSource], calibrations: Mapping[str, dict[str, object]]
-) -> tuple[dict[str, tuple[View, ...]], list[str]]:
-    """The views of each camera, and warnings; times run from 0 at the lowest frame number to 1 at the highest one.
-
-    Args:
-        path: the calibration file in the capture's folder.
-        cameras: in the order of their ``camera_id``.
-        calibrations: by camera name, the fields of a frame in a transforms file: ``fl_x``, ``transform_matrix``, ...
-
-    Raises:
-        DyngsError: see ``dyngs.data.readers.transforms.read_views``.
-    """
-    numbers = sorted({number for camera in cameras for number in camera.pictures})
-    span = max(numbers[-1] - numbers[0], 1)
-    views: dict[str, tuple[View, ...]] = {}
-    warnings = _rate_warning(cameras)
-    for index, camera in enumerate(cameras):
-        own = dict(calibrations[camera.name])
-        where = f"{path}, camera {camera.name}"
-        if camera.video is not None and ("w" not in own or "h" not in own):
-            own |= {"w": camera.video.info.width, "h": camera.video.info.height}
-        frames = []
-        for number, picture in sorted(camera.pictures.items()):
-            times = {"frame": number, "time": (number - numbers[0]) / span}
-            fields = {**own, **times, "file_path": str(picture), "camera": index}
-            video = None if camera.video is None else VideoFrame(camera.video.source, number)
-            frames.append(Frame(where, fields, {}, picture, video))
-        read, notes = read_views(FrameFile(path, {}, tuple(frames)))
-        views[camera.name], more = tuple(read.values()), []
-        if camera.video is not None:
-            views[camera.name], more = _at_video_size(camera.name, camera.video.info, views[camera.name], where)
-        warnings += [*notes, *more]
-    return views, warnings
-
-
-def _at_video_size(
-    name: str, video: VideoInfo, views: tuple[View, ...], where: str
-) -> tuple[tuple[View, ...], list[str]]:
-    """The views with names after the video, and of its size even where the frame has not been decoded yet."""
-    sized, rescaled = [], []
-    for view in views:
-        described = (view.width, view.height)
-        intrinsics, size, changed = match_size(view.intrinsics, described, (video.width, video.height), where)
-        rescaled += [where] if changed else []
-        frame = f"{name}/{view.image_path.stem}"
-        sized.append(replace(view, name=frame, intrinsics=intrinsics, width=size[0], height=size[1]))
-    return tuple(sized), rescale_warning(rescaled)
-
-
-def _rate_warning(cameras: Sequence[CameraSource]) -> list[str]:
-    videos = [
-        (camera.name, camera.video.info.fps)
-        for camera in cameras
-        if camera.video is not None and camera.video.info.fps > 0
-    ]
-    odd = [(name, fps) for name, fps in videos if not math.isclose(fps, videos[0][1], rel_tol=0.01)]
-    if not odd:
-        return []
-    first, (name, fps) = videos[0], odd[0]
-    return [
-        f"{first[0]} has {first[1]:g} frames per second, {name} {fps:g}: frames of one number are taken for "
-        "simultaneous; convert the videos to one rate"
-    ]
 
 
 def _read_calibration(path: Path) -> dict[str, object]:
@@ -247,12 +113,6 @@ def _splits(
         "train": tuple(view for name, kept in views.items() if name not in test for view in kept),
         "test": tuple(view for name, kept in views.items() if name in test for view in kept),
     }, notes
-
-
-def _pictures(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
 
 
 def _some(names: Sequence[str]) -> str:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from dyngs.data.capture import Capture, Lens, PointCloud, View
-from dyngs.data.intrinsics import match_size, pinhole_matrix, rescale_warning
+from dyngs.data.geometry.intrinsics import match_size, pinhole_matrix, rescale_warning
+from dyngs.data.geometry.poses import checked_pose, repair_warning
 from dyngs.data.pictures.images import SUFFIXES, read_header
-from dyngs.data.poses import checked_pose, repair_warning
-from dyngs.data.readers.colmap_check import check_model_file
-from dyngs.data.readers.transforms import view_name
+from dyngs.data.readers.shared.colmap_check import check_model_file
+from dyngs.data.readers.shared.transforms import view_name
 from dyngs.errors import DyngsError, reading
-from dyngs.files.trust import check_size, inside
+from dyngs.files.containment import check_size, inside
 
 if TYPE_CHECKING:
     import pycolmap

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.data.capture import Capture, Split, View
-from dyngs.data.readers.camera_folders import OPENGL_FROM_OPENCV, find_cameras, open_camera, sequence_views
-from dyngs.errors import DyngsError, reading
-from dyngs.files.trust import inside
+from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV
+from dyngs.data.readers.shared.camera_sequences import find_cameras, open_camera, sequence_views
+from dyngs.errors import DyngsError
+from dyngs.files.numpy_files import read_npy
 
 POSES = "poses_bounds.npy"
 
@@ -51,20 +52,9 @@ def read_llff(root: Path) -> Capture:
     return Capture(root, "llff", _splits(views, names), warnings=tuple(notes))
 
 
-def read_number_array(path: Path) -> np.ndarray:
-    """The float64 array of a ``.npy`` file; archives and Python objects are refused.
-
-    Raises:
-        DyngsError: the file is missing, damaged, or holds something else than numbers.
-    """
-    # NumPy reads the header as Python text; a damaged one raises nearly anything.
-    with reading(path, "it must be a NumPy array of numbers; copy it again"), inside(path).open("rb") as file:
-        return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
-
-
 def _read_rows(path: Path) -> np.ndarray:
     """(V, 17) float64."""
-    rows = read_number_array(path)
+    rows = read_npy(path)
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         raise DyngsError(f"{path}: must have 17 columns, one row per camera; got shape {rows.shape}")
     bad = ~np.isfinite(rows[:, :15]).all(axis=1)

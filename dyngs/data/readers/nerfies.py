@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.data.capture import Capture, PointCloud, Split, View
+from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV
 from dyngs.data.pictures.images import SUFFIXES, read_header
-from dyngs.data.readers.camera_folders import OPENGL_FROM_OPENCV
-from dyngs.data.readers.llff import read_number_array
-from dyngs.data.readers.transforms import Frame, FrameFile, read_views
+from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
-from dyngs.files.json_object import read_json_object
-from dyngs.files.trust import check_size, inside
+from dyngs.files.containment import check_size, inside
+from dyngs.files.json_files import read_json_object
+from dyngs.files.numpy_files import read_npy
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ def _scaled_size(full: np.ndarray, factor: int, picture: Path) -> tuple[int, int
 def _points(path: Path, scene: _Scene) -> PointCloud | None:
     if not path.is_file():
         return None
-    xyz = read_number_array(path)
+    xyz = read_npy(path)
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise DyngsError(f"{path}: must have 3 columns, one row per point; got shape {xyz.shape}")
     return PointCloud(scene.apply(xyz), np.full(xyz.shape, 128, np.uint8)) if len(xyz) else None

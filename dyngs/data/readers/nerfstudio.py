@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from dyngs.data.capture import Capture, PointCloud, Split, View
-from dyngs.data.readers.transforms import FrameFile, read_frame_file, read_views
+from dyngs.data.readers.shared.transforms import FrameFile, read_frame_file, read_views
 from dyngs.errors import DyngsError, reading
-from dyngs.files.trust import inside
+from dyngs.files.containment import inside
 
 
 def is_nerfstudio(root: Path) -> bool:
@@ -26,7 +26,7 @@ def read_nerfstudio(root: Path) -> Capture:
     has been applied to both.
 
     Raises:
-        DyngsError: see ``dyngs.data.readers.transforms.read_views``; an unreadable ``.ply``.
+        DyngsError: see ``dyngs.data.readers.shared.transforms.read_views``; an unreadable ``.ply``.
     """
     file = read_frame_file(root / "transforms.json")
     views, warnings = read_views(file)

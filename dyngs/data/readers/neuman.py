@@ -9,24 +9,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.data.capture import Capture, Split
-from dyngs.data.poses import checked_pose
+from dyngs.data.body_frames import body_frames, of_one_clip
+from dyngs.data.capture import BodyFrames, Capture, Silhouette, Split
+from dyngs.data.geometry.poses import checked_pose
+from dyngs.data.pictures.silhouettes import PersonView, person_view
 from dyngs.data.readers.colmap import is_colmap, read_colmap
-from dyngs.data.readers.people import (
-    BodyFrames,
-    PersonView,
-    Silhouette,
-    body_frames,
-    entry,
-    numbers_of,
-    of_one_clip,
-    person_view,
-    read_npz,
-    some,
-)
 from dyngs.errors import DyngsError, reading
+from dyngs.files.containment import inside
+from dyngs.files.fields import entry, numbers_of, some
+from dyngs.files.numpy_files import read_npz
 from dyngs.files.pickles import read_pickle, read_pickled_array
-from dyngs.files.trust import inside
 
 ALIGNED = "4d_humans/smpl_optimized_aligned_scale.npz"
 ALIGNMENTS = "alignments.npy"

@@ -8,25 +8,17 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.data.capture import Capture
+from dyngs.data.body_frames import body_frames, of_one_clip
+from dyngs.data.capture import BodyFrames, Capture, Silhouette
+from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV, inverse_rigid
+from dyngs.data.pictures.silhouettes import MASKS, person_view
 from dyngs.data.pictures.video import VIDEO_SUFFIXES
-from dyngs.data.poses import inverse_rigid
-from dyngs.data.readers.camera_folders import OPENGL_FROM_OPENCV, open_camera, sequence_views
-from dyngs.data.readers.people import (
-    MASKS,
-    BodyFrames,
-    Silhouette,
-    body_frames,
-    entry,
-    hdf5_length,
-    numbers_of,
-    of_one_clip,
-    person_view,
-    read_hdf5,
-)
+from dyngs.data.readers.shared.camera_sequences import open_camera, sequence_views
 from dyngs.errors import DyngsError, reading
+from dyngs.files.containment import inside
+from dyngs.files.fields import entry, numbers_of
+from dyngs.files.hdf5 import hdf5_length, read_hdf5
 from dyngs.files.pickles import read_pickle
-from dyngs.files.trust import inside
 
 CAMERA = "camera.pkl"
 MASK_FILE = "masks.hdf5"

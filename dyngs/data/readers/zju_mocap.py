@@ -9,24 +9,15 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from dyngs.data.capture import Capture, Split, View
-from dyngs.data.poses import checked_pose, inverse_rigid
-from dyngs.data.readers.camera_folders import OPENGL_FROM_OPENCV
-from dyngs.data.readers.people import (
-    BodyFrames,
-    Silhouette,
-    body_frames,
-    entry,
-    numbers_of,
-    of_one_clip,
-    person_view,
-    rows_of,
-    some,
-)
-from dyngs.data.readers.transforms import Frame, FrameFile, read_views
+from dyngs.data.body_frames import body_frames, of_one_clip, rows_of
+from dyngs.data.capture import BodyFrames, Capture, Silhouette, Split, View
+from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV, checked_pose, inverse_rigid
+from dyngs.data.pictures.silhouettes import person_view
+from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError, reading
+from dyngs.files.containment import inside
+from dyngs.files.fields import entry, numbers_of, some
 from dyngs.files.pickles import read_pickle, read_pickled_array
-from dyngs.files.trust import inside
 
 ANNOTATIONS = "annots.npy"
 CAMERAS = "cameras.pkl"

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError, reading
-from dyngs.files.archives import read_arrays
+from dyngs.files.numpy_files import read_arrays
 from dyngs.human.motion.motion import ROWS, Motion, Up, require_moderate, require_rate
 from dyngs.human.motion.retarget import on_floor
 from dyngs.human.template.body import Body

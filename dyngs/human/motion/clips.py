@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.data.capture import View
-from dyngs.data.readers.people import BodyFrames, about_pelvis, rows_of
+from dyngs.data.body_frames import about_pelvis, rows_of
+from dyngs.data.capture import BodyFrames, View
 from dyngs.human.motion.motion import ROWS, Motion
 from dyngs.human.pose.skinning import apply, joint_transforms, rotations
 

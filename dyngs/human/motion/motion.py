@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError, reading
 from dyngs.files.limits import VARIABLE, allowed
-from dyngs.files.write import whole_file
+from dyngs.files.write import atomic_file
 
 if TYPE_CHECKING:
     from dyngs.human.template.body import Body
@@ -213,7 +213,7 @@ def save_motion(motion: Motion, path: Path) -> None:
         raise DyngsError(f"cannot write {path}: a motion is written as .npz")
     if motion.poses.shape[1:] != (55, 3):
         raise ValueError(f"poses must be (F, 55, 3), got {tuple(motion.poses.shape)}")
-    with whole_file(path) as temporary, temporary.open("wb") as file:
+    with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
             poses=motion.poses.reshape(len(motion), -1).numpy(),

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError, reading, reason
-from dyngs.files.archives import read_arrays
 from dyngs.files.limits import require_at_most
+from dyngs.files.numpy_files import read_arrays
 from dyngs.files.pickles import read_pickle
 from dyngs.human.template.body import Body
 

@@ -22,7 +22,7 @@ from dyngs.data.pictures.images import (
     target_size,
 )
 from dyngs.errors import DyngsError
-from dyngs.files.trust import pictures_up_to
+from dyngs.files.containment import pictures_up_to
 
 
 @pytest.mark.parametrize("channels", [3, 4])

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dyngs.data.capture import Lens
-from dyngs.data.intrinsics import pinhole_matrix
+from dyngs.data.geometry.intrinsics import pinhole_matrix
 from dyngs.data.pictures.lens import distort, is_pinhole, undistort, undistort_map
 
 BARREL = Lens("opencv", (-0.2, 0.05, 0.002, -0.003))

@@ -13,7 +13,7 @@ from tiny_captures import level_of, packet_places, truncate_video, write_video
 from dyngs.data.pictures import video as video_module
 from dyngs.data.pictures.video import VideoInfo, probe_video, read_frames, read_numbered_frames
 from dyngs.errors import DyngsError
-from dyngs.files.trust import pictures_up_to
+from dyngs.files.containment import pictures_up_to
 
 
 @pytest.fixture(scope="module")

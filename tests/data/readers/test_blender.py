@@ -8,7 +8,7 @@ import pytest
 from tiny_captures import edit_json, opengl_pose, random_pixels, write_frames, write_picture
 
 from dyngs.data.readers.blender import is_blender, read_blender
-from dyngs.data.readers.transforms import view_name
+from dyngs.data.readers.shared.transforms import view_name
 from dyngs.errors import DyngsError
 
 

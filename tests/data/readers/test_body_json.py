@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from tiny_captures import edit_json, pixel_of, random_pixels, write_frames, write_picture
 
-from dyngs.data.capture import Capture, View
+from dyngs.data.body_frames import about_pelvis, rows_of
+from dyngs.data.capture import BodyFrames, Capture, View
 from dyngs.data.pictures.images import read_picture
 from dyngs.data.readers.body_json import is_body_json, read_body_json
-from dyngs.data.readers.people import BodyFrames, about_pelvis, rows_of
 from dyngs.errors import DyngsError
 
 LENS = {"w": 4, "h": 3, "fl_x": 5.0, "fl_y": 5.0, "cx": 2.0, "cy": 1.5}

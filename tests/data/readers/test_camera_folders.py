@@ -25,7 +25,8 @@ from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.pictures.images import read_picture
 from dyngs.data.read import read_capture
-from dyngs.data.readers.camera_folders import calibrated_fps, find_cameras, read_camera_folders
+from dyngs.data.readers.camera_folders import calibrated_fps, read_camera_folders
+from dyngs.data.readers.shared.camera_sequences import find_cameras
 from dyngs.errors import DyngsError
 
 NAMES = ("cam00", "cam01", "cam02")

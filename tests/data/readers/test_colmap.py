@@ -13,7 +13,7 @@ from dyngs.config import DataConfig
 from dyngs.data.pictures.lens import distort
 from dyngs.data.read import read_capture
 from dyngs.data.readers.colmap import is_colmap, pinhole_and_lens, read_colmap
-from dyngs.data.readers.colmap_check import check_model_file
+from dyngs.data.readers.shared.colmap_check import check_model_file
 from dyngs.errors import DyngsError
 
 MODELS = {

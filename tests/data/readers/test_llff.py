@@ -12,7 +12,7 @@ from tiny_captures import SIDE_PIXELS, cached, pixel_of, truncate_video, write_f
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
-from dyngs.data.readers.llff import read_llff, read_number_array
+from dyngs.data.readers.llff import read_llff
 from dyngs.errors import DyngsError
 
 
@@ -139,19 +139,3 @@ def test_bad_files(root: Path) -> None:
         (root / "poses_bounds.npy").write_bytes(data)
         with pytest.raises(DyngsError, match=r"poses_bounds\.npy: cannot be read"):
             read_llff(root)
-
-
-@pytest.mark.parametrize("byte", [0, 34, 39, 40, 92, 255])
-def test_an_array_with_a_damaged_header_is_one_line(tmp_path: Path, byte: int) -> None:
-    """NumPy reads the header as Python text, so nearly any error may come of it."""
-    path = tmp_path / "points.npy"
-    np.save(path, np.zeros((2, 17)))
-    content, said = path.read_bytes(), []
-    for place in range(10, 70):
-        path.write_bytes(content[:place] + bytes([byte]) + content[place + 1 :])
-        try:
-            read_number_array(path)
-        except DyngsError as error:
-            said.append(str(error))
-    assert len(said) > 50  # some bytes are of no matter
-    assert all("cannot be read" in line and "\n" not in line for line in said)

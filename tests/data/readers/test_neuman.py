@@ -11,9 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny_captures import write_colmap, write_picture
 
-from dyngs.data.capture import Capture
+from dyngs.data.body_frames import about_pelvis
+from dyngs.data.capture import BodyFrames, Capture, Silhouette
+from dyngs.data.pictures.silhouettes import PersonView
 from dyngs.data.readers.neuman import is_neuman, read_neuman
-from dyngs.data.readers.people import BodyFrames, PersonView, Silhouette, about_pelvis
 from dyngs.errors import DyngsError
 
 COUNT = 9

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from tiny_captures import HEIGHT, WIDTH, pixel_of, write_video
 
-from dyngs.data.readers.people import PersonView, cut_out
+from dyngs.data.pictures.silhouettes import PersonView, cut_out
 from dyngs.data.readers.people_snapshot import is_people_snapshot, read_people_snapshot
 from dyngs.errors import DyngsError
 

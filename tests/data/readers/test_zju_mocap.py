@@ -12,8 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny_captures import pixel_of, random_pixels, side_poses, write_picture
 
-from dyngs.data.capture import Capture
-from dyngs.data.readers.people import BodyFrames, PersonView, Silhouette, about_pelvis
+from dyngs.data.body_frames import about_pelvis
+from dyngs.data.capture import BodyFrames, Capture, Silhouette
+from dyngs.data.pictures.silhouettes import PersonView
 from dyngs.data.readers.zju_mocap import is_zju_mocap, read_zju_mocap
 from dyngs.errors import DyngsError
 

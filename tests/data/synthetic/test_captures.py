@@ -14,8 +14,8 @@ from dyngs.cli import main
 from dyngs.cli.data import SYNTHETIC_SCENES
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
-from dyngs.data.inspect import inspect_capture
-from dyngs.data.poses import camera_center
+from dyngs.data.geometry.poses import camera_center
+from dyngs.data.inspection.report import inspect_capture
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import (
     CAMERA_ANGLE_X,

@@ -11,8 +11,8 @@ import torch
 from motion_files import random_motion, tiny_body
 from torch import Tensor
 
-from dyngs.data.capture import View
-from dyngs.data.readers.people import BodyFrames, body_frames
+from dyngs.data.body_frames import body_frames
+from dyngs.data.capture import BodyFrames, View
 from dyngs.errors import DyngsError
 from dyngs.human.motion.clips import Clip, clip_of_motion, footage, placed, same_clip, upright
 from dyngs.human.motion.motion import JOINTS, Motion

@@ -14,10 +14,9 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import HumanModel
-from dyngs.data.capture import Capture, View
+from dyngs.data.capture import BodyFrames, Capture, View
+from dyngs.data.geometry.poses import cam_from_opengl
 from dyngs.data.loader import Picture
-from dyngs.data.poses import cam_from_opengl
-from dyngs.data.readers.people import BodyFrames
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.human.avatar.avatar import Posing
 from dyngs.human.motion.motion import JOINTS

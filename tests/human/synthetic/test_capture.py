@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from dyngs.config import DataConfig
+from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import Capture, View
-from dyngs.data.poses import cam_from_opengl
+from dyngs.data.geometry.poses import cam_from_opengl
 from dyngs.data.read import read_capture
-from dyngs.data.readers.people import about_pelvis, rows_of
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.errors import DyngsError
 from dyngs.human.motion.motion import JOINTS, Motion, read_motion

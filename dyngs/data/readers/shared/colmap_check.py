@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from dyngs.errors import DyngsError
-from dyngs.files.trust import inside
+from dyngs.files.containment import inside
 
 # Number of parameters by camera model id, in COLMAP's numbering.
 _NUM_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from dyngs.errors import DyngsError, reading
-from dyngs.files.trust import inside
+from dyngs.files.containment import inside
 
 
 def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, object]:

@@ -11,12 +11,12 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from dyngs.data.capture import Lens, VideoFrame, View
-from dyngs.data.intrinsics import MAX_SIDE, match_size, pinhole_matrix, rescale_warning
+from dyngs.data.geometry.intrinsics import MAX_SIDE, match_size, pinhole_matrix, rescale_warning
+from dyngs.data.geometry.poses import cam_from_opengl, checked_pose, repair_warning
 from dyngs.data.pictures.images import SUFFIXES, PictureHeader, read_header
-from dyngs.data.poses import cam_from_opengl, checked_pose, repair_warning
 from dyngs.errors import DyngsError
-from dyngs.files.json_object import read_json_object
-from dyngs.files.trust import check_size, inside
+from dyngs.files.containment import check_size, inside
+from dyngs.files.json_files import read_json_object
 
 _LARGEST = 1e300
 _LARGEST_INTEGER = 2**53

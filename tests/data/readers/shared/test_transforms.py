@@ -10,7 +10,7 @@ import pytest
 from tiny_captures import random_pixels, write_frames, write_picture
 
 from dyngs.config import DataConfig
-from dyngs.data.inspect import format_report, inspect_capture
+from dyngs.data.inspection.report import format_report, inspect_capture
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError

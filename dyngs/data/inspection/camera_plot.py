@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.data.capture import Capture, View
-from dyngs.data.poses import checked_pose, inverse_rigid
+from dyngs.data.geometry.poses import inverse_rigid, pose_fault
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 
@@ -48,20 +48,6 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
         _write_title(sheet.pixels, title)
         panels.append(sheet.pixels)
     write_image(out, np.concatenate(panels, axis=1))
-
-
-def pose_fault(view: View) -> str | None:
-    """What keeps the view's pose from being a rotation and a translation, None if nothing does."""
-    return matrix_fault(view.cam_from_world, f"'{view.name}'")
-
-
-def matrix_fault(matrix: np.ndarray, where: str) -> str | None:
-    """One line on why ``matrix`` is no rigid pose, None where it is one; ``where`` leads the line."""
-    try:
-        checked_pose(matrix, where)
-    except DyngsError as error:
-        return str(error)
-    return None
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from dyngs.data.capture import View
 from dyngs.errors import DyngsError
 
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 LARGEST = 1e12
 """Largest entry of a pose: farther out, doubles do not tell places apart well enough to bring them to the origin."""
 ROTATION_TOLERANCE = 1e-3
@@ -45,9 +47,23 @@ def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
     return pose, error
 
 
+def matrix_fault(matrix: np.ndarray, where: str) -> str | None:
+    """One line on why ``matrix`` is no rigid pose, None where it is one; ``where`` leads the line."""
+    try:
+        checked_pose(matrix, where)
+    except DyngsError as error:
+        return str(error)
+    return None
+
+
+def pose_fault(view: View) -> str | None:
+    """What keeps the view's pose from being a rotation and a translation, None if nothing does."""
+    return matrix_fault(view.cam_from_world, f"'{view.name}'")
+
+
 def cam_from_opengl(world_from_cam: np.ndarray) -> np.ndarray:
     """(4, 4) OpenCV ``cam_from_world`` of a rigid OpenGL camera-to-world pose (x right, y up, z backward)."""
-    return inverse_rigid(world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    return inverse_rigid(world_from_cam @ OPENGL_FROM_OPENCV)
 
 
 def inverse_rigid(pose: np.ndarray) -> np.ndarray:

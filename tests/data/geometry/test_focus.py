@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.data.focus import focus_point, share_in_front
+from dyngs.data.geometry.focus import focus_point, share_in_front
 from dyngs.view.paths import look_at
 
 

@@ -12,17 +12,18 @@ from typing import Any
 import numpy as np
 
 from dyngs.config import DataConfig
-from dyngs.data.camera_picture import draw_cameras, matrix_fault, pose_fault
 from dyngs.data.capture import Capture, View
-from dyngs.data.focus import focus_point, share_in_front
-from dyngs.data.frame_selection import distinct_times
+from dyngs.data.geometry.focus import focus_point, share_in_front
+from dyngs.data.geometry.poses import camera_center, inverse_rigid, matrix_fault, pose_fault
+from dyngs.data.inspection.camera_plot import draw_cameras
 from dyngs.data.pictures.frame_cache import planned_frames
 from dyngs.data.pictures.images import SUFFIXES, read_header, read_picture
-from dyngs.data.poses import camera_center, inverse_rigid
-from dyngs.data.readers.camera_folders import calibrated_fps, find_cameras
+from dyngs.data.readers.camera_folders import calibrated_fps
+from dyngs.data.readers.shared.camera_sequences import find_cameras
+from dyngs.data.times import distinct_times
 from dyngs.errors import DyngsError, printable, reading, reason
-from dyngs.files.json_object import read_json_object
-from dyngs.files.trust import leaving_links, pictures_up_to, staying_within
+from dyngs.files.containment import leaving_links, pictures_up_to, staying_within
+from dyngs.files.json_files import read_json_object
 
 __all__ = ["InspectReport", "draw_cameras", "format_report", "inspect_capture", "report_on"]
 

@@ -24,10 +24,10 @@ from tiny_captures import (
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
-from dyngs.data.inspect import inspect_capture
+from dyngs.data.inspection.report import inspect_capture
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.files.trust import check_size, inside, leaving_links, pictures_up_to, staying_within
+from dyngs.files.containment import check_size, inside, leaving_links, pictures_up_to, staying_within
 
 PLY = (
     "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 1\n"

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_captures import opengl_pose
 
+from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.poses import cam_from_opengl, camera_center, checked_pose, inverse_rigid
-from dyngs.data.readers.people import body_frames, of_one_clip
-from dyngs.data.rebase import rebase, shifted
+from dyngs.data.geometry.poses import cam_from_opengl, camera_center, checked_pose, inverse_rigid
+from dyngs.data.geometry.recenter import recenter, shifted
 from dyngs.errors import DyngsError
 
 
@@ -31,7 +31,7 @@ def capture_at(offset: np.ndarray, radius: float = 4.0, count: int = 6) -> Captu
 def test_far_world_comes_to_the_origin_and_back(offset: list[float]) -> None:
     """The scene keeps its shape to 1e-8 units (float64 at 1e6 has 1e-10), and adding the offset restores it."""
     before = capture_at(np.array(offset))
-    after = rebase(before)
+    after = recenter(before)
     assert np.linalg.norm(after.world_offset - offset) < 10
     near = capture_at(np.zeros(3))
     for split in ("train", "test"):
@@ -46,7 +46,7 @@ def test_far_world_comes_to_the_origin_and_back(offset: list[float]) -> None:
 
 def test_projection_does_not_change() -> None:
     before = capture_at(np.array([1e6, -2e6, 3e5]))
-    after = rebase(before)
+    after = recenter(before)
     assert before.points is not None
     assert after.points is not None
     for old, new in zip(before.splits["train"], after.splits["train"], strict=True):
@@ -58,7 +58,7 @@ def test_projection_does_not_change() -> None:
 @pytest.mark.parametrize(("distance", "radius", "moves"), [(5.0, 4.0, False), (9e4, 40, False), (9e4, 4.0, True)])
 def test_only_far_scenes_move(distance: float, radius: float, moves: bool) -> None:
     capture = capture_at(np.array([distance, 0, 0]), radius)
-    assert (rebase(capture) is not capture) == moves
+    assert (recenter(capture) is not capture) == moves
 
 
 @pytest.mark.parametrize("jitter", [0.0, 1e-9])
@@ -68,7 +68,7 @@ def test_fixed_camera_stays_where_it_is(jitter: float) -> None:
     moved = [view.cam_from_world + np.diag([jitter * i, 0, 0], 1) for i in range(5)]
     views = tuple(View(str(i), view.image_path, pose, np.eye(3), 1, 1) for i, pose in enumerate(moved))
     capture = Capture(Path(), "blender", {"train": views})
-    assert rebase(capture) is capture
+    assert recenter(capture) is capture
 
 
 def test_offsets_add_up() -> None:

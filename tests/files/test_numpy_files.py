@@ -12,8 +12,8 @@ import pytest
 from measured import cost_of
 
 from dyngs.errors import DyngsError
-from dyngs.files import archives
-from dyngs.files.archives import MOST_BYTES, read_arrays
+from dyngs.files import numpy_files
+from dyngs.files.numpy_files import MOST_BYTES, read_arrays, read_npy, read_npz
 
 
 def refusal(path: Path, *names: str) -> str:
@@ -85,7 +85,7 @@ def test_headers_that_lie(tmp_path: Path, shape: str, problem: str) -> None:
 
 
 def test_numbers_of_one_byte_count_as_those_of_eight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(archives, "MOST_BYTES", 800)
+    monkeypatch.setattr(numpy_files, "MOST_BYTES", 800)
     write_member(tmp_path / "x.npz", "(101,)", bytes(101), "|u1")
     assert "asks for 808 bytes of arrays" in refusal(tmp_path / "x.npz", "a")
     monkeypatch.setenv("DYNGS_LIMITS", "2")
@@ -112,3 +112,38 @@ def test_other_packing_and_a_lying_directory(tmp_path: Path) -> None:
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "x.npz")
     assert "is no file" in refusal(tmp_path / "x.npz", "a")
+
+
+def test_npz(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    with pytest.raises(DyngsError, match=r"a\.npz: no such file; it should hold the body parameters poses, trans"):
+        read_npz(path, ("poses", "trans"))
+    np.savez(path, poses=np.zeros(3), gender="neutral")
+    assert set(read_npz(path, ("poses",), ("gender", "scale"))) == {"poses", "gender"}
+    with pytest.raises(DyngsError, match="'trans' is missing"):
+        read_npz(path, ("poses", "trans"))
+    np.savez(path, poses=np.array([{}]))
+    with pytest.raises(DyngsError, match=r"a\.npz: 'poses' is not an array of numbers .*it holds Python objects"):
+        read_npz(path, ("poses",))
+    np.save(tmp_path / "b.npy", np.zeros(3))
+    for damaged in (b"", b"PK\x03\x04", b"\x80\x04N.", (tmp_path / "b.npy").read_bytes()):
+        path.write_bytes(damaged)
+        with pytest.raises(DyngsError, match=r"a\.npz: cannot be read") as caught:
+            read_npz(path, ("poses",))
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("byte", [0, 34, 39, 40, 92, 255])
+def test_an_array_with_a_damaged_header_is_one_line(tmp_path: Path, byte: int) -> None:
+    """NumPy reads the header as Python text, so nearly any error may come of it."""
+    path = tmp_path / "points.npy"
+    np.save(path, np.zeros((2, 17)))
+    content, said = path.read_bytes(), []
+    for place in range(10, 70):
+        path.write_bytes(content[:place] + bytes([byte]) + content[place + 1 :])
+        try:
+            read_npy(path)
+        except DyngsError as error:
+            said.append(str(error))
+    assert len(said) > 50  # some bytes are of no matter
+    assert all("cannot be read" in line and "\n" not in line for line in said)

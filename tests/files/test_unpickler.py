@@ -14,9 +14,9 @@ import scipy.sparse
 from measured import cost_of
 
 from dyngs.errors import DyngsError
-from dyngs.files import pickle_machine
-from dyngs.files.pickle_machine import require_tree
+from dyngs.files import unpickler
 from dyngs.files.pickles import read_pickle
+from dyngs.files.unpickler import require_tree
 
 MANY = 50_000
 
@@ -118,8 +118,8 @@ def test_instructions_of_one_byte_that_take_hundreds(
     tmp_path: Path, what: str, step: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("_MOST_CONTAINERS", "_MOST_REMEMBERED"):
-        assert getattr(pickle_machine, name) == 1 << 20
-        monkeypatch.setattr(pickle_machine, name, 1 << 12)
+        assert getattr(unpickler, name) == 1 << 20
+        monkeypatch.setattr(unpickler, name, 1 << 12)
     (tmp_path / "a.pkl").write_bytes(b"(N" + step * (1 << 13) + b"t.")
     with pytest.raises(DyngsError, match=f"asks for 4,097 {what}, of which 4,096 are read"):
         read_pickle(tmp_path / "a.pkl")

@@ -14,8 +14,9 @@ from tiny_captures import edit_json, write_cameras_json, write_video
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.inspect import draw_cameras, format_report, inspect_capture, report_on
-from dyngs.data.poses import cam_from_opengl
+from dyngs.data.geometry.poses import cam_from_opengl
+from dyngs.data.inspection.camera_plot import draw_cameras
+from dyngs.data.inspection.report import format_report, inspect_capture, report_on
 from dyngs.data.synthetic.captures import StillOptions, hemisphere_cameras, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image

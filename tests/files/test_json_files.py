@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dyngs.errors import DyngsError
-from dyngs.files.json_object import read_json_object
+from dyngs.files.json_files import read_json_object
 
 
 def test_an_object_with_a_byte_order_mark(tmp_path: Path) -> None:

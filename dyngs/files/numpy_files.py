@@ -1,4 +1,4 @@
-"""Arrays in ``.npz`` archives of others: only those that are asked for, and nothing allocated before it is checked."""
+"""NumPy files of others, checked before they are read: ``.npy`` arrays and chosen arrays of ``.npz`` archives."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from typing import IO
 import numpy as np
 
 from dyngs.errors import DyngsError, reading, reason
+from dyngs.files.containment import inside
+from dyngs.files.fields import entry
 from dyngs.files.limits import require_at_most
 
 MOST_BYTES = 1 << 29
@@ -44,6 +46,31 @@ def read_arrays(path: Path, choose: Callable[[Collection[str]], Iterable[str]]) 
                 found[name] = _array(path, name, info.file_size, stream, total)
             total += _weight(found[name].shape, found[name].dtype)
         return found
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """The float64 array of a ``.npy`` file; archives and Python objects are refused.
+
+    Raises:
+        DyngsError: the file is missing, damaged, or holds something else than numbers.
+    """
+    # NumPy reads the header as Python text; a damaged one raises nearly anything.
+    with reading(path, "it must be a NumPy array of numbers; copy it again"), inside(path).open("rb") as file:
+        return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
+
+
+def read_npz(path: Path, keys: Collection[str], optional: Collection[str] = ()) -> dict[str, np.ndarray]:
+    """The arrays of a ``.npz`` file: ``keys``, and of ``optional`` what is there; Python objects are refused.
+
+    Raises:
+        DyngsError: the file is missing or damaged, holds objects there, lacks a key, or asks for too much memory.
+    """
+    if not inside(path).is_file():
+        raise DyngsError(f"{path}: no such file; it should hold the body parameters {', '.join(keys)}")
+    found = read_arrays(path, lambda names: [name for name in (*keys, *optional) if name in names])
+    for key in keys:
+        entry(path, found, key)
+    return found
 
 
 def require_text(raw: bytes | bytearray, dtype: np.dtype) -> None:

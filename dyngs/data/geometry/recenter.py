@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from dyngs.data.body_frames import moved
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.poses import camera_center
-from dyngs.data.readers.people import moved
+from dyngs.data.geometry.poses import camera_center
 
 MAX_DISTANCE = 1e5
 MAX_DISTANCE_PER_SPREAD = 1e4
@@ -16,7 +16,7 @@ HARMLESS_DISTANCE = 1e3
 """Nearer scenes stay where they are, however close together their cameras (a fixed camera has no spread at all)."""
 
 
-def rebase(capture: Capture) -> Capture:
+def recenter(capture: Capture) -> Capture:
     """The capture with its median camera at the origin if it lies far out, else the capture itself.
 
     Far: the median camera centre is more than 1e5 units from the origin, or more than 1e4 times the cameras' spread

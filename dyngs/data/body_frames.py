@@ -1,0 +1,150 @@
+"""Body parameters of captured people, one row per frame: checked, moved between frames of reference, found for views.
+
+Local letters: F frames, J joints, B shape coefficients. The bodies are those of SMPL (Loper et al. 2015) and its heirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dyngs.data.capture import BODY_KINDS, BodyFrames, Split, View
+from dyngs.errors import DyngsError
+from dyngs.files.fields import float_array, numbers_of, some
+
+
+def body_frames(
+    where: Path,
+    frames: Sequence[int],
+    poses: object,
+    trans: object,
+    betas: object,
+    scale: object = 1.0,
+    turns: object = None,
+    pelvis: object = None,
+) -> BodyFrames:
+    """Checked body parameters, sorted by frame; one row per frame in whatever shape the file has them.
+
+    Args:
+        where: the file, for messages.
+        frames: F distinct numbers.
+        poses: F rows of 72, 156 or 165 numbers.
+        trans: F rows of 3.
+        betas: (B,), or one such row per frame: then their mean counts.
+        scale: one number, or one per frame.
+        turns: F rows of 3, or None.
+        pelvis: (3,) or None.
+
+    Raises:
+        DyngsError: counts that differ, another width, NaN, a scale that is not positive, a frame twice.
+    """
+    order = np.argsort(np.asarray(frames, dtype=np.int64), kind="stable")
+    numbers = tuple(int(frames[i]) for i in order)
+    if not numbers:
+        raise DyngsError(f"{where}: holds no frame; export the body parameters again")
+    if len(set(numbers)) < len(numbers):
+        twice = numbers[int(np.argmin(np.diff(numbers)))]
+        raise DyngsError(f"{where}: frame {twice} has body parameters twice; remove one of them")
+    rows = _rows(where, "poses", poses, frames)
+    if rows.shape[1] // 3 not in BODY_KINDS or rows.shape[1] % 3:
+        wanted = ", ".join(f"{3 * joints} ({kind})" for joints, kind in BODY_KINDS.items())
+        raise DyngsError(f"{where}: 'poses' has {rows.shape[1]} numbers per frame; the known bodies have {wanted}")
+    scale = np.asarray(scale)
+    scales = _rows(where, "scale", np.full(len(frames), scale.item()) if scale.size == 1 else scale, frames, 1)
+    if not (scales > 0).all():
+        raise DyngsError(f"{where}: 'scale' must be positive; export the file again")
+    return BodyFrames(
+        frames=numbers,
+        poses=rows[order].reshape(len(rows), -1, 3),
+        trans=_rows(where, "trans", trans, frames, 3)[order],
+        betas=_mean_row(where, "betas", betas, frames),
+        scale=scales[order, 0],
+        turns=None if turns is None else _rows(where, "turns", turns, frames, 3)[order],
+        pelvis=None if pelvis is None else numbers_of(f"{where}: 'pelvis'", pelvis, (3,)),
+    )
+
+
+def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
+    """The same bodies without ``turns``, for a template whose pelvis (joint 0, shaped, at rest) is at ``pelvis`` (3,).
+
+    The pelvis stays where it is in the world: at ``scale * turn(j) + trans`` with j that of the fitted body where the
+    files say it, else ``pelvis``. Hence the root turns by ``turn * poses[:, 0]``, and
+    ``trans' = trans + scale * (turn(j) - pelvis)``.
+    """
+    fitted = pelvis if body.pelvis is None else body.pelvis
+    poses, turned = body.poses, fitted
+    if body.turns is not None:
+        turns = Rotation.from_rotvec(body.turns)
+        turned = turns.apply(fitted)
+        roots = (turns * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+        poses = np.concatenate([roots[:, None], poses[:, 1:]], axis=1)
+    trans = body.trans + body.scale[:, None] * (turned - pelvis)
+    return replace(body, poses=poses, trans=trans, turns=None, pelvis=np.asarray(pelvis, dtype=np.float64))
+
+
+def moved(body: BodyFrames, offset: np.ndarray) -> BodyFrames:
+    """The bodies with ``offset`` (3,) subtracted from all positions, as ``geometry.recenter`` moves cameras."""
+    return replace(body, trans=body.trans - offset)
+
+
+def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
+    """(V,) row of ``body`` for each view, by frame number.
+
+    Args:
+        where: the file of the body parameters, for messages.
+
+    Raises:
+        DyngsError: a view without a frame number, or whose frame has no parameters.
+    """
+    rows = {number: row for row, number in enumerate(body.frames)}
+    found = []
+    for view in views:
+        if view.frame is None:
+            raise DyngsError(f"{where}: {view.image_path} has no frame number; give each picture its 'frame'")
+        found.append(rows.get(view.frame, -1))
+    lacking = sorted({view.frame for view, row in zip(views, found, strict=True) if row < 0 and view.frame is not None})
+    if lacking:
+        raise DyngsError(
+            f"{where}: no body parameters for {len(lacking)} frames that have pictures ({some(lacking)}); the file has "
+            f"{len(rows)} frames from {body.frames[0]} to {body.frames[-1]}; add them or remove the pictures"
+        )
+    return np.array(found, dtype=np.int64)
+
+
+def of_one_clip(body: BodyFrames) -> dict[Split, BodyFrames]:
+    """What ``Capture.body`` is where all splits show one clip."""
+    return {"train": body, "val": body, "test": body}
+
+
+def _rows(where: Path, name: str, value: object, frames: Sequence[int], width: int = 0) -> np.ndarray:
+    """(F, width) finite float64, any width where that is 0."""
+    array = float_array(value)
+    if array is None:
+        raise DyngsError(f"{where}: '{name}' must hold as many numbers for each frame; export the file again")
+    if not array.ndim or len(array) != len(frames):
+        count = len(array) if array.ndim else 1
+        raise DyngsError(f"{where}: '{name}' has {count} rows for {len(frames)} frames; export the file again")
+    array = array.reshape(len(frames), -1)
+    if width and array.shape[1] != width:
+        raise DyngsError(
+            f"{where}: '{name}' has {array.shape[1]} numbers per frame instead of {width}; export it again"
+        )
+    bad = ~np.isfinite(array).all(axis=1)
+    if bad.any():
+        frame = frames[int(np.argmax(bad))]
+        raise DyngsError(f"{where}: '{name}' of frame {frame} holds NaN or infinite numbers; repair or remove it")
+    return array
+
+
+def _mean_row(where: Path, name: str, value: object, frames: Sequence[int]) -> np.ndarray:
+    """(width,) from one row, or the mean of one per frame."""
+    array = float_array(value)
+    if array is not None and array.ndim == 1:
+        array = array[None]
+    if array is not None and array.ndim > 1 and len(array) == 1:
+        return numbers_of(f"{where}: '{name}'", array, None)
+    return _rows(where, name, value, frames).mean(axis=0)

@@ -1,0 +1,61 @@
+"""Silhouettes of people: masks in pictures or HDF5 files that become the alpha of a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.data.capture import Silhouette, View
+from dyngs.data.pictures.images import read_picture
+from dyngs.errors import DyngsError
+from dyngs.files.hdf5 import read_hdf5
+
+MASKS = "masks"
+"""Name of the data set of silhouettes in an HDF5 file."""
+
+
+@dataclass(frozen=True)
+class PersonView(View):
+    """A view of a person in front of other things, which are not to be learned: ``silhouette`` becomes its alpha."""
+
+    silhouette: Silhouette | None = None
+
+
+def person_view(view: View, silhouette: Silhouette | None) -> PersonView:
+    """The view with a silhouette."""
+    return PersonView(**{**vars(view), "silhouette": silhouette})
+
+
+def cut_out(pixels: Tensor, silhouette: Silhouette) -> Tensor:
+    """(H, W, 4) uint8 straight-alpha picture of the person alone, from a picture (H, W, 3 or 4) uint8.
+
+    Raises:
+        DyngsError: the silhouette is missing, damaged or of another size.
+    """
+    alpha = _levels(silhouette)
+    if alpha.shape != pixels.shape[:2]:
+        raise DyngsError(
+            f"{silhouette.path}: the mask is {alpha.shape[1]}x{alpha.shape[0]} but its picture is {pixels.shape[1]}x"
+            f"{pixels.shape[0]}; make them the same size"
+        )
+    if pixels.shape[-1] == 4:
+        alpha = (alpha.float() * pixels[..., 3].float() / 255).round().to(torch.uint8)
+    return torch.cat([pixels[..., :3], alpha[..., None]], dim=-1)
+
+
+def _levels(silhouette: Silhouette) -> Tensor:
+    """(H, W) uint8, 255 where the person is."""
+    if silhouette.row is None:
+        levels = read_picture(silhouette.path)[..., :3]
+        levels = levels.amax(-1) if silhouette.person == "nonzero" else levels.float().mean(-1).round().to(torch.uint8)
+    else:
+        row = read_hdf5(silhouette.path, MASKS, silhouette.row)
+        if row.ndim != 2 or row.dtype not in (np.uint8, np.bool_):
+            raise DyngsError(f"{silhouette.path}: '{MASKS}' must hold bytes in the shape (F, H, W); export it again")
+        levels = torch.from_numpy(row.astype(np.uint8))
+    if silhouette.person == "nonzero":
+        return (levels > 0).to(torch.uint8) * 255
+    return 255 - levels if silhouette.person == "black" else levels

@@ -1,0 +1,61 @@
+"""Checked values of dictionaries that were read from a file: required keys and finite numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+
+from dyngs.errors import DyngsError
+
+
+def entry(where: object, fields: object, key: str) -> Any:
+    """``fields[key]`` of a dictionary out of a file.
+
+    Raises:
+        DyngsError: it is no dictionary or lacks the key; ``where`` says which file.
+    """
+    if not isinstance(fields, dict):
+        raise DyngsError(f"{where}: must be a dictionary with the key '{key}'; export it again")
+    if key not in fields:
+        raise DyngsError(f"{where}: the key '{key}' is missing; export it again")
+    return fields[key]
+
+
+def numbers_of(where: object, value: object, shape: tuple[int, ...] | None) -> np.ndarray:
+    """The finite float64 numbers of ``value`` in ``shape``, or flat where that is None; a file may have another shape.
+
+    Raises:
+        DyngsError: other things, or another count; ``where`` says which file.
+    """
+    array = float_array(value)
+    fits = array is not None and (shape is None or array.size == math.prod(shape))
+    if array is None or not fits or not np.isfinite(array).all():
+        count = "x".join(map(str, shape)) + " " if shape else ""
+        raise DyngsError(f"{where} must hold {count}finite numbers; export it again")
+    return array.ravel() if shape is None else array.reshape(shape)
+
+
+def some(items: Collection[object]) -> str:
+    """The first few, for messages."""
+    return ", ".join(str(item) for item in list(items)[:5]) + (f" and {len(items) - 5} more" if len(items) > 5 else "")
+
+
+def float_array(value: object) -> np.ndarray | None:
+    """float64, None where these are no numbers."""
+    try:
+        array = np.asarray(value) if _is_numeric(value) else None
+        return array.astype(np.float64) if array is not None and array.dtype.kind in "biuf" else None
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def _is_numeric(value: object) -> bool:
+    """Whether there are but numbers in it: NumPy would make every text among them as long as the longest."""
+    if isinstance(value, (list, tuple)):
+        return all(_is_numeric(part) for part in value)
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "biuf"
+    return isinstance(value, (int, float, np.generic)) and not isinstance(value, (str, bytes))

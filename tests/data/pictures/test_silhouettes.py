@@ -1,0 +1,65 @@
+"""Silhouettes become the alpha of pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny_captures import random_pixels, write_picture
+
+from dyngs.data.capture import Silhouette, View
+from dyngs.data.pictures.silhouettes import cut_out, person_view
+from dyngs.errors import DyngsError
+
+
+@pytest.mark.parametrize(
+    ("person", "expected"),
+    [("white", [0, 1, 128, 255]), ("black", [255, 254, 127, 0]), ("nonzero", [0, 255, 255, 255])],
+)
+def test_silhouettes_become_alpha(tmp_path: Path, person: Any, expected: list[int]) -> None:
+    write_picture(tmp_path / "m.png", np.array([[[0], [1], [128], [255]]], np.uint8))
+    pixels = torch.from_numpy(random_pixels(1, 4, 3))
+    cut = cut_out(pixels, Silhouette(tmp_path / "m.png", person))
+    assert cut[0, :, 3].tolist() == expected
+    assert torch.equal(cut[..., :3], pixels)
+
+
+def test_silhouettes_and_alpha_multiply(tmp_path: Path) -> None:
+    write_picture(tmp_path / "m.png", np.array([[[0], [128], [255]]], np.uint8))
+    pixels = torch.tensor([[[9, 9, 9, 200]] * 3], dtype=torch.uint8)
+    assert cut_out(pixels, Silhouette(tmp_path / "m.png", "white"))[0, :, 3].tolist() == [0, 100, 200]
+
+
+def test_bad_silhouettes(tmp_path: Path) -> None:
+    write_picture(tmp_path / "m.png", np.zeros((2, 3, 1), np.uint8))
+    with pytest.raises(DyngsError, match=r"m\.png: the mask is 3x2 but its picture is 4x1"):
+        cut_out(torch.zeros(1, 4, 3, dtype=torch.uint8), Silhouette(tmp_path / "m.png", "white"))
+    with pytest.raises(DyngsError, match=r"n\.png: no such picture"):
+        cut_out(torch.zeros(1, 4, 3, dtype=torch.uint8), Silhouette(tmp_path / "n.png", "white"))
+
+
+def test_silhouettes_in_hdf5(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py", reason="needs dyngs[people]")
+    hdf5 = tmp_path / "m.hdf5"
+    masks = np.zeros((5, 2, 3), np.uint8)
+    masks[3, 1, 2] = 1
+    with h5py.File(hdf5, "w") as file:
+        file.create_dataset("masks", data=masks, compression="lzf")
+    pixels = torch.zeros(2, 3, 3, dtype=torch.uint8)
+    assert cut_out(pixels, Silhouette(hdf5, "nonzero", 3))[..., 3].tolist() == [[0, 0, 0], [0, 0, 255]]
+    with pytest.raises(DyngsError, match="'masks' must be a data set in an HDF5 file"):
+        cut_out(pixels, Silhouette(hdf5, "nonzero", 5))
+
+
+def test_a_view_with_a_silhouette_stays_a_view() -> None:
+    view = person_view(
+        View("v3", Path("3.png"), np.eye(4), np.eye(3), 4, 3, frame=3), Silhouette(Path("m.png"), "white")
+    )
+    assert isinstance(view, View)
+    changed = replace(view, time=0.5)
+    assert (changed.silhouette, changed.frame, changed.name) == (view.silhouette, 3, "v3")
+    assert person_view(view, None).silhouette is None

@@ -1,0 +1,157 @@
+"""Body parameters: checked, brought to another template, found for views."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from dyngs.data.body_frames import about_pelvis, body_frames, moved, rows_of
+from dyngs.data.capture import BodyFrames, View
+from dyngs.errors import DyngsError
+
+PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
+FILE = Path("body.npz")
+
+
+def posed(points: np.ndarray, joints: np.ndarray, weights: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """(M, 3) linear blend skinning, one joint after the other: ``v = sum_j w_j A_j v``."""
+    to_world: list[np.ndarray] = []
+    total = np.zeros_like(points)
+    for joint, parent in enumerate(PARENTS):
+        step = np.eye(4)
+        step[:3, :3] = Rotation.from_rotvec(pose[joint]).as_matrix()
+        step[:3, 3] = joints[joint] - (joints[parent] if parent >= 0 else 0)
+        to_world.append(step if parent < 0 else to_world[parent] @ step)
+        turned = (points - joints[joint]) @ to_world[joint][:3, :3].T + to_world[joint][:3, 3]
+        total += weights[:, joint, None] * turned
+    return total
+
+
+def random_body(seed: int, count: int = 3, turned: bool = True) -> BodyFrames:
+    rng = np.random.default_rng(seed)
+    return BodyFrames(
+        frames=tuple(range(count)),
+        poses=rng.normal(size=(count, 24, 3)),
+        trans=rng.normal(size=(count, 3)),
+        betas=np.zeros(10),
+        scale=rng.uniform(0.2, 3, count),
+        turns=rng.normal(size=(count, 3)) * 2 if turned else None,
+    )
+
+
+def in_world(body: BodyFrames, row: int, points: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Where the points of a template are, as ``BodyFrames`` says it."""
+    at_rest = posed(points, joints, weights, body.poses[row])
+    if body.turns is not None:
+        at_rest = at_rest @ Rotation.from_rotvec(body.turns[row]).as_matrix().T
+    return body.scale[row] * at_rest + body.trans[row]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 1000))
+def test_turns_about_the_origin_become_turns_about_the_pelvis(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, joints, weights = rng.normal(size=(8, 3)), rng.normal(size=(24, 3)), rng.dirichlet(np.ones(24), 8)
+    body = random_body(seed)
+    same = about_pelvis(body, joints[0])
+    assert same.turns is None
+    for row in range(3):
+        expected = in_world(body, row, points, joints, weights)
+        np.testing.assert_allclose(in_world(same, row, points, joints, weights), expected, atol=1e-11)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 1000), st.booleans())
+def test_another_template_has_its_pelvis_where_the_fitted_body_had_it(seed: int, turned: bool) -> None:
+    rng = np.random.default_rng(seed)
+    fitted, own = rng.normal(size=(2, 3))
+    body = replace(random_body(seed, turned=turned), pelvis=fitted)
+    other = about_pelvis(body, own)
+    turns = Rotation.from_rotvec(np.zeros((3, 3)) if body.turns is None else body.turns)
+    expected = body.scale[:, None] * turns.apply(fitted) + body.trans
+    np.testing.assert_allclose(other.scale[:, None] * own + other.trans, expected, atol=1e-12)
+    np.testing.assert_allclose(about_pelvis(other, fitted).trans, about_pelvis(body, fitted).trans, atol=1e-12)
+
+
+def test_nothing_to_turn_leaves_everything_and_moves_with_the_cameras() -> None:
+    body = random_body(0, turned=False)
+    same = about_pelvis(body, np.array([0.1, -0.2, 0.3]))
+    assert np.array_equal(same.poses, body.poses)
+    assert np.array_equal(same.trans, body.trans)
+    assert np.array_equal(moved(body, np.array([1e6, -2.0, 3.0])).trans, body.trans - [1e6, -2.0, 3.0])
+
+
+def test_rows_in_any_order_and_shape() -> None:
+    poses, trans = np.arange(3 * 165.0).reshape(3, 1, 165), np.arange(9.0).reshape(3, 1, 3)
+    body = body_frames(FILE, [7, 2, 5], poses, trans, np.ones((3, 10)) * [[0], [1], [2]], 2.0, pelvis=[[1, 2, 3]])
+    assert (body.frames, body.kind, body.betas.tolist(), body.scale.tolist()) == ((2, 5, 7), "smplx", [1] * 10, [2] * 3)
+    assert body.poses.shape == (3, 55, 3)
+    assert body.poses[:, 0, 0].tolist() == [165, 330, 0]
+    assert body.trans[:, 0].tolist() == [3, 6, 0]
+    assert body.pelvis is not None
+    assert body.pelvis.tolist() == [1, 2, 3]
+    kinds = [body_frames(FILE, [0], np.zeros((1, w)), [[0, 0, 0]], [0.0]).kind for w in (72, 156, 165)]
+    assert kinds == ["smpl", "smplh", "smplx"]
+
+
+GOOD: dict[str, Any] = {
+    "frames": range(4),
+    "poses": np.zeros((4, 72)),
+    "trans": np.zeros((4, 3)),
+    "betas": np.zeros(10),
+    "scale": np.ones(4),
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"poses": np.zeros((4, 87))}, "'poses' has 87 numbers per frame; the known bodies have 72"),
+        ({"poses": np.zeros((4, 73))}, "'poses' has 73 numbers per frame"),
+        ({"poses": np.zeros((3, 72))}, "'poses' has 3 rows for 4 frames"),
+        ({"poses": np.zeros(())}, "'poses' has 1 rows for 4 frames"),
+        ({"poses": [[0.0] * 72] * 3 + [[0.0]]}, "'poses' must hold as many numbers"),
+        ({"poses": [["a"] * 72] * 4}, "'poses' must hold as many numbers"),
+        ({"poses": None}, "'poses' must hold as many numbers"),
+        ({"trans": np.zeros((5, 3))}, "'trans' has 5 rows for 4 frames"),
+        ({"trans": np.zeros((4, 4))}, "'trans' has 4 numbers per frame instead of 3"),
+        ({"trans": np.full((4, 3), np.nan)}, "'trans' of frame 0 holds NaN"),
+        ({"poses": np.where(np.arange(4)[:, None] == 2, np.inf, np.zeros(72))}, "'poses' of frame 2 holds NaN"),
+        ({"betas": [0, np.nan]}, "'betas' must hold finite numbers"),
+        ({"betas": np.zeros((3, 10))}, "'betas' has 3 rows for 4 frames"),
+        ({"scale": 0.0}, "'scale' must be positive"),
+        ({"scale": -np.ones(4)}, "'scale' must be positive"),
+        ({"scale": "big"}, "'scale' must hold as many numbers"),
+        ({"scale": np.ones(3)}, "'scale' has 3 rows"),
+        ({"turns": np.zeros((4, 4))}, "'turns' has 4 numbers per frame instead of 3"),
+        ({"pelvis": [0, 1]}, "'pelvis' must hold 3 finite numbers"),
+        ({"frames": [0, 1, 2, 1]}, "frame 1 has body parameters twice"),
+        ({"frames": []}, "holds no frame"),
+    ],
+)
+def test_bad_parameters(change: dict[str, Any], line: str) -> None:
+    assert body_frames(FILE, **GOOD).frames == (0, 1, 2, 3)
+    with pytest.raises(DyngsError, match=line) as caught:
+        body_frames(FILE, **{**GOOD, **change})
+    assert "body.npz" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def view_of(frame: int | None) -> View:
+    return View(f"v{frame}", Path(f"{frame}.png"), np.eye(4), np.eye(3), 4, 3, frame=frame)
+
+
+def test_views_find_their_rows_by_frame() -> None:
+    body = replace(random_body(0), frames=(2, 5, 9))
+    assert rows_of(FILE, body, [view_of(9), view_of(2), view_of(9)]).tolist() == [2, 0, 2]
+    with pytest.raises(DyngsError, match=r"2 frames that have pictures \(3, 4\).* 3 frames from 2 to 9"):
+        rows_of(FILE, body, [view_of(2), view_of(4), view_of(3), view_of(4)])
+    with pytest.raises(DyngsError, match=r"None\.png has no frame number"):
+        rows_of(FILE, body, [view_of(None)])
