@@ -68,7 +68,8 @@ class View:
         mask_path: white = keep, black = ignore; None without a mask.
         time: in [0, 1], or None for a still scene.
         frame: frame number of a sequence, or None.
-        video: what ``image_path`` is decoded from, None where it is a file of the capture.
+        video: the video frame that ``image_path`` is decoded from, None where it is a file of the capture.
+        silhouette: the person in the picture, becomes its alpha; None: no person is cut out.
     """
 
     name: str
@@ -83,6 +84,7 @@ class View:
     time: float | None = None
     frame: int | None = None
     video: VideoFrame | None = None
+    silhouette: Silhouette | None = None
 
 
 @dataclass(frozen=True)

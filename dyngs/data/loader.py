@@ -24,7 +24,7 @@ from dyngs.data.pictures.images import (
     target_size,
 )
 from dyngs.data.pictures.lens import LensMap, is_pinhole, undistort, undistort_map
-from dyngs.data.pictures.silhouettes import PersonView, cut_out
+from dyngs.data.pictures.silhouettes import cut_out
 from dyngs.errors import DyngsError
 from dyngs.files.containment import pictures_up_to
 
@@ -178,7 +178,7 @@ class PictureLoader:
 
     def _decode(self, view: View) -> _Decoded:
         pixels = read_picture(view.image_path)
-        if isinstance(view, PersonView) and view.silhouette is not None:
+        if view.silhouette is not None:
             pixels = cut_out(pixels, view.silhouette)
         mask = None if view.mask_path is None else read_mask(view.mask_path)
         if mask is not None and mask.shape != pixels.shape[:2]:
@@ -216,7 +216,7 @@ def check_files(views: Sequence[View]) -> None:
     Raises:
         DyngsError: otherwise; missing files are counted and the first is named.
     """
-    outlines = [view.silhouette.path for view in views if isinstance(view, PersonView) and view.silhouette]
+    outlines = [view.silhouette.path for view in views if view.silhouette]
     paths = [path for view in views for path in (view.image_path, view.mask_path) if path is not None] + outlines
     missing = [path for path in paths if not path.is_file()]
     if missing:

@@ -13,7 +13,6 @@ from dyngs.data.frame_selection import select_frames
 from dyngs.data.geometry.recenter import recenter
 from dyngs.data.pictures.frame_cache import decode_frames
 from dyngs.data.pictures.images import read_header
-from dyngs.data.pictures.silhouettes import PersonView
 from dyngs.data.readers.blender import is_blender, read_blender
 from dyngs.data.readers.body_json import is_body_json, read_body_json
 from dyngs.data.readers.camera_folders import CALIBRATION, is_camera_folders, read_camera_folders
@@ -130,9 +129,8 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
 
 def _check_places(view: View) -> None:
     """Refuse pictures, masks and silhouettes that lie outside the capture."""
-    silhouette = view.silhouette if isinstance(view, PersonView) else None
     picture = view.image_path if view.video is None else view.video.video
-    for path in (picture, view.mask_path, silhouette and silhouette.path):
+    for path in (picture, view.mask_path, view.silhouette and view.silhouette.path):
         if path is not None:
             inside(path)
 
@@ -157,7 +155,7 @@ def _missing_pictures(splits: Splits) -> list[str]:
 
 def _first_has_alpha(views: tuple[View, ...]) -> bool:
     for view in views:
-        if isinstance(view, PersonView) and view.silhouette is not None:
+        if view.silhouette is not None:
             return True
         try:
             return read_header(view.image_path).has_alpha

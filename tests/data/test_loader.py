@@ -14,7 +14,6 @@ from tiny_captures import random_pixels, write_picture
 from dyngs.config import DataConfig
 from dyngs.data.capture import Lens, Silhouette, View
 from dyngs.data.loader import PictureLoader
-from dyngs.data.pictures.silhouettes import person_view
 from dyngs.errors import DyngsError
 
 
@@ -202,7 +201,9 @@ def test_silhouettes_become_alpha(tmp_path: Path) -> None:
     person = np.zeros((8, 12, 1), np.uint8)
     person[2:4, 3:6] = 7
     write_picture(tmp_path / "person.png", person)
-    views = [person_view(v, Silhouette(tmp_path / "person.png", "nonzero")) for v in views_of(tmp_path, channels=3)]
+    views = [
+        replace(v, silhouette=Silhouette(tmp_path / "person.png", "nonzero")) for v in views_of(tmp_path, channels=3)
+    ]
     alpha = loader(tuple(views))[1].alpha
     assert alpha is not None
     assert torch.equal(alpha, torch.from_numpy(person[..., 0] > 0).float())

@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.data.capture import Silhouette, View
+from dyngs.data.capture import Silhouette
 from dyngs.data.pictures.images import read_picture
 from dyngs.errors import DyngsError
 from dyngs.files.hdf5 import read_hdf5
 
 MASKS = "masks"
 """Name of the data set of silhouettes in an HDF5 file."""
-
-
-@dataclass(frozen=True)
-class PersonView(View):
-    """A view of a person in front of other things, which are not to be learned: ``silhouette`` becomes its alpha."""
-
-    silhouette: Silhouette | None = None
-
-
-def person_view(view: View, silhouette: Silhouette | None) -> PersonView:
-    """The view with a silhouette."""
-    return PersonView(**{**vars(view), "silhouette": silhouette})
 
 
 def cut_out(pixels: Tensor, silhouette: Silhouette) -> Tensor:

@@ -10,9 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import body_frames, of_one_clip
-from dyngs.data.capture import BodyFrames, Capture, Silhouette, Split
+from dyngs.data.capture import BodyFrames, Capture, Silhouette, Split, View
 from dyngs.data.geometry.poses import checked_pose
-from dyngs.data.pictures.silhouettes import PersonView, person_view
 from dyngs.data.readers.colmap import is_colmap, read_colmap
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
@@ -52,11 +51,16 @@ def _read(root: Path) -> Capture:
     names = [view.image_path.name for view in posed]
     numbers = [_number(root, name) for name in names]
     first, last = min(numbers, default=0), max(numbers, default=0)
-    people: dict[str, PersonView] = {}
+    people: dict[str, View] = {}
     for view, number in zip(posed, numbers, strict=True):
         mask = root / "segmentations" / view.image_path.name
-        timed = replace(view, camera_id=0, frame=number, time=(number - first) / max(last - first, 1))
-        people[view.image_path.name] = person_view(timed, Silhouette(mask, "black") if mask.is_file() else None)
+        people[view.image_path.name] = replace(
+            view,
+            camera_id=0,
+            frame=number,
+            time=(number - first) / max(last - first, 1),
+            silhouette=Silhouette(mask, "black") if mask.is_file() else None,
+        )
     body = _aligned(root, numbers) if (root / ALIGNED).is_file() else _fitted(root, names, numbers)
     without = [name for name, view in people.items() if view.silhouette is None]
     notes = [f"{len(without)} pictures have no mask in segmentations, first {without[0]}"] if without else []
@@ -117,9 +121,9 @@ def _number(root: Path, name: str) -> int:
     return int(digits[-1])
 
 
-def _splits(root: Path, people: dict[str, PersonView]) -> tuple[dict[Split, tuple[PersonView, ...]], list[str]]:
+def _splits(root: Path, people: dict[str, View]) -> tuple[dict[Split, tuple[View, ...]], list[str]]:
     """As the lists of names say; all for training where there are none."""
-    splits: dict[Split, tuple[PersonView, ...]] = {}
+    splits: dict[Split, tuple[View, ...]] = {}
     unposed: list[str] = []
     names: tuple[Split, ...] = ("train", "val", "test")
     for split in names:

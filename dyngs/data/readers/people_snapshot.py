@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
 from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV, inverse_rigid
-from dyngs.data.pictures.silhouettes import MASKS, person_view
+from dyngs.data.pictures.silhouettes import MASKS
 from dyngs.data.pictures.video import VIDEO_SUFFIXES
 from dyngs.data.readers.shared.camera_sequences import open_camera, sequence_views
 from dyngs.errors import DyngsError, reading
@@ -57,7 +57,7 @@ def _read(root: Path) -> Capture:
         root / CAMERA, [replace(camera, pictures=pictures)], {camera.name: _calibration(root / CAMERA)}
     )
     people = tuple(
-        person_view(view, Silhouette(root / MASK_FILE, "nonzero", number))
+        replace(view, silhouette=Silhouette(root / MASK_FILE, "nonzero", number))
         for view, number in zip(views[camera.name], sorted(pictures), strict=True)
     )
     lost = len(camera.pictures) - len(pictures)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -12,7 +12,6 @@ import numpy as np
 from dyngs.data.body_frames import body_frames, of_one_clip, rows_of
 from dyngs.data.capture import BodyFrames, Capture, Silhouette, Split, View
 from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV, checked_pose, inverse_rigid
-from dyngs.data.pictures.silhouettes import person_view
 from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
@@ -84,7 +83,7 @@ def _read(root: Path) -> Capture:
     rows_of(found, body, views)
     masks = [_mask(root, shot.file, folders) for shot in shots]
     people = [
-        person_view(view, None if mask is None else Silhouette(mask, person))
+        replace(view, silhouette=None if mask is None else Silhouette(mask, person))
         for view, mask in zip(views, masks, strict=True)
     ]
     without = [view.name for view, mask in zip(views, masks, strict=True) if mask is None]

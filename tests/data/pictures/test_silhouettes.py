@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ import pytest
 import torch
 from tiny_captures import random_pixels, write_picture
 
-from dyngs.data.capture import Silhouette, View
-from dyngs.data.pictures.silhouettes import cut_out, person_view
+from dyngs.data.capture import Silhouette
+from dyngs.data.pictures.silhouettes import cut_out
 from dyngs.errors import DyngsError
 
 
@@ -53,13 +52,3 @@ def test_silhouettes_in_hdf5(tmp_path: Path) -> None:
     assert cut_out(pixels, Silhouette(hdf5, "nonzero", 3))[..., 3].tolist() == [[0, 0, 0], [0, 0, 255]]
     with pytest.raises(DyngsError, match="'masks' must be a data set in an HDF5 file"):
         cut_out(pixels, Silhouette(hdf5, "nonzero", 5))
-
-
-def test_a_view_with_a_silhouette_stays_a_view() -> None:
-    view = person_view(
-        View("v3", Path("3.png"), np.eye(4), np.eye(3), 4, 3, frame=3), Silhouette(Path("m.png"), "white")
-    )
-    assert isinstance(view, View)
-    changed = replace(view, time=0.5)
-    assert (changed.silhouette, changed.frame, changed.name) == (view.silhouette, 3, "v3")
-    assert person_view(view, None).silhouette is None
