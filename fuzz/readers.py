@@ -272,24 +272,20 @@ def small_body(joints: int) -> Body:
     return tiny_body(joints)
 
 
-def _captures() -> dict[str, Reader]:
-    own: dict[str, dict[str, Seed]] = {
-        "blender": {"still": write_blender},
-        "nerfstudio": {"moving": write_nerfstudio},
-        "colmap_bin": {"binary": write_colmap_binary},
-        "colmap_txt": {"text": write_colmap_text},
-        "nerfies": {"nerfies": write_small_nerfies},
-        "llff": {"still": write_llff, "videos": write_llff_videos},
-        "camera_folders": {"mixed": write_camera_folders},
-        "zju_mocap": {"annotated": write_zju, "single": write_zju_single},
-        "neuman": {"fitted": write_neuman, "aligned": write_neuman_aligned},
-        "body_json": {"smplx": write_body_json},
-    }
-    found = {name: Reader(seeds, read_whole_capture) for name, seeds in own.items()}
-    found["people_snapshot"] = Reader({"video": write_people_snapshot}, read_whole_capture, needs="h5py")
-    return found
-
-
+CAPTURES: dict[str, dict[str, Seed]] = {
+    "blender": {"still": write_blender},
+    "nerfstudio": {"moving": write_nerfstudio},
+    "colmap": {"binary": write_colmap_binary, "text": write_colmap_text},
+    "nerfies": {"nerfies": write_small_nerfies},
+    "llff": {"still": write_llff, "videos": write_llff_videos},
+    "camera_folders": {"mixed": write_camera_folders},
+    "zju_mocap": {"annotated": write_zju, "single": write_zju_single},
+    "neuman": {"fitted": write_neuman, "aligned": write_neuman_aligned},
+    "body_json": {"smplx": write_body_json},
+    "people_snapshot": {"video": write_people_snapshot},
+}
+"""Seeds of each capture format, by its name in ``dyngs.data.read.FORMATS``."""
+_NEEDS = {"people_snapshot": "h5py"}
 _RUNS: dict[str, Seed] = {
     kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "skeleton", "trajectory")
 }
@@ -302,7 +298,7 @@ _BODIES: dict[str, Seed] = {
 }
 
 READERS: dict[str, Reader] = {
-    **_captures(),
+    **{name: Reader(seeds, read_whole_capture, needs=_NEEDS.get(name)) for name, seeds in CAPTURES.items()},
     "pictures": Reader(_PICTURES, read_a_picture),
     "video": Reader({"mp4": files.write_mp4}, read_a_video),
     "pickles": Reader({"new": files.write_fits, "old": files.write_old_fits}, read_a_pickle),

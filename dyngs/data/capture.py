@@ -139,6 +139,7 @@ class Capture:
             lies far from its origin).
         has_alpha: pictures carry straight alpha that means "transparent here".
         body: body parameters of each split, by frame number, for captures of people, else None.
+        fps: frames per second of the recording, None where the capture does not say.
         warnings: suspicious things met while reading, one line each.
     """
 
@@ -149,6 +150,7 @@ class Capture:
     world_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     has_alpha: bool = False
     body: dict[Split, BodyFrames] | None = None
+    fps: float | None = None
     warnings: tuple[str, ...] = ()
 
     def replace(self, **changes: object) -> Capture:

@@ -1,4 +1,4 @@
-"""The one entrance to captures on disk: recognise the format, read it, and bring it into its final form."""
+"""Read a capture of any format: recognise the format, read it, finish its splits and times."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ from dyngs.data.frame_selection import select_frames
 from dyngs.data.geometry.recenter import recenter
 from dyngs.data.pictures.frame_cache import decode_frames
 from dyngs.data.pictures.images import read_header
-from dyngs.data.readers.blender import is_blender, read_blender
-from dyngs.data.readers.body_json import is_body_json, read_body_json
-from dyngs.data.readers.camera_folders import CALIBRATION, is_camera_folders, read_camera_folders
-from dyngs.data.readers.colmap import MODEL_FOLDERS, is_colmap, read_colmap
-from dyngs.data.readers.llff import POSES, is_llff, read_llff
-from dyngs.data.readers.nerfies import is_nerfies, read_nerfies
-from dyngs.data.readers.nerfstudio import is_nerfstudio, read_nerfstudio
-from dyngs.data.readers.neuman import is_neuman, read_neuman
-from dyngs.data.readers.people_snapshot import is_people_snapshot, read_people_snapshot
-from dyngs.data.readers.zju_mocap import is_zju_mocap, read_zju_mocap
+from dyngs.data.readers import (
+    blender,
+    body_json,
+    camera_folders,
+    colmap,
+    llff,
+    nerfies,
+    nerfstudio,
+    neuman,
+    people_snapshot,
+    zju_mocap,
+)
+from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.times import sequence_warnings, still_if_constant, unit_times
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside, pictures_up_to, staying_within
@@ -32,59 +35,59 @@ Splits = dict[Split, tuple[View, ...]]
 FARTHEST = 1e18
 """Points with larger coordinates are mistakes; their squares would not fit into float32."""
 
-_READERS = {
-    "body_json": (is_body_json, read_body_json, "transforms_train.json and body_train.npz"),
-    "zju_mocap": (is_zju_mocap, read_zju_mocap, "annots.npy, or cameras.pkl and mesh_infos.pkl"),
-    "people_snapshot": (is_people_snapshot, read_people_snapshot, "camera.pkl, masks.hdf5, reconstructed_poses.hdf5"),
-    "neuman": (is_neuman, read_neuman, "a COLMAP model and alignments.npy or 4d_humans"),
-    "blender": (is_blender, read_blender, "transforms_train.json"),
-    "nerfstudio": (is_nerfstudio, read_nerfstudio, "transforms.json"),
-    "colmap": (is_colmap, read_colmap, f"cameras.bin or cameras.txt in {', '.join(MODEL_FOLDERS)}"),
-    "nerfies": (is_nerfies, read_nerfies, "dataset.json and camera/"),
-    "camera_folders": (is_camera_folders, read_camera_folders, CALIBRATION),
-    "llff": (is_llff, read_llff, POSES),
-}
-_BUILT_ON = {"body_json": "blender", "neuman": "colmap"}
-"""Formats that are another one with body parameters beside it."""
+FORMATS: tuple[CaptureFormat, ...] = (
+    body_json.FORMAT,
+    zju_mocap.FORMAT,
+    people_snapshot.FORMAT,
+    neuman.FORMAT,
+    blender.FORMAT,
+    nerfstudio.FORMAT,
+    colmap.FORMAT,
+    nerfies.FORMAT,
+    camera_folders.FORMAT,
+    llff.FORMAT,
+)
+"""All formats, in the order in which a folder is tried: of several that are recognised the first one is read."""
 
 
-def read_capture(options: DataConfig, decode_videos: bool = True) -> Capture:
-    """The capture in ``options.root``; pictures are not decoded, only their headers are read.
+def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) -> Capture:
+    """Read the capture in a folder; pictures are not decoded, only their headers are read.
 
-    Views are sorted by name. ``options.frames`` chooses among the times of all splits. Where the format names no test
-    set, every ``options.test_every``-th picture is one. Times are brought to [0, 1], a far-away world to its origin.
-    All three splits are present, val and test possibly empty.
+    Views are sorted by name. ``frames`` of the options chooses among the times of all splits. Where the format names no
+    test views, every ``test_every``-th picture is one. Times are scaled to [0, 1]; a scene far from the origin is moved
+    there. The splits train, val and test are always present, val and test possibly empty.
+
+    Example::
+
+        capture = dyngs.read_capture("lego")  # or DataConfig(root="lego", downscale=2) with options of the section data
+        pictures = PictureLoader(capture.splits["train"])
+        pictures[0].cameras, pictures[0].rgb_premultiplied
 
     Args:
-        options: where and how to read.
-        decode_videos: make picture files of the chosen frames of videos, see ``pictures.frame_cache``; otherwise the
-            views may name files that do not exist yet.
+        source: the folder, or the section ``data`` of a configuration: the folder and how to read it.
+        decode_videos: write the chosen frames of videos as picture files, see ``pictures.frame_cache``; otherwise views
+            may name files that do not exist yet.
 
     Raises:
         DyngsError: no such folder, no capture in it, or anything in it that cannot be right; names the file.
     """
+    options = source if isinstance(source, DataConfig) else DataConfig(root=Path(source))
     root = options.root
     if not root.is_dir():
         problem = "is a file; give the folder that holds it" if root.is_file() else "no such folder; check data.root"
         raise DyngsError(f"{root}: {problem}")
     with reading(root, "choose another folder or change its permissions"):
-        found = [name for name, (is_format, _, _) in _READERS.items() if is_format(root)]
-    if options.format == "auto" and not found:
-        wanted = "; ".join(f"{name}: {files}" for name, (_, _, files) in _READERS.items())
-        raise DyngsError(f"{root}: no capture found; looked for {wanted}")
-    if options.format not in ("auto", *found):
-        also = f"; but there is a {found[0]} capture" if found else ""
-        raise DyngsError(f"{root}: no {options.format} capture, which would have {_READERS[options.format][2]}{also}")
-    name = found[0] if options.format == "auto" else options.format
+        found = [format for format in FORMATS if format.recognise(root)]
+    chosen = _chosen_format(options, found)
     with (
         staying_within(root, options.follow_links),
         pictures_up_to(options.max_megapixels),
         reading(root, "one of its files is not as it should be (`dyngs --debug` shows where); export it again"),
     ):
-        capture = _finished(_READERS[name][1](root), options, decode_videos)
-    others = [other for other in found[1:] if other != _BUILT_ON.get(name)]
+        capture = _finished(chosen.read(root), options, decode_videos)
+    others = [other for other in found if other is not chosen and other.name != chosen.extends]
     if options.format == "auto" and others:
-        note = f"read as {name}, but there is also a {others[0]} capture; data.format= chooses"
+        note = f"read as {chosen.name}, but there is also a {others[0].name} capture; data.format= chooses"
         capture = replace(capture, warnings=(note, *capture.warnings))
     return capture
 
@@ -95,6 +98,20 @@ def hold_out(views: tuple[View, ...], test_every: int) -> tuple[tuple[View, ...]
         return views, ()
     test = views[::test_every]
     return tuple(view for index, view in enumerate(views) if index % test_every), test
+
+
+def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFormat:
+    """The format that ``options.format`` names, with "auto" the first one that was ``found`` in the folder."""
+    if options.format == "auto":
+        if not found:
+            wanted = "; ".join(f"{format.name}: {format.files}" for format in FORMATS)
+            raise DyngsError(f"{options.root}: no capture found; looked for {wanted}")
+        return found[0]
+    chosen = next(format for format in FORMATS if format.name == options.format)
+    if chosen not in found:
+        also = f"; but there is a {found[0].name} capture" if found else ""
+        raise DyngsError(f"{options.root}: no {chosen.name} capture, which would have {chosen.files}{also}")
+    return chosen
 
 
 def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Capture:

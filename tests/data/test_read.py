@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,10 +16,11 @@ from tiny_captures import (
 )
 
 from dyngs.config import DataConfig
+from dyngs.data import readers
 from dyngs.data.capture import Capture
 from dyngs.data.geometry.poses import camera_center
 from dyngs.data.loader import PictureLoader
-from dyngs.data.read import read_capture
+from dyngs.data.read import FORMATS, read_capture
 from dyngs.errors import DyngsError
 
 CAMERAS = ("cam00", "cam01", "cam02")
@@ -32,12 +34,31 @@ def names(capture: Capture, split: str) -> list[str]:
     return [view.name for view in capture.splits[split]]  # type: ignore[index]
 
 
+def test_a_format_is_a_reader_module_and_a_line_of_the_list() -> None:
+    """Every module in ``readers/`` declares one format of its own name; configuration and docs name the same ones."""
+    modules = {path.stem for path in Path(readers.__file__).parent.glob("*.py")} - {"__init__"}
+    assert sorted(format.name for format in FORMATS) == sorted(modules)
+    assert set(get_args(DataConfig.model_fields["format"].annotation)) == {"auto", *modules}
+    table = (Path(__file__).resolve().parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    assert [name for name in modules if f"\n| `{name}` |" not in table] == []
+    assert {format.extends for format in FORMATS} - {None} <= modules
+
+
 def test_formats_are_recognised(blender_root: Path) -> None:
     capture = read(blender_root)
     assert (capture.format, capture.has_alpha) == ("blender", True)
     assert {name: len(views) for name, views in capture.splits.items()} == {"train": 16, "val": 0, "test": 2}
     assert capture.world_offset.tolist() == [0, 0, 0]
     assert capture.warnings == ()
+
+
+def test_a_folder_alone_is_read_with_default_options(blender_root: Path) -> None:
+    expected = read(blender_root)
+    for source in (blender_root, str(blender_root)):
+        capture = read_capture(source)
+        assert {split: names(capture, split) for split in capture.splits} == {
+            split: names(expected, split) for split in expected.splits
+        }
 
 
 def test_nerfstudio_is_recognised(nerfstudio_root: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -16,10 +15,7 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.geometry.focus import focus_point, share_in_front
 from dyngs.data.geometry.poses import camera_center, inverse_rigid, matrix_fault, pose_fault
 from dyngs.data.inspection.camera_plot import draw_cameras
-from dyngs.data.pictures.frame_cache import planned_frames
 from dyngs.data.pictures.images import SUFFIXES, read_header, read_picture
-from dyngs.data.readers.camera_folders import calibrated_fps
-from dyngs.data.readers.shared.camera_sequences import find_cameras
 from dyngs.data.times import distinct_times
 from dyngs.errors import DyngsError, printable, reading, reason
 from dyngs.files.containment import leaving_links, pictures_up_to, staying_within
@@ -148,28 +144,11 @@ def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
     moving = sum(len(poses) > 1 for poses in cameras.values())
     motion = "" if not moving else " (moving)" if moving == len(cameras) else f" ({moving} moving)"
     yield "sequence", f"{len(cameras)} {what}{motion} x {len(times)} times, {len(views)} pictures"
-    fps = _frame_rate(capture)
-    if fps:
-        yield "frame rate", f"{fps:.6g} per second"
+    if capture.fps is not None:
+        yield "frame rate", f"{capture.fps:.6g} per second"
     frames = [view.image_path for view in views if view.video is not None]
     if frames:
         yield "video frames", f"{sum(path.is_file() for path in frames)} of {len(frames)} are decoded already"
-
-
-def _frame_rate(capture: Capture) -> float | None:
-    """Frames per second as ``cameras.json``, the transforms file or the first video says, None if none does."""
-    root = capture.root
-    try:
-        if capture.format in ("camera_folders", "llff"):
-            fps = calibrated_fps(root) if capture.format == "camera_folders" else None
-            videos = [path for path in find_cameras(root).values() if path.is_file()]
-            return fps or (planned_frames(videos[0]).info.fps if videos else None)
-        names = dict.fromkeys(("blender", "body_json"), "transforms_train.json") | {"nerfstudio": "transforms.json"}
-        fields = json.loads((root / names.get(capture.format, "")).read_text(encoding="utf-8-sig"))
-        fps = fields.get("fps")
-    except (DyngsError, OSError, ValueError, AttributeError, RecursionError):
-        return None
-    return float(fps) if isinstance(fps, (int, float)) and 0 < fps < 1e6 else None
 
 
 def _split_problems(capture: Capture) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyngs.data.capture import Capture, Split, View
+from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import read_frame_file, read_views
 
 
@@ -23,14 +24,20 @@ def read_blender(root: Path) -> Capture:
     """
     splits: dict[Split, tuple[View, ...]] = {}
     warnings: list[str] = []
+    fps = None
     names: tuple[Split, ...] = ("train", "val", "test")
     for name in names:
         path = root / f"transforms_{name}.json"
         if name != "train" and not path.is_file():
             continue
-        views, notes = read_views(read_frame_file(path))
+        file = read_frame_file(path)
+        views, notes = read_views(file)
+        fps = file.fps if name == "train" else fps
         splits[name] = tuple(views.values())
         warnings += [f"{path.name}: {note}" for note in notes]
         if not views:
             warnings.append(f"{path.name}: lists no frames")
-    return Capture(root, "blender", splits, warnings=tuple(warnings))
+    return Capture(root, "blender", splits, fps=fps, warnings=tuple(warnings))
+
+
+FORMAT = CaptureFormat("blender", "transforms_train.json", is_blender, read_blender)

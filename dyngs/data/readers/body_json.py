@@ -8,6 +8,7 @@ from typing import cast
 from dyngs.data.body_frames import body_frames, rows_of
 from dyngs.data.capture import BodyFrames, Capture, Split, View
 from dyngs.data.readers.blender import read_blender
+from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import read_frame_file, read_views
 from dyngs.errors import DyngsError, reading
 from dyngs.files.numpy_files import read_npz
@@ -66,3 +67,8 @@ def _read_body(path: Path) -> BodyFrames:
     found = read_npz(path, ("poses", "trans", "betas"), ("scale",))
     frames = range(len(found["poses"]) if found["poses"].ndim else 0)
     return body_frames(path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0))
+
+
+FORMAT = CaptureFormat(
+    "body_json", "transforms_train.json and body_train.npz", is_body_json, read_body_json, extends="blender"
+)

@@ -3,18 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV, checked_pose, inverse_rigid
-from dyngs.data.readers.shared.camera_sequences import find_cameras, open_camera, sequence_views
+from dyngs.data.readers.shared.camera_sequences import (
+    find_cameras,
+    open_camera,
+    sequence_views,
+    video_fps,
+)
+from dyngs.data.readers.shared.capture_format import CaptureFormat
+from dyngs.data.readers.shared.transforms import MAX_FPS
 from dyngs.errors import DyngsError
 from dyngs.files.json_files import read_json_object
 
 CALIBRATION = "cameras.json"
 _MIN_TO_HOLD_ONE_OUT = 3
+
+
+@dataclass(frozen=True)
+class _CalibrationFile:
+    """The fields of ``cameras.json``: camera name to calibration, frames per second, and ``test`` as written."""
+
+    cameras: dict[str, object]
+    fps: float | None
+    test: object
 
 
 def is_camera_folders(root: Path) -> bool:
@@ -33,9 +50,8 @@ def read_camera_folders(root: Path) -> Capture:
         DyngsError: broken or incomplete calibration, no pictures, pictures without a number in their name, bad videos.
     """
     path = root / CALIBRATION
-    fields = _read_calibration(path)
-    calibrated = fields["cameras"]
-    assert isinstance(calibrated, dict)
+    file = _read_calibration(path)
+    calibrated = file.cameras
     found = find_cameras(root)
     names = [name for name in sorted(calibrated) if name in found]
     if not names:
@@ -50,27 +66,21 @@ def read_camera_folders(root: Path) -> Capture:
     cameras = [open_camera(name, found[name]) for name in names]
     own = {name: _calibration(calibrated[name], f"{path}, camera {name}") for name in names}
     views, notes = sequence_views(path, cameras, own)
-    splits, more = _splits(path, fields, views)
-    return Capture(root, "camera_folders", splits, warnings=(*warnings, *notes, *more))
+    splits, more = _splits(path, file.test, views)
+    fps = file.fps or video_fps(cameras)
+    return Capture(root, "camera_folders", splits, fps=fps, warnings=(*warnings, *notes, *more))
 
 
-def calibrated_fps(root: Path) -> float | None:
-    """``fps`` of ``cameras.json``, None where it or the file is absent."""
-    if not is_camera_folders(root):
-        return None
-    fps = _read_calibration(root / CALIBRATION).get("fps")
-    return None if fps is None else float(fps)  # type: ignore[arg-type]
-
-
-def _read_calibration(path: Path) -> dict[str, object]:
+def _read_calibration(path: Path) -> _CalibrationFile:
     wrong = "must be an object whose 'cameras' maps camera names to calibrations"
     fields = read_json_object(path, wrong)
-    if not isinstance(fields.get("cameras"), dict) or not fields["cameras"]:
+    cameras = fields.get("cameras")
+    if not isinstance(cameras, dict) or not cameras:
         raise DyngsError(f"{path}: {wrong}")
     fps = fields.get("fps")
-    if fps is not None and (isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps < 1e6):
+    if fps is not None and (isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps < MAX_FPS):
         raise DyngsError(f"{path}: 'fps' must be a positive number, got {fps!r:.40}")
-    return fields
+    return _CalibrationFile(cameras, None if fps is None else float(fps), fields.get("test"))
 
 
 def _calibration(value: object, where: str) -> dict[str, object]:
@@ -95,10 +105,10 @@ def _calibration(value: object, where: str) -> dict[str, object]:
 
 
 def _splits(
-    path: Path, fields: dict[str, object], views: dict[str, tuple[View, ...]]
+    path: Path, test: object, views: dict[str, tuple[View, ...]]
 ) -> tuple[dict[Split, tuple[View, ...]], list[str]]:
     """Test cameras by ``test``, else the first one if there are enough; no test split if there are not."""
-    test, notes = fields.get("test"), []
+    notes = []
     if test is None:
         if len(views) < _MIN_TO_HOLD_ONE_OUT:
             return {"train": tuple(view for kept in views.values() for view in kept)}, []
@@ -117,3 +127,6 @@ def _splits(
 
 def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+FORMAT = CaptureFormat("camera_folders", CALIBRATION, is_camera_folders, read_camera_folders)

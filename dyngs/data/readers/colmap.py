@@ -11,6 +11,7 @@ from dyngs.data.capture import Capture, Lens, PointCloud, View
 from dyngs.data.geometry.intrinsics import match_size, pinhole_matrix, rescale_warning
 from dyngs.data.geometry.poses import checked_pose, repair_warning
 from dyngs.data.pictures.images import SUFFIXES, read_header
+from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.colmap_check import check_model_file
 from dyngs.data.readers.shared.transforms import view_name
 from dyngs.errors import DyngsError, reading
@@ -171,3 +172,6 @@ def _warnings(folder: Path, model: pycolmap.Reconstruction, views: list[View], h
     if has_masks and without:
         warnings.append(f"{len(without)} pictures have no mask, first {without[0]}")
     return warnings
+
+
+FORMAT = CaptureFormat("colmap", f"cameras.bin or cameras.txt in {', '.join(MODEL_FOLDERS)}", is_colmap, read_colmap)

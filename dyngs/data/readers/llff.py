@@ -9,7 +9,13 @@ import numpy as np
 
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV
-from dyngs.data.readers.shared.camera_sequences import find_cameras, open_camera, sequence_views
+from dyngs.data.readers.shared.camera_sequences import (
+    find_cameras,
+    open_camera,
+    sequence_views,
+    video_fps,
+)
+from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.errors import DyngsError
 from dyngs.files.numpy_files import read_npy
 
@@ -49,7 +55,7 @@ def read_llff(root: Path) -> Capture:
     numbers = [int(digits) for name in names for digits in re.findall(r"\d+$", name)]
     if numbers != sorted(numbers):
         notes.append(f"{path.name}: its rows are matched with cameras in the order {', '.join(names[:4])}, .. by name")
-    return Capture(root, "llff", _splits(views, names), warnings=tuple(notes))
+    return Capture(root, "llff", _splits(views, names), fps=video_fps(cameras), warnings=tuple(notes))
 
 
 def _read_rows(path: Path) -> np.ndarray:
@@ -95,3 +101,6 @@ def _gaps(names: list[str]) -> str:
     numbers = {int(digits) for name in names for digits in re.findall(r"\d+$", name)}
     missing = sorted(set(range(min(numbers), max(numbers))) - numbers) if numbers else []
     return f", without number {', '.join(map(str, missing[:5]))}" if 0 < len(missing) < len(numbers) else ""
+
+
+FORMAT = CaptureFormat("llff", POSES, is_llff, read_llff)

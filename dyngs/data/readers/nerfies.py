@@ -11,6 +11,7 @@ import numpy as np
 from dyngs.data.capture import Capture, PointCloud, Split, View
 from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV
 from dyngs.data.pictures.images import SUFFIXES, read_header
+from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
 from dyngs.files.containment import check_size, inside
@@ -218,3 +219,6 @@ def _points(path: Path, scene: _Scene) -> PointCloud | None:
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise DyngsError(f"{path}: must have 3 columns, one row per point; got shape {xyz.shape}")
     return PointCloud(scene.apply(xyz), np.full(xyz.shape, 128, np.uint8)) if len(xyz) else None
+
+
+FORMAT = CaptureFormat("nerfies", "dataset.json and camera/", is_nerfies, read_nerfies)

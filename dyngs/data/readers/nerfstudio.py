@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dyngs.data.capture import Capture, PointCloud, Split, View
+from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import FrameFile, read_frame_file, read_views
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
@@ -33,7 +34,7 @@ def read_nerfstudio(root: Path) -> Capture:
     splits, notes = _splits(file, views)
     written = file.fields.get("ply_file_path")
     points = read_points(inside(root / written)) if isinstance(written, str) and written else None
-    return Capture(root, "nerfstudio", splits, points, warnings=(*warnings, *notes))
+    return Capture(root, "nerfstudio", splits, points, fps=file.fps, warnings=(*warnings, *notes))
 
 
 def read_points(path: Path) -> PointCloud:
@@ -83,3 +84,6 @@ def _splits(file: FrameFile, views: dict[str, View]) -> tuple[dict[Split, tuple[
     if len(used) < len(views):
         notes.append(f"{len(views) - len(used)} frames are in no split and are ignored")
     return splits, notes
+
+
+FORMAT = CaptureFormat("nerfstudio", "transforms.json", is_nerfstudio, read_nerfstudio)

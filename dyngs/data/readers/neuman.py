@@ -13,6 +13,7 @@ from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import BodyFrames, Capture, Silhouette, Split, View
 from dyngs.data.geometry.poses import checked_pose
 from dyngs.data.readers.colmap import is_colmap, read_colmap
+from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 from dyngs.files.fields import entry, numbers_of, some
@@ -139,3 +140,8 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[dict[Split, tuple[View
         splits["train"] = tuple(view for view in people.values() if view.name not in held_out)
     notes = [f"{len(unposed)} pictures of the splits have no pose and are left out: {some(unposed)}"] if unposed else []
     return splits, notes
+
+
+FORMAT = CaptureFormat(
+    "neuman", "a COLMAP model and alignments.npy or 4d_humans", is_neuman, read_neuman, extends="colmap"
+)

@@ -13,7 +13,8 @@ from dyngs.data.capture import BodyFrames, Capture, Silhouette
 from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV, inverse_rigid
 from dyngs.data.pictures.silhouettes import MASKS
 from dyngs.data.pictures.video import VIDEO_SUFFIXES
-from dyngs.data.readers.shared.camera_sequences import open_camera, sequence_views
+from dyngs.data.readers.shared.camera_sequences import open_camera, sequence_views, video_fps
+from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 from dyngs.files.fields import entry, numbers_of
@@ -63,7 +64,7 @@ def _read(root: Path) -> Capture:
     lost = len(camera.pictures) - len(pictures)
     if lost:
         warnings.append(f"{video.name}: {lost} of {len(camera.pictures)} frames lack a mask or a pose and are left out")
-    capture = Capture(root, "people_snapshot", {"train": people}, warnings=tuple(warnings))
+    capture = Capture(root, "people_snapshot", {"train": people}, fps=video_fps([camera]), warnings=tuple(warnings))
     return capture.replace(body=of_one_clip(body))
 
 
@@ -109,3 +110,8 @@ def _body(path: Path) -> BodyFrames:
         raise DyngsError(f"{path}: 'pose' has {len(poses)} rows but 'trans' {len(trans)}; export it again")
     fitted = np.flatnonzero([bool(np.any(p)) or bool(np.any(t)) for p, t in zip(poses, trans, strict=True)])
     return body_frames(path, fitted.tolist(), poses[fitted], trans[fitted], betas)
+
+
+FORMAT = CaptureFormat(
+    "people_snapshot", f"{CAMERA}, {MASK_FILE}, {POSE_FILE}", is_people_snapshot, read_people_snapshot
+)

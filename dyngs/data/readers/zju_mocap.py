@@ -12,6 +12,7 @@ import numpy as np
 from dyngs.data.body_frames import body_frames, of_one_clip, rows_of
 from dyngs.data.capture import BodyFrames, Capture, Silhouette, Split, View
 from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV, checked_pose, inverse_rigid
+from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
@@ -246,3 +247,6 @@ def _items(where: object, fields: object, key: str) -> list[object]:
     if not isinstance(value, (list, tuple, np.ndarray)) or (isinstance(value, np.ndarray) and not value.ndim):
         raise DyngsError(f"{where}: '{key}' must be a list; export it again")
     return list(value)
+
+
+FORMAT = CaptureFormat("zju_mocap", f"{ANNOTATIONS}, or {CAMERAS} and {MESHES}", is_zju_mocap, read_zju_mocap)

@@ -25,7 +25,7 @@ from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.pictures.images import read_picture
 from dyngs.data.read import read_capture
-from dyngs.data.readers.camera_folders import calibrated_fps, read_camera_folders
+from dyngs.data.readers.camera_folders import read_camera_folders
 from dyngs.data.readers.shared.camera_sequences import find_cameras
 from dyngs.errors import DyngsError
 
@@ -66,7 +66,7 @@ def test_views_times_and_splits(root: Path) -> None:
         assert view.frame == int(view.name[-4:])
         assert view.time == pytest.approx(view.frame / 3)
         assert view.camera_id == int(view.name[4])
-    assert calibrated_fps(root) == 25
+    assert read(root).fps == 25
 
 
 @pytest.mark.parametrize("opencv", [False, True])

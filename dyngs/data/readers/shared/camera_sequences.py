@@ -110,6 +110,12 @@ def sequence_views(
     return views, warnings
 
 
+def video_fps(cameras: Sequence[CameraSource]) -> float | None:
+    """Frames per second of the first video that says so, None without one."""
+    rates = (camera.video.info.fps for camera in cameras if camera.video is not None)
+    return next((fps for fps in rates if fps > 0), None)
+
+
 def _at_video_size(
     name: str, video: VideoInfo, views: tuple[View, ...], where: str
 ) -> tuple[tuple[View, ...], list[str]]:

@@ -18,6 +18,8 @@ from dyngs.errors import DyngsError
 from dyngs.files.containment import check_size, inside
 from dyngs.files.json_files import read_json_object
 
+MAX_FPS = 1e6
+"""Higher frame rates are taken for mistakes."""
 _LARGEST = 1e300
 _LARGEST_INTEGER = 2**53
 _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
@@ -67,6 +69,14 @@ class FrameFile:
     path: Path
     fields: dict[str, object]
     frames: tuple[Frame, ...]
+
+    @property
+    def fps(self) -> float | None:
+        """Frames per second as the file says, None where it does not."""
+        fps = self.fields.get("fps")
+        if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps < MAX_FPS:
+            return None
+        return float(fps)
 
 
 @dataclass
