@@ -25,10 +25,10 @@ import torch
 from dyngs.config import Config, HumanNetModel
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.evaluate.report import evaluate_run
-from dyngs.human.prediction.fill import filled
-from dyngs.human.prediction.sitter import spread_views
+from dyngs.human.prediction.person import spread_views
+from dyngs.human.prediction.predict import predict_gaussians
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.human.template.person import template
+from dyngs.human.template.load import load_template
 from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at
 from dyngs.train.predictor import filmed, human_options, load_network, new_network
 from dyngs.train.predictor_run import network_config, predict_person, write_run
@@ -75,14 +75,14 @@ def baselines(network: Path, capture: Path, out: Path, count: int) -> list[Row]:
     mean = load_network(new_network(model, torch.Generator()), latest_checkpoint(network), model.resolution)
     bare: HumanNetModel = model.model_copy(update={"heights": (min(model.heights),)})
     data = config.data.model_copy(update={"root": capture.absolute()})
-    person = filmed(data, bare, template(human_options(bare)))
+    person = filmed(data, bare, load_template(human_options(bare)))
     rows = []
     for name in ("seen, else mean", "mean texture"):
         start = time.perf_counter()
         maps = person.look(spread_views(person.sitter, count))
         if name == "mean texture":
             maps = replace(maps, seen=torch.zeros_like(maps.seen))
-        avatar = filled(person.sitter, maps, mean, None, bare.carve)
+        avatar = predict_gaussians(person.sitter, maps, mean, None, bare.carve)
         seconds = time.perf_counter() - start
         run = out / name.replace(", ", "_").replace(" ", "_")
         if not checkpoint_paths(run):

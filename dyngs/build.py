@@ -26,11 +26,11 @@ from dyngs.deform.residual import Residuals, cameras_in_place, residuals_of, vie
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import render_options
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.avatar import Skeleton, first_gaussians, pose_shapes
 from dyngs.human.avatar.model import HumanScene, Subject, first_look
-from dyngs.human.motion.clips import footage
-from dyngs.human.template.person import rest_shape, template
-from dyngs.human.template.uv import texels_of
+from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, texel_gaussians
+from dyngs.human.motion.clip import captured_motion
+from dyngs.human.template.atlas import atlas_texels
+from dyngs.human.template.load import load_template, rest_shape
 from dyngs.rendering import RenderOptions
 from dyngs.static.densify import DefaultDensifier, Densifier
 from dyngs.static.init import StartValues, Surroundings, initial_gaussians
@@ -111,12 +111,12 @@ def human_model(config: Config, capture: Capture, pictures: PictureLoader) -> tu
         raise DyngsError(f"{capture.root}: has no body parameters, which model.kind=human needs; see docs/human.md")
     if sh_degree > 1:
         raise DyngsError(f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1")
-    given, body = capture.body["train"], template(model)
+    given, body = capture.body["train"], load_template(model)
     vertices, joints = rest_shape(body, torch.from_numpy(given.betas).float())
-    texels = texels_of(body, model.resolution, vertices)
-    gaussians, anchors = first_gaussians(texels, sorted(set(model.heights)), sh_degree)
-    filmed = footage(capture.root, given, capture.splits["train"], joints)
-    subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_shapes(body))
+    texels = atlas_texels(body, model.resolution, vertices)
+    gaussians, anchors = texel_gaussians(texels, sorted(set(model.heights)), sh_degree)
+    filmed = captured_motion(capture.root, given, capture.splits["train"], joints)
+    subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body))
     gaussians, subject = first_look(gaussians, texels, subject, _first_pictures(pictures), model.carve)
     return gaussians, HumanScene(model, subject, rates_of(config))
 

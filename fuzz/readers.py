@@ -28,7 +28,7 @@ from fuzz.seeds import (
 )
 
 if TYPE_CHECKING:
-    from dyngs.human.template.body import Body
+    from dyngs.human.template.body import BodyTemplate
     from dyngs.rendering import Rendering
     from dyngs.scene import Scene
 
@@ -62,7 +62,7 @@ def read_whole_capture(root: Path) -> object:
     from dyngs.data.loader import PictureLoader
     from dyngs.data.read import read_capture
     from dyngs.errors import DyngsError
-    from dyngs.human.motion.clips import footage
+    from dyngs.human.motion.clip import captured_motion
 
     options = DataConfig.model_validate({"root": root})
     try:
@@ -79,7 +79,7 @@ def read_whole_capture(root: Path) -> object:
     if capture.body is not None:
         body = small_body(24)
         found += [
-            footage(root, own, capture.splits[split], body.joints)
+            captured_motion(root, own, capture.splits[split], body.joints)
             for split, own in capture.body.items()
             if capture.splits.get(split)
         ]
@@ -124,10 +124,10 @@ def read_a_body(root: Path) -> object:
     import torch
 
     from dyngs.human.template.body import posed_vertices
-    from dyngs.human.template.body_files import load_body
+    from dyngs.human.template.body_reader import read_body
 
     uv = root / "uv.obj"
-    body = load_body(
+    body = read_body(
         next((p for p in sorted(root.iterdir()) if p.suffix in (".npz", ".pkl")), root / "a.npz"),
         uv if uv.is_file() else None,
     )
@@ -137,11 +137,11 @@ def read_a_body(root: Path) -> object:
 
 def read_a_motion(root: Path) -> object:
     """The motion, as a clip on a small body."""
-    from dyngs.human.motion.clips import clip_of_motion
+    from dyngs.human.motion.clip import motion_clip
     from dyngs.human.motion.motion import read_motion
 
     motion = read_motion(only(root), small_body(55))
-    return motion, clip_of_motion(motion).at(0.3)
+    return motion, motion_clip(motion).at(0.3)
 
 
 def read_splats(root: Path) -> object:
@@ -265,7 +265,7 @@ def played(scene: Scene, options: object) -> object:
 
 
 @cache
-def small_body(joints: int) -> Body:
+def small_body(joints: int) -> BodyTemplate:
     """A body of few vertices."""
     from motion_files import tiny_body
 

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dyngs.human.motion.motion import JOINTS, ROWS, Motion
-from dyngs.human.template.body import Body
+from dyngs.human.template.body import BodyTemplate
 
 ABOVE = {"pelvis": "", "spine1": "pelvis", "spine2": "spine1", "spine3": "spine2", "neck": "spine3", "head": "neck"}
 ABOVE |= {"jaw": "head"}
@@ -58,7 +58,7 @@ def skeleton(names: Sequence[str] = JOINTS) -> Skeleton:
     return Skeleton(tuple(names), tuple(parents), np.array([PLACES[name] for name in names], dtype=np.float64))
 
 
-def tiny_body(count: int = 55, shapes: int = 0) -> Body:
+def tiny_body(count: int = 55, shapes: int = 0) -> BodyTemplate:
     """165 vertices around 55 (or 52, 24) joints, with random weights and, if asked, shape directions."""
     torch.manual_seed(count)
     names = [JOINTS[i] for i in ROWS[count]]
@@ -68,7 +68,7 @@ def tiny_body(count: int = 55, shapes: int = 0) -> Body:
         joints, parents = torch.cat([joints, joints[-2:] + 0.05]), (*parents, 20, 21)
     weights = torch.rand(3 * count, count) ** 8
     dirs = torch.randn(3 * count, 3, shapes) / 50 if shapes else None
-    return Body(
+    return BodyTemplate(
         name={55: "smplx", 52: "smplh", 24: "smpl"}[count],
         vertices=joints.repeat(3, 1) + 0.05 * torch.randn(3 * count, 3),
         faces=torch.zeros(0, 3).long(),
@@ -99,7 +99,7 @@ def world_rotations(poses: np.ndarray, parents: Sequence[int]) -> np.ndarray:
     return world
 
 
-def slow_vertices(body: Body, motion: Motion) -> np.ndarray:
+def slow_vertices(body: BodyTemplate, motion: Motion) -> np.ndarray:
     """(F, M, 3) of linear blend skinning as written down in the SMPL paper, with 4x4 matrices and loops; float64."""
     betas = motion.betas.double().numpy()[: body.num_shapes]
     vertices, joints = body.vertices.double().numpy(), body.joints.double().numpy()
@@ -123,7 +123,7 @@ def slow_vertices(body: Body, motion: Motion) -> np.ndarray:
     return out
 
 
-def pelvis_path(body: Body, motion: Motion) -> np.ndarray:
+def pelvis_path(body: BodyTemplate, motion: Motion) -> np.ndarray:
     """(F, 3) of the root joint."""
     return (body.joints[0] + motion.trans).double().numpy()
 

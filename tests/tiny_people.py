@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dyngs.config import DataConfig, HumanNetModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.human.template.body import Body, default_body
+from dyngs.human.template.body import BodyTemplate, default_template
 from dyngs.train.predictor import Filmed, filmed
 
 TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)
@@ -16,8 +16,8 @@ NET = HumanNetModel(sh_degree=0, resolution=32, heights=(0.0, 0.02), views=3, in
 
 
 @cache
-def body() -> Body:
-    return default_body()
+def body() -> BodyTemplate:
+    return default_template()
 
 
 def people(folder: Path, seeds: tuple[int, ...], options: HumanOptions = TINY) -> Path:

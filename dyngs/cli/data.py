@@ -150,15 +150,15 @@ def run_sfm(arguments: argparse.Namespace) -> int:
 def run_motion(arguments: argparse.Namespace) -> int:
     """Convert the motion and say what it is."""
     from dyngs.human.motion.motion import read_motion, save_motion
-    from dyngs.human.template.body import default_body
-    from dyngs.human.template.body_files import load_body
+    from dyngs.human.template.body import default_template
+    from dyngs.human.template.body_reader import read_body
 
     out: Path = arguments.out
     if out.exists():
         raise DyngsError(f"{out} exists already; name a new file for the motion")
     if out.suffix.lower() != ".npz":
         raise DyngsError(f"cannot write {out}: a motion is written as .npz")
-    body = default_body() if arguments.body is None else load_body(arguments.body)
+    body = default_template() if arguments.body is None else read_body(arguments.body)
     motion = read_motion(arguments.file, body, arguments.fps, arguments.up, arguments.clip)
     save_motion(motion, out)
     print(f"written: {out}\n         {_summary(motion)}")

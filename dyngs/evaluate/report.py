@@ -25,7 +25,7 @@ from dyngs.evaluate.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
 from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.files.write import write_text
 from dyngs.human.avatar.trained import AvatarScene
-from dyngs.human.motion.clips import footage, same_clip
+from dyngs.human.motion.clip import captured_motion, same_bodies
 from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import COMPACT_NAME, LoadedRun, is_compact, load_run
 from dyngs.scene import Scene, moment_of, num_colour_values
@@ -261,9 +261,9 @@ def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
     if not isinstance(run.scene, AvatarScene) or capture.body is None:
         return run.scene
     given, trained = capture.body[cast(Split, split)], capture.body["train"]
-    if same_clip(given, trained):
+    if same_bodies(given, trained):
         return run.scene
-    shown = footage(capture.root, given, split_views(capture, split), run.scene.given_joints)
+    shown = captured_motion(capture.root, given, split_views(capture, split), run.scene.given_joints)
     return run.scene.playing(shown.clip)
 
 

@@ -19,13 +19,13 @@ from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.avatar import Anchors, PoseShapes, Skeleton, skinning_weights
-from dyngs.human.avatar.refine import Fit, corrected_clip
+from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
+from dyngs.human.avatar.posing import Anchors, PoseBlendShapes, Skeleton, skinning_weights
 from dyngs.human.avatar.trained import AvatarScene
-from dyngs.human.motion.clips import Clip, upright
+from dyngs.human.motion.clip import MotionClip, rest_clip
 from dyngs.human.motion.motion import ROWS
 from dyngs.human.pose.skinning import check_tree
-from dyngs.human.template.person import template_file
+from dyngs.human.template.load import template_path
 from dyngs.runs.checkpoint import LoadedRun, info_of
 
 SUFFIX = ".safetensors"
@@ -66,7 +66,7 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
         raise DyngsError(f"{path}: an avatar is written as {SUFFIX}")
     if scene.colour is not None:
         raise DyngsError("an avatar file holds harmonics, this run's colours are a network; train with colour.kind=sh")
-    reference = upright(scene.given_clip, scene.given_joints, scene.skeleton.parents)
+    reference = rest_clip(scene.given_clip, scene.given_joints, scene.skeleton.parents)
     anchors = scene.anchors
     tensors = {f"gaussians.{name}": x for name, x in scene.gaussians.tensors().items()}
     tensors |= {f"anchors.{name}": x for name, x in anchors.tensors().items()}
@@ -118,13 +118,13 @@ def read_avatar(path: Path) -> LoadedRun:
 
 
 def _template_ref(model: HumanModel) -> TemplateRef:
-    file = template_file(model)
+    file = template_path(model)
     return TemplateRef(file.name, _sha256(file), model.body is None)
 
 
 def _template_beside(path: Path, ref: TemplateRef) -> Path | None:
     """Where the template of an avatar in ``path`` is or should be; None is the free one."""
-    file = template_file(HumanModel()) if ref.packaged else path.parent / Path(ref.file).name
+    file = template_path(HumanModel()) if ref.packaged else path.parent / Path(ref.file).name
     if file.is_file() and _sha256(file) != ref.sha256:
         whose = "that of this version of dyngs" if ref.packaged else f"{file}"
         raise DyngsError(f"{path}: was built on another template '{ref.file}' than {whose}; give the file of that name")
@@ -192,8 +192,8 @@ def _scene(tensors: Mapping[str, Tensor]) -> AvatarScene:
     own = part("anchors.")
     anchors = Anchors(**{**own, "face": own["face"].long(), "joints": own["joints"].long()})
     parents = tuple(tensors["skeleton.parents"].tolist())
-    fit = Fit(tensors["fit.turns"], float(tensors["fit.log_scale"]))
-    reference = Clip(
+    fit = SharedCorrection(tensors["fit.turns"], float(tensors["fit.log_scale"]))
+    reference = MotionClip(
         times=torch.zeros(1, dtype=torch.float64),
         poses=tensors["reference.poses"][None],
         trans=tensors["reference.trans"][None],
@@ -207,7 +207,7 @@ def _scene(tensors: Mapping[str, Tensor]) -> AvatarScene:
         skeleton=Skeleton(tensors["skeleton.joints"], parents),
         given_joints=tensors["skeleton.template_joints"],
         fit=fit,
-        shapes=PoseShapes(shapes["directions"].float(), shapes["faces"].long()) if shapes else None,
+        shapes=PoseBlendShapes(shapes["directions"].float(), shapes["faces"].long()) if shapes else None,
         pose_dirs=tensors.get("pose_dirs"),
         clip=corrected_clip(fit, reference),
         given_clip=reference,

@@ -14,12 +14,12 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, reading
 from dyngs.evaluate.report import render_options
 from dyngs.human.avatar.model import HumanScene
-from dyngs.human.prediction.fill import Avatar, filled, num_channels
-from dyngs.human.prediction.maps import Maps, maps_of, to_atlas
 from dyngs.human.prediction.network import AtlasNetwork
-from dyngs.human.prediction.sitter import Sitter, sitter_of, spread_views
-from dyngs.human.template.body import Body
-from dyngs.human.template.person import template
+from dyngs.human.prediction.person import CapturedPerson, captured_person, spread_views
+from dyngs.human.prediction.predict import PredictedAvatar, num_input_channels, predict_gaussians
+from dyngs.human.prediction.texel_maps import TexelMaps, observe_texels, to_atlas
+from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.load import load_template
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.rendering import render
 from dyngs.runs.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
@@ -40,20 +40,22 @@ _LOWEST = 1e-3
 class Filmed:
     """A person to train on: pictures, and the choices of those that are predicted from, with their maps once known."""
 
-    sitter: Sitter
+    sitter: CapturedPerson
     pictures: PictureLoader
     choices: list[list[int]]
-    _maps: dict[int, Maps] = field(default_factory=dict)
+    _maps: dict[int, TexelMaps] = field(default_factory=dict)
 
-    def maps(self, choice: int) -> Maps:
+    def maps(self, choice: int) -> TexelMaps:
         """What the pictures of that choice show; kept."""
         if choice not in self._maps:
             self._maps[choice] = self.look(self.choices[choice])
         return self._maps[choice]
 
-    def look(self, views: list[int]) -> Maps:
+    def look(self, views: list[int]) -> TexelMaps:
         """What these pictures show."""
-        return maps_of(self.sitter, ((self.pictures[i], self.sitter.posing(self.sitter.views[i])) for i in views))
+        return observe_texels(
+            self.sitter, ((self.pictures[i], self.sitter.posing(self.sitter.views[i])) for i in views)
+        )
 
 
 @dataclass
@@ -98,7 +100,7 @@ class NetworkTrainer:
             background_colour(self.background, self.generator),
             replace(render_options(self.model), nonfinite="trust"),
         )
-        avatar = filled(person.sitter, person.maps(choice), self.mean, self.network, self.model.carve)
+        avatar = predict_gaussians(person.sitter, person.maps(choice), self.mean, self.network, self.model.carve)
         posed = _scene(self.model, avatar).gaussians_at(avatar.gaussians, targets[0], step).gaussians
         total = torch.zeros(())
         for picture in targets:
@@ -176,7 +178,7 @@ def assemble_network(config: Config) -> NetworkTrainer:
     model = config.model
     if not isinstance(model, HumanNetModel):
         raise ValueError(f"model.kind is {model.kind}")
-    body, generator = template(human_options(model)), torch.Generator().manual_seed(config.run.seed)
+    body, generator = load_template(human_options(model)), torch.Generator().manual_seed(config.run.seed)
     network = new_network(model, generator)
     people = [filmed(data, model, body) for data in captures_in(config.data)]
     for person in people:
@@ -207,7 +209,7 @@ def new_network(model: HumanNetModel, generator: torch.Generator) -> AtlasNetwor
             f"model.resolution={model.resolution} must be a multiple of {factor} for {len(model.widths)} model.widths"
         )
     scaffolds = len(set(model.heights))
-    return AtlasNetwork(num_channels(scaffolds), scaffolds, model.widths, generator)
+    return AtlasNetwork(num_input_channels(scaffolds), scaffolds, model.widths, generator)
 
 
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
@@ -248,14 +250,16 @@ def captures_in(data: DataConfig) -> list[DataConfig]:
     return [data.model_copy(update={"root": folder}) for folder in folders]
 
 
-def filmed(data: DataConfig, model: HumanNetModel, body: Body) -> Filmed:
+def filmed(data: DataConfig, model: HumanNetModel, body: BodyTemplate) -> Filmed:
     """The person of one capture, without choices of pictures.
 
     Raises:
         DyngsError: no capture there, or not one of a person.
     """
     capture = read_capture(data)
-    return Filmed(sitter_of(capture, human_options(model), body), PictureLoader(capture.splits["train"], data), [])
+    return Filmed(
+        captured_person(capture, human_options(model), body), PictureLoader(capture.splits["train"], data), []
+    )
 
 
 def mean_colours(people: list[Filmed], resolution: int) -> Tensor:
@@ -281,11 +285,11 @@ def rate_at(model: HumanNetModel, step: int, steps: int) -> float:
     return model.lr * max(share, _LOWEST)
 
 
-def _choices(sitter: Sitter, model: HumanNetModel, generator: torch.Generator) -> list[list[int]]:
+def _choices(sitter: CapturedPerson, model: HumanNetModel, generator: torch.Generator) -> list[list[int]]:
     """Views to predict from: of a random moment each, one of them random, the others such that much is seen."""
     firsts = torch.randint(len(sitter.views), (model.inputs,), generator=generator).tolist()
     return [spread_views(sitter, model.views, first) for first in firsts]
 
 
-def _scene(model: HumanNetModel, avatar: Avatar) -> HumanScene:
+def _scene(model: HumanNetModel, avatar: PredictedAvatar) -> HumanScene:
     return HumanScene(human_options(model), avatar.subject, Rates(1))

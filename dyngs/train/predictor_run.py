@@ -13,9 +13,9 @@ from dyngs.config import Config, DataConfig, HumanModel, HumanNetModel
 from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
 from dyngs.errors import DyngsError
 from dyngs.human.avatar.model import HumanScene
-from dyngs.human.prediction.fill import Avatar, filled
-from dyngs.human.prediction.sitter import Sitter, named_views, spread_views
-from dyngs.human.template.person import template
+from dyngs.human.prediction.person import CapturedPerson, named_views, spread_views
+from dyngs.human.prediction.predict import PredictedAvatar, predict_gaussians
+from dyngs.human.template.load import load_template
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.runs.folder import new_folder, require_empty
 from dyngs.static.optimizer import GaussianOptimizer
@@ -63,13 +63,13 @@ def predict_person(network_run: Path, capture: Path, out: Path, views: int | tup
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
     data = config.data.model_copy(update={"root": capture.absolute()})
-    person = filmed(data, model, template(human_options(model)))
+    person = filmed(data, model, load_template(human_options(model)))
     chosen = _chosen(person.sitter, views)
     start = time.perf_counter()
     maps = person.look(chosen)
     middle = time.perf_counter()
     with torch.no_grad():
-        avatar = without_faint(filled(person.sitter, maps, mean, network, model.carve))
+        avatar = without_faint(predict_gaussians(person.sitter, maps, mean, network, model.carve))
     end = time.perf_counter()
     write_run(out, avatar, data, model, end - start)
     names = tuple(person.sitter.views[i].name for i in chosen)
@@ -88,7 +88,7 @@ def network_config(run_dir: Path) -> tuple[Config, HumanNetModel]:
     return config, config.model
 
 
-def write_run(out: Path, avatar: Avatar, data: DataConfig, model: HumanNetModel, seconds: float) -> None:
+def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: HumanNetModel, seconds: float) -> None:
     """Write ``avatar`` as a run of the preset for one person after no step; ``seconds`` is what it took so far."""
     preset = load_config(packaged_preset("human"), ["data.root=."])
     if not isinstance(preset.model, HumanModel):
@@ -113,14 +113,14 @@ def write_run(out: Path, avatar: Avatar, data: DataConfig, model: HumanNetModel,
         save_checkpoint(started, trainer.checkpoint(), seconds)
 
 
-def without_faint(avatar: Avatar) -> Avatar:
+def without_faint(avatar: PredictedAvatar) -> PredictedAvatar:
     """Without Gaussians that are hardly there."""
     kept = avatar.gaussians.opacities >= _FAINT
     anchors = avatar.subject.anchors.select(kept)
-    return Avatar(avatar.gaussians.select(kept), replace(avatar.subject, anchors=anchors))
+    return PredictedAvatar(avatar.gaussians.select(kept), replace(avatar.subject, anchors=anchors))
 
 
-def _chosen(sitter: Sitter, views: int | tuple[str, ...]) -> list[int]:
+def _chosen(sitter: CapturedPerson, views: int | tuple[str, ...]) -> list[int]:
     if isinstance(views, tuple):
         return named_views(sitter, views)
     if not 1 <= views <= len(sitter.views):

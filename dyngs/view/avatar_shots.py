@@ -13,8 +13,8 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options
 from dyngs.export.avatar import read_avatar
 from dyngs.human.avatar.trained import AvatarScene
-from dyngs.human.motion.clips import up_of
-from dyngs.human.pose.skinning import rotations
+from dyngs.human.motion.clip import up_direction
+from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.view.frames import Shot
 from dyngs.view.paths import CameraPath, frame_orbit_for_points, frozen_path, read_path, spiral_path, with_times
 from dyngs.view.playing import playing_motion
@@ -71,12 +71,12 @@ def _around(scene: AvatarScene, options: ShotOptions, count: int) -> Cameras:
     """An orbit around where the person is, a spiral before it, or without a path the one camera in front of it."""
     moments = np.linspace(0, 1, 1 if scene.is_still else _MOMENTS)
     means = torch.cat([scene.at(moment).means for moment in moments.tolist()]).numpy()
-    x, y, z = up_of(scene.given_clip).tolist()
+    x, y, z = up_direction(scene.given_clip).tolist()
     size = options.size or DEFAULT_SIZE
     if options.path == "orbit":
         return frame_orbit_for_points(means, count, size, (x, y, z))
     ring = frame_orbit_for_points(means, _RING, size, (x, y, z))
-    facing = rotations(scene.clip.poses[0, 0])[:, 2]
+    facing = axis_angle_to_matrix(scene.clip.poses[0, 0])[:, 2]
     front = int((ring.centers @ facing).argmax())
     if options.path is None:
         return ring.select(front)

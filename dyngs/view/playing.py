@@ -10,9 +10,9 @@ import torch
 from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
 from dyngs.human.avatar.trained import AvatarScene
-from dyngs.human.motion.clips import clip_of_motion, placed, upright
+from dyngs.human.motion.clip import motion_clip, place_like, rest_clip
 from dyngs.human.motion.motion import read_motion
-from dyngs.human.template.person import template
+from dyngs.human.template.load import load_template
 from dyngs.runs.checkpoint import LoadedRun
 
 
@@ -34,14 +34,14 @@ def playing_motion(run: LoadedRun, path: Path) -> Played:
         DyngsError: the run is not one of a person, or the file cannot be read.
     """
     scene, model = _avatar(run, f"--motion {path}")
-    motion = read_motion(path, template(model))
+    motion = read_motion(path, load_template(model))
     if motion.poses.shape[1] != len(scene.given_joints):
         motion = motion.for_joints(len(scene.given_joints))
-    clip = clip_of_motion(motion)
+    clip = motion_clip(motion)
     if bool((motion.scale != 1).any()):
         clip = replace(clip, trans=clip.trans - torch.tensor(run.info.world_offset))
     else:
-        clip = placed(clip, scene.given_clip, scene.given_joints, scene.skeleton.parents)
+        clip = place_like(clip, scene.given_clip, scene.given_joints, scene.skeleton.parents)
     return Played(replace(run, scene=scene.playing(clip)), motion.fps)
 
 
@@ -52,7 +52,7 @@ def at_rest(run: LoadedRun) -> LoadedRun:
         DyngsError: the run is not one of a person.
     """
     scene, _ = _avatar(run, "--pose rest")
-    rest = upright(scene.given_clip, scene.given_joints, scene.skeleton.parents)
+    rest = rest_clip(scene.given_clip, scene.given_joints, scene.skeleton.parents)
     return replace(run, scene=scene.playing(rest))
 
 

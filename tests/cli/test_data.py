@@ -16,7 +16,7 @@ from dyngs.config import DataConfig
 from dyngs.data.read import read_capture
 from dyngs.human.motion.motion import Motion, read_motion, save_motion
 from dyngs.human.template import body as body_module
-from dyngs.human.template.body_files import load_body
+from dyngs.human.template.body_reader import read_body
 
 PrintedOutput = pytest.CaptureFixture[str]
 
@@ -74,7 +74,7 @@ def test_the_clip_and_the_body_are_passed_on(tmp_path: Path) -> None:
     for words, body, name in (
         (["--clip", "walk"], None, "walk"),
         (["--clip", "still"], None, "still"),
-        (["--clip", "walk", "--body", str(tmp_path / "small.npz")], load_body(tmp_path / "small.npz"), "walk"),
+        (["--clip", "walk", "--body", str(tmp_path / "small.npz")], read_body(tmp_path / "small.npz"), "walk"),
     ):
         out = tmp_path / f"{name}_{len(words)}.npz"
         assert main(["data", "motion", str(clip), str(out), *words]) == 0

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.deform.nodes import turned
-from dyngs.human.pose.covariance import moved_axes, rotations_of
+from dyngs.human.pose.covariance import rotations_of, transform_covariance
 from dyngs.ops.projection import project
 from dyngs.ops.quaternions import unit_quats
 from dyngs.ops.reference import rotation_matrices
@@ -58,7 +58,7 @@ def test_every_user_takes_every_length(scale: float) -> None:
         offsets = quats - torch.tensor([1.0, 0.0, 0.0, 0.0])
         again = exact(offsets + torch.tensor([1.0, 0.0, 0.0, 0.0])).float()
         torch.testing.assert_close(turned(offsets, vectors), rotate(again, vectors), **long)
-    axes, lengths = moved_axes(torch.eye(3).expand(3, 3, 3), quats, log_scales)
+    axes, lengths = transform_covariance(torch.eye(3).expand(3, 3, 3), quats, log_scales)
     half = rotation_matrices(axes) * lengths.exp()[:, None]
     wanted = matrices * log_scales.exp()[:, None]
     torch.testing.assert_close(half @ half.mT, wanted @ wanted.mT, rtol=0, atol=100 * ROUNDING)

@@ -14,20 +14,20 @@ from dyngs.conventions import SH_C0
 from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.avatar import (
+from dyngs.human.avatar.corrections import Corrections, corrected_pose, corrected_skeleton, corrected_weights
+from dyngs.human.avatar.observations import SurfacePoints, observe_points
+from dyngs.human.avatar.posing import (
     Anchors,
-    PoseShapes,
-    Posing,
+    BodyPose,
+    PoseBlendShapes,
     Skeleton,
-    offsets_at_rest,
-    posed,
-    posing_of,
+    frame_pose,
+    pose_gaussians,
+    rest_offsets,
     skinning_weights,
 )
-from dyngs.human.avatar.carve import Places, sightings
-from dyngs.human.avatar.refine import Corrections, corrected_posing, corrected_skeleton, corrected_weights
-from dyngs.human.motion.clips import Footage
-from dyngs.human.template.uv import Texels, neighbours
+from dyngs.human.motion.clip import CapturedMotion
+from dyngs.human.template.atlas import Texels, nearest_neighbours
 from dyngs.static.densify import EditResult
 from dyngs.static.model import Drawn
 from dyngs.static.rates import Rates
@@ -45,8 +45,8 @@ class Subject:
 
     skeleton: Skeleton
     anchors: Anchors
-    footage: Footage
-    shapes: PoseShapes | None = None
+    footage: CapturedMotion
+    shapes: PoseBlendShapes | None = None
 
 
 def first_look(
@@ -57,21 +57,21 @@ def first_look(
     Gaussians above the lowest scaffold are kept if they lie inside the silhouette of a share ``carve`` of the pictures.
 
     Args:
-        gaussians: P times the number of scaffolds, as ``first_gaussians`` orders them.
+        gaussians: P times the number of scaffolds, as ``texel_gaussians`` orders them.
         texels: P.
         subject: whose anchors are those of ``gaussians``.
         pictures: some of those to train on.
     """
     clip, anchors, skeleton = subject.footage.clip, subject.anchors, subject.skeleton
     rows = {frame: row for row, frame in enumerate(subject.footage.frames)}
-    shown = ((picture, posing_of(clip, rows[picture.frame or 0])) for picture in pictures)
+    shown = ((picture, frame_pose(clip, rows[picture.frame or 0])) for picture in pictures)
     normals = texels.normals.repeat(len(anchors) // max(len(texels), 1), 1)
     weights = skinning_weights(anchors, len(skeleton.joints))
 
-    def offsets(posing: Posing) -> Tensor | None:
-        return offsets_at_rest(anchors, weights, posing, subject.shapes, None)
+    def offsets(posing: BodyPose) -> Tensor | None:
+        return rest_offsets(anchors, weights, posing, subject.shapes, None)
 
-    found = sightings(Places(anchors.points, normals, weights, offsets), skeleton, shown)
+    found = observe_points(SurfacePoints(anchors.points, normals, weights, offsets), skeleton, shown)
     sh = gaussians.sh.clone()
     sh[:, 0] = (found.rgb - 0.5) / SH_C0
     kept = found.inside >= carve
@@ -116,14 +116,14 @@ class HumanScene:
         if self._refines(step):
             learned = self.corrections.learned
             pose_dirs = self.corrections.pose_dirs
-            posing, skeleton = corrected_posing(learned, clip, row), corrected_skeleton(learned, skeleton)
+            posing, skeleton = corrected_pose(learned, clip, row), corrected_skeleton(learned, skeleton)
             weights = corrected_weights(learned, self.anchors, len(skeleton.joints))
             penalties |= self.corrections.penalties()
         else:
-            posing = posing_of(clip, row)
+            posing = frame_pose(clip, row)
             weights = self._constant_weights()
-        offsets = offsets_at_rest(self.anchors, weights, posing, self.subject.shapes, pose_dirs)
-        moved = posed(parameters, weights, skeleton, posing, offsets)
+        offsets = rest_offsets(self.anchors, weights, posing, self.subject.shapes, pose_dirs)
+        moved = pose_gaussians(parameters, weights, skeleton, posing, offsets)
         penalties |= self._between_neighbours(parameters, moved, float(clip.scale[row]), step)
         return Drawn(moved, penalties, Frame(parameters.means, posing.rotations[0]))
 
@@ -199,7 +199,7 @@ class HumanScene:
         if options.rigidity == 0 and options.smoothness == 0:
             return {}
         if self._near is None:
-            self._near = neighbours(parameters.means, NEIGHBOURS)
+            self._near = nearest_neighbours(parameters.means, NEIGHBOURS)
         if not self._near.shape[1]:
             return {}
         near = self._near[:, step % self._near.shape[1]]

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from dyngs.colour.network import ColourNetwork, Frame
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.avatar import Anchors, PoseShapes, Skeleton, offsets_at_rest, posed, posing_of
-from dyngs.human.avatar.refine import Fit, corrected_clip, corrected_skeleton, corrected_weights
-from dyngs.human.avatar.stored import require_avatar, require_shapes
-from dyngs.human.motion.clips import Clip
+from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_skeleton, corrected_weights
+from dyngs.human.avatar.posing import Anchors, PoseBlendShapes, Skeleton, frame_pose, pose_gaussians, rest_offsets
+from dyngs.human.avatar.validation import require_avatar, require_shapes
+from dyngs.human.motion.clip import MotionClip
 from dyngs.rendering import Shader
 
 
@@ -42,11 +42,11 @@ class AvatarScene:
     weights: Tensor
     skeleton: Skeleton
     given_joints: Tensor
-    fit: Fit
-    shapes: PoseShapes | None
+    fit: SharedCorrection
+    shapes: PoseBlendShapes | None
     pose_dirs: Tensor | None
-    clip: Clip
-    given_clip: Clip
+    clip: MotionClip
+    given_clip: MotionClip
     num_field_values: int
     colour: ColourNetwork | None = None
 
@@ -80,15 +80,15 @@ class AvatarScene:
         Raises:
             DyngsError: the time is NaN.
         """
-        posing = posing_of(self.clip.at(time), 0)
-        offsets = offsets_at_rest(self.anchors, self.weights, posing, self.shapes, self.pose_dirs)
-        return posed(self.gaussians, self.weights, self.skeleton, posing, offsets)
+        posing = frame_pose(self.clip.at(time), 0)
+        offsets = rest_offsets(self.anchors, self.weights, posing, self.shapes, self.pose_dirs)
+        return pose_gaussians(self.gaussians, self.weights, self.skeleton, posing, offsets)
 
     def shader_at(self, time: float | None) -> Shader | None:
         """What colours the Gaussians of ``at(time)``; None: their harmonics."""
         if self.colour is None:
             return None
-        return self.colour.shader(time, Frame(self.gaussians.means, posing_of(self.clip.at(time), 0).rotations[0]))
+        return self.colour.shader(time, Frame(self.gaussians.means, frame_pose(self.clip.at(time), 0).rotations[0]))
 
     def part(self, which: Literal["moving", "still"]) -> AvatarScene:
         """All of it, or nothing: a person moves as a whole."""
@@ -102,7 +102,7 @@ class AvatarScene:
             pose_dirs=None if self.pose_dirs is None else self.pose_dirs[index],
         )
 
-    def playing(self, clip: Clip) -> AvatarScene:
+    def playing(self, clip: MotionClip) -> AvatarScene:
         """The same person in another clip, whose poses are given as those of training were.
 
         What was learned about all poses is applied: the person's size, and how the joints are turned.
@@ -120,9 +120,9 @@ def trained_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> AvatarS
     require_avatar(gaussians, state)
     learned = {name: state[f"learned.{name}"] for name in ("poses", "trans", "turns", "joints", "log_scale", "weights")}
     anchors = Anchors(**{field.name: state[f"anchors.{field.name}"] for field in fields(Anchors)})
-    clip = Clip(*(state[f"clip.{name}"] for name in ("times", "poses", "trans", "scale")))
+    clip = MotionClip(*(state[f"clip.{name}"] for name in ("times", "poses", "trans", "scale")))
     skeleton = Skeleton(state["joints"], tuple(state["parents"].tolist()))
-    fit = Fit(learned["turns"], float(learned["log_scale"]))
+    fit = SharedCorrection(learned["turns"], float(learned["log_scale"]))
     with torch.no_grad():
         return AvatarScene(
             gaussians=gaussians,
@@ -139,12 +139,12 @@ def trained_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> AvatarS
         )
 
 
-def stored_shapes(state: Mapping[str, Tensor]) -> PoseShapes | None:
+def stored_shapes(state: Mapping[str, Tensor]) -> PoseBlendShapes | None:
     """The pose blend shapes of a state, if there are any."""
     if "shapes.directions" not in state:
         return None
     require_shapes(state["shapes.directions"], state["shapes.faces"], len(state["joints"]))
-    return PoseShapes(state["shapes.directions"].float(), state["shapes.faces"].long())
+    return PoseBlendShapes(state["shapes.directions"].float(), state["shapes.faces"].long())
 
 
 def _optional(state: Mapping[str, Tensor], name: str) -> tuple[Tensor, ...]:

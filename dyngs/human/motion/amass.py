@@ -16,6 +16,9 @@ from dyngs.files.numpy_files import read_arrays
 from dyngs.human.motion.motion import ROWS, Motion, Up, require_moderate, require_rate
 from dyngs.human.motion.retarget import on_floor
 from dyngs.human.template.body import Body
+from dyngs.human.motion.motion import ROWS, Motion, UpAxis, require_frame_count, require_frame_rate
+from dyngs.human.motion.retarget import place_on_floor
+from dyngs.human.template.body import BodyTemplate
 
 _MODELS = {72: "smpl", 156: "smplh", 165: "smplx"}
 _PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
@@ -23,7 +26,7 @@ _PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
-def read_amass(path: Path, body: Body, up: Up = "auto") -> Motion:
+def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
     """The motion of 55 joints, y up, in float32; joints that the file lacks do not turn.
 
     Keys: ``poses`` (F, 72, 156 or 165), or ``root_orient``, ``pose_body`` and the like; ``trans`` (F, 3);
@@ -45,7 +48,7 @@ def read_amass(path: Path, body: Body, up: Up = "auto") -> Motion:
         return _motion(path, _arrays(path), body, up)
 
 
-def _motion(path: Path, arrays: dict[str, np.ndarray], body: Body, up: Up) -> Motion:
+def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: UpAxis) -> Motion:
     poses, width = _poses(path, arrays)
     frames = len(poses)
     trans = _numbers(path, arrays, "trans")
@@ -66,7 +69,7 @@ def _motion(path: Path, arrays: dict[str, np.ndarray], body: Body, up: Up) -> Mo
     values = (torch.from_numpy(x).float() for x in (poses, trans, betas, scale))
     poses, trans, betas, scale = values
     motion = Motion(poses, trans, betas, _fps(path, arrays), scale)
-    return on_floor(motion, body) if is_other_model else motion
+    return place_on_floor(motion, body) if is_other_model else motion
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
@@ -87,7 +90,7 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
         flat = _joined_parts(path, arrays)
     if not len(flat):
         raise DyngsError(f"{path}: has no frames")
-    require_moderate(path, len(flat), 55)
+    require_frame_count(path, len(flat), 55)
     rows = list(ROWS[flat.shape[1] // 3])
     poses = np.zeros((len(flat), 55, 3))
     poses[:, rows] = flat.reshape(len(flat), -1, 3)[:, : len(rows)]
@@ -127,7 +130,7 @@ def _fps(path: Path, arrays: dict[str, np.ndarray]) -> float:
     rate = _numbers(path, arrays, key)
     if rate.size != 1 or not rate.item() > 0:
         raise DyngsError(f"{path}: '{key}' must be one positive number")
-    return require_rate(path, rate.item())
+    return require_frame_rate(path, rate.item())
 
 
 def _scale(path: Path, arrays: dict[str, np.ndarray], frames: int) -> np.ndarray:
@@ -138,7 +141,7 @@ def _scale(path: Path, arrays: dict[str, np.ndarray], frames: int) -> np.ndarray
     return np.broadcast_to(scale, frames).copy()
 
 
-def _is_z_up(path: Path, arrays: dict[str, np.ndarray], up: Up) -> bool:
+def _is_z_up(path: Path, arrays: dict[str, np.ndarray], up: UpAxis) -> bool:
     if up != "auto":
         return up == "z"
     if "up_axis" not in arrays:
@@ -149,7 +152,7 @@ def _is_z_up(path: Path, arrays: dict[str, np.ndarray], up: Up) -> bool:
     return said == "z"
 
 
-def _pelvis(body: Body, betas: np.ndarray) -> np.ndarray:
+def _pelvis(body: BodyTemplate, betas: np.ndarray) -> np.ndarray:
     """(3,) the root joint of the shaped body at rest."""
     pelvis = body.joints[0].double().numpy()
     if body.joint_shape_dirs is None:

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError, reading
 from dyngs.files.limits import require_at_most
-from dyngs.human.motion.motion import chunks, require_moderate, require_rate
-from dyngs.human.motion.retarget import SourceMotion
+from dyngs.human.motion.motion import frame_chunks, require_frame_count, require_frame_rate
+from dyngs.human.motion.retarget import SkeletonMotion
 
 _END_SITE = -1
 _MOST_JOINTS = 4096
@@ -36,7 +36,7 @@ class _Joint:
     channels: list[str] = field(default_factory=list)  # "zrotation" and the like, in the order of the file
 
 
-def read_bvh(path: Path) -> SourceMotion:
+def read_bvh(path: Path) -> SkeletonMotion:
     """The motion of the file's joints, in its own units and axes; rest is where all rotations are zero.
 
     A joint moves relative to its parent by T R: T is its position channels, or OFFSET along axes that have none, and
@@ -52,10 +52,10 @@ def read_bvh(path: Path) -> SourceMotion:
         rotations = np.empty((len(values), len(joints), 3, 3))
         positions = np.empty((len(values), len(joints), 3))
         rest = np.zeros((len(joints), 3))
-        for part in chunks(len(values)):
+        for part in frame_chunks(len(values)):
             rest = _place(joints, values[part], rotations[part], positions[part])
         names = tuple(joint.name for joint in joints)
-        return SourceMotion(path, names, rest, rotations, positions, fps, world_is_y_up=False)
+        return SkeletonMotion(path, names, rest, rotations, positions, fps, world_is_y_up=False)
 
 
 def _place(joints: Sequence[_Joint], values: np.ndarray, rotations: np.ndarray, positions: np.ndarray) -> np.ndarray:
@@ -157,11 +157,11 @@ def _values(path: Path, rows: str, joints: Sequence[_Joint]) -> tuple[np.ndarray
     seconds = _numbers(path, [header[2]]).item()
     if not frames or not channels or not seconds > 0:
         raise DyngsError(f"{path}: needs at least one frame, one channel and a positive Frame Time")
-    fps = require_rate(path, 1.0 / seconds if seconds > 1e-300 else math.inf)
+    fps = require_frame_rate(path, 1.0 / seconds if seconds > 1e-300 else math.inf)
     if frames * channels > (len(rows) - header.end() + 1) // 2:  # each has a digit and a gap
         count = sum(1 for _ in re.finditer(r"\S+", rows[header.end() :]))
         raise _cut_off(path, frames, channels, count)
-    require_moderate(path, frames, len(joints))
+    require_frame_count(path, frames, len(joints))
     values = np.empty(frames * channels)
     count, start = 0, header.end()
     while start < len(rows):

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError, reading
 from dyngs.files.limits import require_at_most
-from dyngs.human.motion.motion import chunks, require_moderate, sample_times
-from dyngs.human.motion.retarget import SourceMotion
+from dyngs.human.motion.motion import frame_chunks, require_frame_count, sample_times
+from dyngs.human.motion.retarget import SkeletonMotion
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -137,7 +137,7 @@ class _Frames:
     positions: np.ndarray
 
 
-def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> SourceMotion:
+def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> SkeletonMotion:
     """The motion of the joints of the file's largest skin at ``fps`` frames per second, from the first key to the last.
 
     Rest is the bind pose, inverse(inverseBindMatrices), or where there are none the nodes as they stand. The world is
@@ -154,18 +154,18 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> SourceM
         return _motion(_File(path), fps, clip)
 
 
-def _motion(file: _File, fps: float, clip: str | None) -> SourceMotion:
+def _motion(file: _File, fps: float, clip: str | None) -> SkeletonMotion:
     joints = max((skin.joints for skin in file.document.skins), key=len, default=())
     if not joints:
         raise file.error("has no skin, hence no skeleton; export it with its skinned mesh")
     chain = _with_ancestors(file, joints)
     curves = _curves(file, _chosen(file, chain, clip), chain)
     start, end = min(c.times[0] for c in curves.values()), max(c.times[-1] for c in curves.values())
-    require_moderate(file.path, float((end - start) * fps), len(chain))
+    require_frame_count(file.path, float((end - start) * fps), len(chain))
     times = start + sample_times(end - start, 1.0, fps)
     rotations = np.empty((len(times), len(joints), 3, 3))
     positions = np.empty((len(times), len(joints), 3))
-    for part in chunks(len(times)):
+    for part in frame_chunks(len(times)):
         moving = _placed(file, chain, curves, times[part])
         for i, node in enumerate(joints):
             rotations[part, i], positions[part, i] = moving[node].rotations, moving[node].positions
@@ -178,9 +178,9 @@ def _motion(file: _File, fps: float, clip: str | None) -> SourceMotion:
         rest_from_joint = np.stack([still[node].rotations[0] for node in joints])
     else:
         rest, rest_from_joint = _bind_pose(file, bind, len(joints))
-    for part in chunks(len(times)):
+    for part in frame_chunks(len(times)):
         rotations[part] = rotations[part] @ rest_from_joint.swapaxes(1, 2)
-    return SourceMotion(
+    return SkeletonMotion(
         file.path,
         tuple(file.document.nodes[node].name for node in joints),
         rest,

@@ -20,7 +20,7 @@ from dyngs.files.limits import VARIABLE, allowed
 from dyngs.files.write import atomic_file
 
 if TYPE_CHECKING:
-    from dyngs.human.template.body import Body
+    from dyngs.human.template.body import BodyTemplate
 
 _FINGERS = tuple(f"{finger}{i}" for finger in ("index", "middle", "pinky", "ring", "thumb") for i in (1, 2, 3))
 
@@ -36,7 +36,7 @@ JOINTS = (
 ROWS = {55: tuple(range(55)), 52: (*range(22), *range(25, 55)), 24: tuple(range(22))}
 """By number of joints of a body: which of the 55 its first joints are. SMPL's last two, the hands, are none of them."""
 
-Up = Literal["auto", "y", "z"]
+UpAxis = Literal["auto", "y", "z"]
 
 MAX_JOINT_POSES = 5_000_000
 """Joints (55 at least) times frames of a motion at most: 90,909 frames, or 50 minutes at 30 frames per second."""
@@ -93,7 +93,7 @@ class Motion:
         times = sample_times(len(self) - 1, self.fps, fps)
         if fps == self.fps:
             return self
-        return joined([self._between(times[rows], fps) for rows in chunks(len(times))])
+        return concatenated([self._between(times[rows], fps) for rows in frame_chunks(len(times))])
 
     def _between(self, times: np.ndarray, fps: float) -> Motion:
         """The motion at ``times`` (F,), in its own frames."""
@@ -109,18 +109,18 @@ class Motion:
         return Motion(poses, linear(self.trans), self.betas, fps, linear(self.scale))
 
 
-def joined(parts: Sequence[Motion]) -> Motion:
+def concatenated(parts: Sequence[Motion]) -> Motion:
     """One motion after the other; at least one, all of one person and rate."""
     whole = {name: torch.cat([getattr(part, name) for part in parts]) for name in ("poses", "trans", "scale")}
     return replace(parts[0], **whole)
 
 
-def chunks(count: int) -> list[slice]:
+def frame_chunks(count: int) -> list[slice]:
     """Slices of at most a thousand frames that make up ``count`` of them."""
     return [slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK)]
 
 
-def require_moderate(path: Path, frames: float, joints: int) -> None:
+def require_frame_count(path: Path, frames: float, joints: int) -> None:
     """Check that the motion of a file fits into memory, before it is made.
 
     Raises:
@@ -135,7 +135,7 @@ def require_moderate(path: Path, frames: float, joints: int) -> None:
         )
 
 
-def require_rate(path: Path, fps: float) -> float:
+def require_frame_rate(path: Path, fps: float) -> float:
     """``fps``, if it is a rate of frames per second that a motion can have.
 
     Raises:
@@ -164,7 +164,7 @@ def sample_times(last: float, from_fps: float, fps: float) -> np.ndarray:
 
 
 def read_motion(
-    path: Path, body: Body | None = None, fps: float | None = None, up: Up = "auto", clip: str | None = None
+    path: Path, body: BodyTemplate | None = None, fps: float | None = None, up: UpAxis = "auto", clip: str | None = None
 ) -> Motion:
     """The motion of an AMASS ``.npz``, a ``.bvh``, a ``.glb`` or a ``.gltf``, of 55 joints, in float32.
 
@@ -182,7 +182,7 @@ def read_motion(
     from dyngs.human.motion.bvh import read_bvh
     from dyngs.human.motion.gltf import read_gltf
     from dyngs.human.motion.retarget import retarget
-    from dyngs.human.template.body import default_body
+    from dyngs.human.template.body import default_template
 
     path, kind = Path(path), Path(path).suffix.lower()
     if kind not in (".npz", ".bvh", ".glb", ".gltf"):
@@ -191,7 +191,7 @@ def read_motion(
         raise DyngsError(f"{path}: the up axis can only be told of an .npz; that of a {kind} is known")
     if clip is not None and kind not in (".glb", ".gltf"):
         raise DyngsError(f"{path}: a {kind} holds one motion without a name; do not ask for '{clip}'")
-    body = default_body() if body is None else body
+    body = default_template() if body is None else body
     with reading(path):
         if kind == ".npz":
             motion = read_amass(path, body, up)

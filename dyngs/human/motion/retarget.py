@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.human.motion.motion import JOINTS, ROWS, Motion, chunks
+from dyngs.human.motion.motion import JOINTS, ROWS, Motion, frame_chunks
 from dyngs.human.motion.rigs import match_joints
-from dyngs.human.pose.skinning import joint_transforms, rotations
-from dyngs.human.template.body import Body
+from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
+from dyngs.human.template.body import BodyTemplate
 
 _PARENTS = (
     *(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 15, 15, 15),
@@ -45,7 +45,7 @@ _SNAP_COS = np.cos(np.radians(15.0))
 
 
 @dataclass(frozen=True)
-class SourceMotion:
+class SkeletonMotion:
     """How the S joints of some other skeleton move; float64, in any unit of length.
 
     Attributes:
@@ -67,7 +67,7 @@ class SourceMotion:
     world_is_y_up: bool
 
 
-def retarget(source: SourceMotion, body: Body) -> Motion:
+def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
     """The source's motion on ``body``: 55 joints, y up, float32, its rest pose facing +z.
 
     World rotation of joint b that is the source's joint s: G_b = N G_s M^T align(d_b, M d_s), where d are directions
@@ -90,12 +90,12 @@ def retarget(source: SourceMotion, body: Body) -> Motion:
     to_target = {name: (i, target_from_rest.T @ turns[name]) for name, i in found.items()}
     poses = [
         _axis_angles(_turned(source.rotations[rows], target_from_world, to_target))
-        for rows in chunks(len(source.rotations))
+        for rows in frame_chunks(len(source.rotations))
     ]
     first = {name: source.positions[0, i] for name, i in found.items()}
     ratio = _leg_length(ours) / max(_leg_length(first), 1e-9)
     trans = ratio * source.positions[:, found["pelvis"]] @ target_from_world.T - ours["pelvis"]
-    return on_floor(
+    return place_on_floor(
         Motion(
             torch.cat(poses),
             torch.from_numpy(trans).float(),
@@ -130,7 +130,7 @@ def _axis_angles(world: np.ndarray) -> Tensor:
     return torch.from_numpy(Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec()).float().reshape(-1, 55, 3)
 
 
-def on_floor(motion: Motion, body: Body) -> Motion:
+def place_on_floor(motion: Motion, body: BodyTemplate) -> Motion:
     """The motion of 55 joints moved up or down as a whole: the lowest vertex of its mean shape comes to y = 0.
 
     Pose blendshapes, which are millimetres, are not considered.
@@ -141,7 +141,7 @@ def on_floor(motion: Motion, body: Body) -> Motion:
     return replace(motion, trans=trans)
 
 
-def _lowest(poses: Tensor, body: Body) -> Tensor:
+def _lowest(poses: Tensor, body: BodyTemplate) -> Tensor:
     """(F,) smallest y of the vertices in the poses (F, J, 3), of blended transforms of which only row y is needed."""
     followed = body.weights.nonzero(as_tuple=True)
     points = torch.cat([body.vertices, torch.ones_like(body.vertices[:, :1])], dim=1)
@@ -150,13 +150,18 @@ def _lowest(poses: Tensor, body: Body) -> Tensor:
     vertex = followed[0].repeat_interleave(4).numpy()
     height = csr_array((shares.ravel(), (vertex, columns.ravel())), shape=(len(points), 4 * len(body.joints)))
     lowest = []
-    for part in chunks(len(poses)):
-        rows = joint_transforms(body.joints, body.parents, rotations(poses[part]))[:, :, 1].flatten(1).double().numpy()
+    for part in frame_chunks(len(poses)):
+        rows = (
+            joint_transforms(body.joints, body.parents, axis_angle_to_matrix(poses[part]))[:, :, 1]
+            .flatten(1)
+            .double()
+            .numpy()
+        )
         lowest += [(height @ few.T).min(axis=0) for few in np.array_split(rows, range(64, len(rows), 64))]
     return torch.from_numpy(np.concatenate(lowest)).to(poses.dtype)
 
 
-def _target_from_rest(source: SourceMotion, found: dict[str, int]) -> np.ndarray:
+def _target_from_rest(source: SkeletonMotion, found: dict[str, int]) -> np.ndarray:
     """(3, 3) rotation from the axes of the rest pose to x left, y up, z forward.
 
     Up is the axis nearest to the way from the ankles to the shoulders; left is that of hips and shoulders, made

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dyngs.human.pose.polar import quats_of
+from dyngs.human.pose.nearest_rotation import quats_of
 from dyngs.ops.quaternions import unit_quats
 
 _SWEEPS = 6
@@ -28,7 +28,7 @@ _CLOSEST = 1e-4
 """Relative gap of two squared axes below which turning one into the other changes nothing that could be seen."""
 
 
-def moved_axes(linear: Tensor, quats: Tensor, log_scales: Tensor) -> tuple[Tensor, Tensor]:
+def transform_covariance(linear: Tensor, quats: Tensor, log_scales: Tensor) -> tuple[Tensor, Tensor]:
     """Rotations wxyz (N, 4) and log scales (N, 3) of covariances T S T^T with S that of ``quats`` and ``log_scales``.
 
     Exact for every T: with T R diag(s) = U diag(d) V^T the covariance is U diag(d^2) U^T. The gradient of U divides by

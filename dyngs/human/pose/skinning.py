@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 
-def rotations(poses: Tensor) -> Tensor:
+def axis_angle_to_matrix(poses: Tensor) -> Tensor:
     """(..., 3, 3) rotation matrices of axis-angle vectors ``poses`` (..., 3), rad; exact at zero, as is the gradient.
 
     Rodrigues: R = cos(t) 1 + sin(t)/t [p]x + (1 - cos(t))/t^2 p p^T with t = |p|; (1 - cos(t))/t^2 = sinc(t/2)^2 / 2.
@@ -67,7 +67,7 @@ def check_tree(parents: tuple[int, ...]) -> None:
             raise ValueError(f"joint {joint} has parent {parent}; parents must come before their children")
 
 
-def blended(weights: Tensor, transforms: Tensor) -> Tensor:
+def blend_transforms(weights: Tensor, transforms: Tensor) -> Tensor:
     """(..., P, 3, 4) transforms of points: those of the joints (..., J, 3, 4) in the shares ``weights`` (P, J).
 
     T_i = sum_j w_ij A_j: no rigid motion in general. Rows of the weights sum to 1.
@@ -75,6 +75,6 @@ def blended(weights: Tensor, transforms: Tensor) -> Tensor:
     return (weights @ transforms.flatten(-2)).unflatten(-1, (3, 4))
 
 
-def apply(transforms: Tensor, points: Tensor) -> Tensor:
+def apply_transforms(transforms: Tensor, points: Tensor) -> Tensor:
     """(..., P, 3) points, each moved by its own of the ``transforms`` (..., P, 3, 4)."""
     return (transforms[..., :3] * points[..., None, :]).sum(-1) + transforms[..., 3]

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from dyngs.errors import DyngsError
 
 HEADS = {"turn": 4, "stretch": 3, "opacity": 1, "rise": 1, "paint": 3, "trust": 1}
-"""What is predicted for a texel of a scaffold, and in how many numbers; see ``dyngs.human.prediction.fill``."""
+"""What is predicted for a texel of a scaffold, and in how many numbers; see ``dyngs.human.prediction.predict``."""
 
 _GROUPS = 8
 

@@ -23,11 +23,17 @@ from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image, write_text
 from dyngs.human.motion.motion import JOINTS, Motion, save_motion
-from dyngs.human.synthetic.clothes import atlas_of, dressed, outfit_of, texture_of, texture_places
-from dyngs.human.template.mesh import Hits, interpolated, unit, vertex_normals, visible
+from dyngs.human.synthetic.clothes import (
+    dress_body,
+    paint_texture,
+    random_outfit,
+    texel_coordinates,
+    texture_coordinates,
+)
+from dyngs.human.template.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
 
 if TYPE_CHECKING:
-    from dyngs.human.template.body import Body
+    from dyngs.human.template.body import BodyTemplate
 
 _FPS = 12.0
 _RADIUS = 3.5
@@ -48,7 +54,7 @@ class HumanOptions:
         num_new: frames of the other clip, ``pose``; 0 = no such split.
         num_cameras: training cameras, on a ring around the person.
         num_test: test cameras, each midway between two training cameras; 0 = neither test nor ``pose``.
-        seed: of the outfit, see ``dyngs.human.synthetic.clothes.outfit_of``; one seed gives the same bytes each time.
+        seed: of the outfit, see ``dyngs.human.synthetic.clothes.random_outfit``; the same seed gives the same bytes.
         samples: per pixel side.
     """
 
@@ -91,16 +97,16 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     Raises:
         DyngsError: nothing asked for, ``out`` holds something already, or cannot be written.
     """
-    from dyngs.human.template.body import default_body
+    from dyngs.human.template.body import default_template
 
     if min(options.size, options.num_frames, options.num_cameras, options.samples) < 1:
         raise DyngsError("a synthetic person needs size, num_frames, num_cameras and samples of at least 1")
     if min(options.num_new, options.num_test, options.seed) < 0:
         raise DyngsError("a synthetic person needs num_new, num_test and seed of at least 0")
     require_new_folder(out)
-    body = default_body()
-    outfit = outfit_of(options.seed)
-    clothed, texture = dressed(body, outfit), texture_of(body, outfit)
+    body = default_template()
+    outfit = random_outfit(options.seed)
+    clothed, texture = dress_body(body, outfit), paint_texture(body, outfit)
     train = dict(enumerate(_ring(options.num_cameras)))
     test = {len(train) + i: pose for i, pose in enumerate(_ring_between(options.num_test, options.num_cameras))}
     clips = {"train": walk(body, options.num_frames)}
@@ -116,7 +122,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     return out
 
 
-def walk(body: Body, num_frames: int) -> Motion:
+def walk(body: BodyTemplate, num_frames: int) -> Motion:
     """(F frames) three swings of legs and arms on the spot while the body turns by 50 degrees; soles at y = 0."""
     time = np.linspace(0.0, 1.0, num_frames)
     swing, lift = np.sin(3 * np.pi * time), 0.3 - 0.3 * np.cos(3 * np.pi * time)
@@ -135,7 +141,7 @@ def walk(body: Body, num_frames: int) -> Motion:
     return _on_floor(body, turns, num_frames)
 
 
-def squat(body: Body, num_frames: int) -> Motion:
+def squat(body: BodyTemplate, num_frames: int) -> Motion:
     """(F frames) from standing down into a squat, while the arms go up sideways; soles at y = 0."""
     depth = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, num_frames))
     turns = {"spine1": _turn(x=0.35 * depth), "head": _turn(x=-0.3 * depth, z=0.2 * depth)}
@@ -175,7 +181,7 @@ def render_mesh(mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples:
     sums = np.zeros((size * size, 4))
     for k in range(samples * samples):
         place = np.array([(k % samples + 0.5) / samples, (k // samples + 0.5) / samples, 0.0])
-        hits = visible((image - place)[mesh.faces], size, size)
+        hits = rasterize((image - place)[mesh.faces], size, size)
         sums[hits.index, :3] += _lit(mesh, normals, hits)
         sums[hits.index, 3] += 1.0
     rgb = sums[:, :3] / np.maximum(sums[:, 3:], 1.0)
@@ -200,18 +206,18 @@ def _write_split(
     write_text(out / f"transforms_{split}.json", json.dumps(lens | {"frames": frames}, indent=1) + "\n")
 
 
-def _posed_meshes(body: Body, motion: Motion, texture: np.ndarray) -> Iterator[PosedMesh]:
+def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> Iterator[PosedMesh]:
     """The mesh of each frame, posed in float64."""
     from dyngs.human.template.body import posed_vertices
 
-    uv, uv_faces = atlas_of(body)
+    uv, uv_faces = texture_coordinates(body)
     exact, faces = body.to(torch.float64), body.faces.numpy()
     for pose, trans, scale in zip(*(x.double() for x in (motion.poses, motion.trans, motion.scale)), strict=True):
         vertices = posed_vertices(exact, pose[None], trans[None], scale=scale[None])[0].numpy()
         yield PosedMesh(vertices, faces, uv, uv_faces, texture)
 
 
-def _on_floor(body: Body, turns: dict[str, np.ndarray], num_frames: int) -> Motion:
+def _on_floor(body: BodyTemplate, turns: dict[str, np.ndarray], num_frames: int) -> Motion:
     """The motion of joints that turn by axis-angle (F, 3) or (3,), its lowest vertex at y = 0 in every frame."""
     from dyngs.human.template.body import posed_vertices
 
@@ -246,8 +252,8 @@ def _ring_between(count: int, others: int) -> np.ndarray:
 def _looking(azimuths: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """(V, 4, 4) OpenGL camera-to-world poses, y up; azimuths (V,) from +z towards +x in radians, heights (V,) in m."""
     centers = np.stack([_RADIUS * np.sin(azimuths), heights, _RADIUS * np.cos(azimuths)], axis=-1)
-    backward = unit(centers - _TARGET)
-    right = unit(np.cross([0.0, 1.0, 0.0], backward))
+    backward = normalized(centers - _TARGET)
+    right = normalized(np.cross([0.0, 1.0, 0.0], backward))
     poses = np.tile(np.eye(4), (len(centers), 1, 1))
     poses[:, :3] = np.stack([right, np.cross(backward, right), backward, centers], axis=-1)
     return poses
@@ -258,18 +264,18 @@ def _focal(size: int) -> float:
     return float(0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X))
 
 
-def _lit(mesh: PosedMesh, normals: np.ndarray, hits: Hits) -> np.ndarray:
+def _lit(mesh: PosedMesh, normals: np.ndarray, hits: Fragments) -> np.ndarray:
     """(H, 3) sRGB values of what is hit."""
-    uv = interpolated(hits.shares, mesh.uv[mesh.uv_faces[hits.faces]])
-    normal = unit(interpolated(hits.shares, normals[mesh.faces[hits.faces]]))
-    light = _AMBIENT + _DIFFUSE * np.maximum(normal @ unit(_TO_LIGHT), 0.0)
+    uv = interpolate(hits.shares, mesh.uv[mesh.uv_faces[hits.faces]])
+    normal = normalized(interpolate(hits.shares, normals[mesh.faces[hits.faces]]))
+    light = _AMBIENT + _DIFFUSE * np.maximum(normal @ normalized(_TO_LIGHT), 0.0)
     return np.minimum(_sampled(mesh.texture, uv) * light[:, None], 1.0)
 
 
 def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """(H, 3) of a texture (S, S, 3) at ``uv`` (H, 2), bilinear between the centres of texels."""
     last = len(texture) - 1
-    column, row = (np.clip(place, 0.0, last) for place in texture_places(uv, len(texture)))
+    column, row = (np.clip(place, 0.0, last) for place in texel_coordinates(uv, len(texture)))
     left, top = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
     right, below = np.minimum(left + 1, last), np.minimum(top + 1, last)
     x, y = (column - left)[:, None], (row - top)[:, None]

@@ -15,10 +15,10 @@ from scipy.ndimage import distance_transform_edt
 
 from dyngs.errors import DyngsError
 from dyngs.human.motion.motion import JOINTS
-from dyngs.human.template.mesh import interpolated, vertex_normals, visible
+from dyngs.human.template.mesh import interpolate, rasterize, vertex_normals
 
 if TYPE_CHECKING:
-    from dyngs.human.template.body import Body
+    from dyngs.human.template.body import BodyTemplate
 
 _PARTS = {
     "eye": ("eye",),
@@ -62,7 +62,7 @@ class Outfit:
     size: float = 1.0
 
 
-def outfit_of(seed: int) -> Outfit:
+def random_outfit(seed: int) -> Outfit:
     """What the person of ``seed`` wears. 0 is the template as it is, painted; all others stand away from it by up to
     4 cm, differ in cut and pattern, and are 0.88 to 1.04 times as tall."""
     palette = _palette(seed)
@@ -83,7 +83,7 @@ def outfit_of(seed: int) -> Outfit:
     )
 
 
-def dressed(body: Body, outfit: Outfit) -> Body:
+def dress_body(body: BodyTemplate, outfit: Outfit) -> BodyTemplate:
     """``body`` with the clothes as part of its surface, smooth; joints, weights and atlas stay."""
     vertices = body.vertices.double().numpy()
     away = _heights(vertices, _shares_of_parts(body), _left_eye(body), outfit)
@@ -91,7 +91,7 @@ def dressed(body: Body, outfit: Outfit) -> Body:
     return replace(body, vertices=torch.from_numpy(moved).to(body.vertices))
 
 
-def texture_of(body: Body, outfit: Outfit, resolution: int = 512) -> np.ndarray:
+def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> np.ndarray:
     """(S, S, 3) sRGB values in [0, 1] of ``outfit``, float64; left and right, front and back differ.
 
     Texels that no triangle covers repeat the nearest that one does, so that interpolation at seams stays on the body.
@@ -104,12 +104,12 @@ def texture_of(body: Body, outfit: Outfit, resolution: int = 512) -> np.ndarray:
     Raises:
         DyngsError: the template has no texture coordinates.
     """
-    uv, uv_faces = atlas_of(body)
-    columns, rows = texture_places(uv, resolution)
-    hits = visible(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], resolution, resolution)
+    uv, uv_faces = texture_coordinates(body)
+    columns, rows = texel_coordinates(uv, resolution)
+    hits = rasterize(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], resolution, resolution)
     around = body.faces.numpy()[hits.faces]
-    points = interpolated(hits.shares, body.vertices.double().numpy()[around])
-    parts = interpolated(hits.shares, _shares_of_parts(body)[around]).argmax(axis=1)
+    points = interpolate(hits.shares, body.vertices.double().numpy()[around])
+    parts = interpolate(hits.shares, _shares_of_parts(body)[around]).argmax(axis=1)
     texture = np.zeros((resolution * resolution, 3))
     texture[hits.index] = _painted(points, np.array(list(_PARTS))[parts], _left_eye(body), outfit)
     is_bare = np.ones(resolution * resolution, dtype=bool)
@@ -119,7 +119,7 @@ def texture_of(body: Body, outfit: Outfit, resolution: int = 512) -> np.ndarray:
     return texture[row * resolution + column]
 
 
-def atlas_of(body: Body) -> tuple[np.ndarray, np.ndarray]:
+def texture_coordinates(body: BodyTemplate) -> tuple[np.ndarray, np.ndarray]:
     """Texture coordinates (U, 2), float64, and the triangles (T, 3) into them.
 
     Raises:
@@ -130,17 +130,17 @@ def atlas_of(body: Body) -> tuple[np.ndarray, np.ndarray]:
     return body.uv.double().numpy(), body.uv_faces.numpy()
 
 
-def texture_places(uv: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
+def texel_coordinates(uv: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
     """Column and row (U,) of a texture, whole numbers at the centres of texels, of ``uv`` (U, 2)."""
     return uv[:, 0] * resolution - 0.5, (1.0 - uv[:, 1]) * resolution - 0.5
 
 
-def _left_eye(body: Body) -> np.ndarray:
+def _left_eye(body: BodyTemplate) -> np.ndarray:
     """(3,)"""
     return body.joints[JOINTS.index("left_eye")].double().numpy()
 
 
-def _shares_of_parts(body: Body) -> np.ndarray:
+def _shares_of_parts(body: BodyTemplate) -> np.ndarray:
     """(M, 8) how much every vertex belongs to each of ``_PARTS``; rows sum to 1."""
     bases = [name.removeprefix("left_").removeprefix("right_").rstrip("123") for name in JOINTS]
     member = np.array([[base in names for names in _PARTS.values()] for base in bases], dtype=np.float64)

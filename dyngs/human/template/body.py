@@ -12,14 +12,20 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.human.pose.skinning import apply, blended, check_tree, joint_transforms, rotations
+from dyngs.human.pose.skinning import (
+    apply_transforms,
+    axis_angle_to_matrix,
+    blend_transforms,
+    check_tree,
+    joint_transforms,
+)
 
 DEFAULT_FILE = Path(__file__).parent / "files" / "anny_smplx55.npz"
 """The free template that comes with the package."""
 
 
 @dataclass(frozen=True)
-class Body:
+class BodyTemplate:
     """A body template: rest mesh, shape space, joints and skinning weights; float32 tensors, metres, y up, facing +z,
     +x the person's left.
 
@@ -81,21 +87,21 @@ class Body:
         """E, 0 without expressions."""
         return 0 if self.expression_dirs is None else self.expression_dirs.shape[-1]
 
-    def to(self, dtype: torch.dtype) -> Body:
+    def to(self, dtype: torch.dtype) -> BodyTemplate:
         """The same body with its floating-point numbers in ``dtype``."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         floats = {k: x.to(dtype) for k, x in values.items() if isinstance(x, Tensor) and x.is_floating_point()}
         return replace(self, **floats)
 
 
-def default_body() -> Body:
+def default_template() -> BodyTemplate:
     """The free template that comes with the package: an adult of 1.76 m in T-pose, 55 joints in the order of SMPL-X."""
-    from dyngs.human.template.body_files import load_body
+    from dyngs.human.template.body_reader import read_body
 
-    return load_body(DEFAULT_FILE)
+    return read_body(DEFAULT_FILE)
 
 
-def shaped(body: Body, betas: Tensor | None, expression: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def apply_shape(body: BodyTemplate, betas: Tensor | None, expression: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Vertices (..., M, 3) and joints (..., J, 3) at rest of a person of this shape; differentiable.
 
     v = v_mean + S beta + E psi, and the joints alike, as they are linear in the vertices.
@@ -129,7 +135,7 @@ def shaped(body: Body, betas: Tensor | None, expression: Tensor | None = None) -
 
 
 def posed_vertices(
-    body: Body,
+    body: BodyTemplate,
     poses: Tensor,
     trans: Tensor,
     betas: Tensor | None = None,
@@ -155,12 +161,12 @@ def posed_vertices(
         raise DyngsError(
             f"poses must be (frames, {len(body.joints)}, 3) for the {body.name} body, got {tuple(poses.shape)}"
         )
-    vertices, joints = shaped(body, betas, expression)
-    turned = rotations(poses)
+    vertices, joints = apply_shape(body, betas, expression)
+    turned = axis_angle_to_matrix(poses)
     if body.pose_dirs is not None:
         features = (turned[:, 1:] - torch.eye(3, dtype=poses.dtype, device=poses.device)).flatten(1)
         vertices = vertices + (features @ body.pose_dirs).unflatten(-1, (-1, 3))
-    posed = apply(blended(body.weights, joint_transforms(joints, body.parents, turned)), vertices)
+    posed = apply_transforms(blend_transforms(body.weights, joint_transforms(joints, body.parents, turned)), vertices)
     if scale is not None:
         posed = scale[:, None, None] * posed
     return posed + trans[:, None]

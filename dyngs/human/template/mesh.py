@@ -11,7 +11,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Hits:
+class Fragments:
     """Which triangle is seen where; H grid points that see one, none of them twice.
 
     Attributes:
@@ -25,7 +25,7 @@ class Hits:
     shares: np.ndarray
 
 
-def visible(corners: np.ndarray, width: int, height: int) -> Hits:
+def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
     """The nearest triangle at every grid point, whole numbers of column and row, that sees one.
 
     Args:
@@ -56,7 +56,7 @@ def visible(corners: np.ndarray, width: int, height: int) -> Hits:
     first = np.flatnonzero(nearness == nearest[index])
     index, chosen = np.unique(index[first], return_index=True)
     first = first[chosen]
-    return Hits(index, owner[first], (shares[:, first] / nearness[first]).T)
+    return Fragments(index, owner[first], (shares[:, first] / nearness[first]).T)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -64,15 +64,15 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     a, b, c = vertices[faces].transpose(1, 0, 2)
     flat = np.repeat(np.cross(b - a, c - a), 3, axis=0)
     total = [np.bincount(faces.ravel(), weights=flat[:, k], minlength=len(vertices)) for k in range(3)]
-    return unit(np.stack(total, axis=-1))
+    return normalized(np.stack(total, axis=-1))
 
 
-def interpolated(shares: np.ndarray, values: np.ndarray) -> np.ndarray:
+def interpolate(shares: np.ndarray, values: np.ndarray) -> np.ndarray:
     """(H, D) values at hits between their corners' (H, 3, D)."""
     return np.einsum("hk,hkd->hd", shares, values)
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
+def normalized(vectors: np.ndarray) -> np.ndarray:
     """(..., 3) of length 1; zero stays zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 

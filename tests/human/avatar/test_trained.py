@@ -13,31 +13,31 @@ from dyngs.camera import Cameras
 from dyngs.config import HumanModel
 from dyngs.deform.learned import LearnedTensors
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.avatar import Skeleton, first_gaussians
+from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_pose
 from dyngs.human.avatar.model import HumanScene, Subject
-from dyngs.human.avatar.refine import Fit, corrected_clip, corrected_posing
+from dyngs.human.avatar.posing import Skeleton, texel_gaussians
 from dyngs.human.avatar.trained import AvatarScene, trained_avatar
-from dyngs.human.motion.clips import Clip, Footage
-from dyngs.human.pose.skinning import rotations
-from dyngs.human.template.body import default_body
-from dyngs.human.template.uv import texels_of
+from dyngs.human.motion.clip import CapturedMotion, MotionClip
+from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.human.template.atlas import atlas_texels
+from dyngs.human.template.body import default_template
 from dyngs.rendering import render
 from dyngs.static.rates import Rates
 
 
-def random_clip(frames: int, seed: int = 0) -> Clip:
+def random_clip(frames: int, seed: int = 0) -> MotionClip:
     generator = torch.Generator().manual_seed(seed)
     times = torch.linspace(0, 1, frames, dtype=torch.float64)
     trans = torch.randn(frames, 3, generator=generator)
-    return Clip(times, 0.3 * torch.randn(frames, 55, 3, generator=generator), 0.1 * trans, torch.ones(frames))
+    return MotionClip(times, 0.3 * torch.randn(frames, 55, 3, generator=generator), 0.1 * trans, torch.ones(frames))
 
 
 def stirred() -> tuple[HumanScene, Gaussians, AvatarScene]:
     """A model whose corrections are not zero, its Gaussians, and what is stored of it."""
-    body = default_body()
-    gaussians, anchors = first_gaussians(texels_of(body, 24), (0.0,), 0)
+    body = default_template()
+    gaussians, anchors = texel_gaussians(atlas_texels(body, 24), (0.0,), 0)
     gaussians = gaussians.replace(sh=torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(1)))
-    subject = Subject(Skeleton(body.joints, body.parents), anchors, Footage(random_clip(4), (0, 1, 2, 3)))
+    subject = Subject(Skeleton(body.joints, body.parents), anchors, CapturedMotion(random_clip(4), (0, 1, 2, 3)))
     model = HumanScene(HumanModel(sh_degree=0), subject, Rates(10))
     generator = torch.Generator().manual_seed(2)
     for x in model.corrections.learned.values().values():
@@ -67,8 +67,8 @@ def test_baked_corrections_are_those_of_training() -> None:
     model, _, scene = stirred()
     clip = model.subject.footage.clip
     for row in range(len(clip)):
-        posing = corrected_posing(model.corrections.learned, clip, row)
-        torch.testing.assert_close(rotations(scene.clip.poses[row]), posing.rotations, rtol=0, atol=1e-5)
+        posing = corrected_pose(model.corrections.learned, clip, row)
+        torch.testing.assert_close(axis_angle_to_matrix(scene.clip.poses[row]), posing.rotations, rtol=0, atol=1e-5)
         torch.testing.assert_close(scene.clip.trans[row], posing.trans)
         torch.testing.assert_close(scene.clip.scale[row], posing.scale)
 
@@ -76,9 +76,9 @@ def test_baked_corrections_are_those_of_training() -> None:
 def test_other_clips_get_what_holds_for_all_poses() -> None:
     turns = torch.zeros(2, 3)
     turns[1, 0] = 0.5
-    clip = Clip(torch.zeros(1, dtype=torch.float64), torch.zeros(1, 2, 3), torch.ones(1, 3), torch.ones(1))
+    clip = MotionClip(torch.zeros(1, dtype=torch.float64), torch.zeros(1, 2, 3), torch.ones(1, 3), torch.ones(1))
     clip.poses[0, 1, 1] = math.pi / 2
-    found = corrected_clip(Fit(turns, math.log(2)), clip)
+    found = corrected_clip(SharedCorrection(turns, math.log(2)), clip)
     wanted = (Rotation.from_rotvec([0, math.pi / 2, 0]) * Rotation.from_rotvec([0.5, 0, 0])).as_rotvec()
     assert found.poses[0, 1].tolist() == pytest.approx(wanted.tolist(), abs=1e-6)
     assert float(found.scale[0]) == pytest.approx(2)

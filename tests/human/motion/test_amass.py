@@ -14,7 +14,7 @@ from motion_files import random_motion, slow_vertices, tiny_body
 
 from dyngs.errors import DyngsError
 from dyngs.human.motion.amass import read_amass
-from dyngs.human.motion.motion import JOINTS, Motion, Up
+from dyngs.human.motion.motion import JOINTS, Motion, UpAxis
 
 SHARED = Path(__file__).parents[3] / "../shared/data"
 MODELS = {24: "smpl", 52: "smplh", 55: "smplx"}
@@ -36,7 +36,7 @@ def numbers(count: int = 55, **changes: Any) -> dict[str, object]:
     }
 
 
-def read(path: Path, arrays: dict[str, object], count: int = 55, up: Up = "auto", shapes: int = 0) -> Motion:
+def read(path: Path, arrays: dict[str, object], count: int = 55, up: UpAxis = "auto", shapes: int = 0) -> Motion:
     given = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
     np.savez(path / "x.npz", **given)  # pyright: ignore[reportArgumentType]
     return read_amass(path / "x.npz", tiny_body(count, shapes), up)
@@ -89,7 +89,7 @@ def test_turning_heeds_the_scale(tmp_path: Path, scale: float) -> None:
         ({"up_axis": "z"}, "y", False),
     ],
 )
-def test_which_files_are_turned(tmp_path: Path, changes: dict[str, Any], up: Up, is_turned: bool) -> None:
+def test_which_files_are_turned(tmp_path: Path, changes: dict[str, Any], up: UpAxis, is_turned: bool) -> None:
     """AMASS's are; those with a scale, which fits of our own write, are not; the file's word counts more, the caller's
     most."""
     arrays = numbers(**changes)

@@ -19,14 +19,14 @@ from dyngs.human.motion.motion import (
     MAX_JOINT_POSES,
     ROWS,
     Motion,
-    chunks,
+    frame_chunks,
     read_motion,
-    require_moderate,
-    require_rate,
+    require_frame_count,
+    require_frame_rate,
     sample_times,
     save_motion,
 )
-from dyngs.human.template.body import default_body, posed_vertices
+from dyngs.human.template.body import default_template, posed_vertices
 
 BODY = tiny_body()
 
@@ -97,7 +97,7 @@ def test_the_body_that_comes_with_dyngs_is_the_default(tmp_path: Path) -> None:
     """Its feet come to the floor, its pelvis to the height of its legs."""
     own = skeleton()
     motion = read_motion(write_bvh(tmp_path / "x.bvh", own, np.tile(np.eye(3), (1, 55, 1, 1)), own.rest[:1]))
-    body = default_body()
+    body = default_template()
     lowest = posed_vertices(body, motion.poses, motion.trans)[..., 1].min()
     assert float(lowest) == pytest.approx(0, abs=1e-5)
     assert 0.8 < float(body.joints[0, 1] + motion.trans[0, 1]) < 1.1
@@ -178,12 +178,12 @@ def test_rates_that_make_no_sense(fps: float) -> None:
 
 def test_motions_that_fill_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of few joints too, as the body has 55."""
-    require_moderate(Path("x.glb"), MAX_JOINT_POSES // 100, 100)
+    require_frame_count(Path("x.glb"), MAX_JOINT_POSES // 100, 100)
     for frames, joints in ((MAX_JOINT_POSES // 100 + 1, 100), (MAX_JOINT_POSES // 55 + 1, 1), (float("inf"), 1)):
         with pytest.raises(DyngsError, match=r"x\.glb: .* too many, 5,000,000 .* or set .* DYNGS_LIMITS="):
-            require_moderate(Path("x.glb"), frames, joints)
+            require_frame_count(Path("x.glb"), frames, joints)
     monkeypatch.setenv("DYNGS_LIMITS", "2")
-    require_moderate(Path("x.glb"), 2 * MAX_JOINT_POSES // 100, 100)
+    require_frame_count(Path("x.glb"), 2 * MAX_JOINT_POSES // 100, 100)
 
 
 def test_resampling_has_the_same_limit() -> None:
@@ -195,13 +195,13 @@ def test_resampling_has_the_same_limit() -> None:
 @pytest.mark.parametrize("fps", [0.0, 1e-310, 1e-9, 1e6, float("inf"), float("nan")])
 def test_rates_of_no_motion(fps: float) -> None:
     with pytest.raises(DyngsError, match=r"x\.bvh: .* frames per second are not those of a motion"):
-        require_rate(Path("x.bvh"), fps)
+        require_frame_rate(Path("x.bvh"), fps)
 
 
 def test_long_motions_are_worked_on_in_parts() -> None:
     """As if they were not."""
     motion = random_motion(2500)
-    whole, parts = motion.resampled(24.0), chunks(2500)
+    whole, parts = motion.resampled(24.0), frame_chunks(2500)
     assert [(part.start, part.stop) for part in parts] == [(0, 1024), (1024, 2048), (2048, 2500)]
     expected = motion._between(sample_times(2499, 30.0, 24.0), 24.0)
     for name in ("poses", "trans", "scale"):

@@ -24,12 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
 from dyngs.human.motion.motion import JOINTS, Motion
-from dyngs.human.motion.retarget import (
-    SourceMotion,
-    least_rotation,
-    on_floor,
-    retarget,
-)
+from dyngs.human.motion.retarget import SkeletonMotion, least_rotation, place_on_floor, retarget
 
 MIDDLE = tuple(name for name in JOINTS if "_" not in name)
 AXES = [
@@ -40,21 +35,21 @@ AXES = [
 TURNS = [axes for axes in AXES if np.linalg.det(axes) > 0]
 
 
-def driven(own: Skeleton, poses: np.ndarray, root: np.ndarray) -> SourceMotion:
+def driven(own: Skeleton, poses: np.ndarray, root: np.ndarray) -> SkeletonMotion:
     """The motion of a skeleton by local rotations (F, S, 3), its root at (F, 3)."""
     rotations = world_rotations(poses, own.parents)
     positions = np.empty((*poses.shape[:2], 3))
     for i, parent in enumerate(own.parents):
         bone = own.rest[i] - own.rest[parent]
         positions[:, i] = root if parent < 0 else positions[:, parent] + rotations[:, parent] @ bone
-    return SourceMotion(Path("x.bvh"), own.names, own.rest, rotations, positions, 30.0, world_is_y_up=False)
+    return SkeletonMotion(Path("x.bvh"), own.names, own.rest, rotations, positions, 30.0, world_is_y_up=False)
 
 
-def at_rest(own: Skeleton, frames: int = 1) -> SourceMotion:
+def at_rest(own: Skeleton, frames: int = 1) -> SkeletonMotion:
     return driven(own, np.zeros((frames, len(own.names), 3)), np.tile(own.rest[0], (frames, 1)))
 
 
-def of_motion(motion: Motion, own: Skeleton) -> SourceMotion:
+def of_motion(motion: Motion, own: Skeleton) -> SkeletonMotion:
     """The same rotations on a skeleton of our 55 joints."""
     return driven(own, motion.poses.double().numpy(), motion.trans.double().numpy() + own.rest[0])
 
@@ -152,7 +147,7 @@ def test_rotations_are_kept_whatever_the_axes_and_the_unit(seed: int, turn: np.n
         ),
         body,
     )
-    close(found, on_floor(original, body))
+    close(found, place_on_floor(original, body))
 
 
 @pytest.mark.parametrize("turn", TURNS[::5])
@@ -160,7 +155,7 @@ def test_in_a_world_that_is_y_up_the_axes_of_the_rest_pose_do_not_matter(turn: n
     original, body = random_motion(), tiny_body()
     source = of_motion(original, skeleton())
     source = replace(source, rest=source.rest @ turn.T, rotations=source.rotations @ turn.T, world_is_y_up=True)
-    close(retarget(source, body), on_floor(original, body))
+    close(retarget(source, body), place_on_floor(original, body))
 
 
 def test_a_rest_pose_that_faces_anywhere_faces_forward() -> None:
@@ -214,7 +209,7 @@ def test_bodies_with_fewer_joints(count: int) -> None:
     """Rotations of the joints that they have are kept."""
     original, body = random_motion(angle=0.6), tiny_body(count)
     motion = retarget(of_motion(original, skeleton()), body)
-    close(motion, on_floor(original, body))
+    close(motion, place_on_floor(original, body))
     assert slow_vertices(body, motion)[..., 1].min() == pytest.approx(0, abs=1e-6)
 
 
@@ -225,7 +220,7 @@ def test_bodies_with_fewer_joints(count: int) -> None:
 def test_the_lowest_vertex_comes_to_the_floor(count: int) -> None:
     body = tiny_body(count)
     motion = replace(random_motion(), scale=torch.tensor([0.5, 1.0, 1.5, 2.0]))
-    landed = on_floor(motion, body)
+    landed = place_on_floor(motion, body)
     assert slow_vertices(body, landed)[..., 1].min() == pytest.approx(0, abs=1e-6)
     assert torch.equal(landed.trans[:, ::2], motion.trans[:, ::2])
     rise = pelvis_path(body, landed) - pelvis_path(body, motion)

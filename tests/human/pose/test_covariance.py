@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.human.pose.covariance import moved_axes, rotations_of
+from dyngs.human.pose.covariance import rotations_of, transform_covariance
 from dyngs.ops.reference import rotation_matrices
 
 
@@ -41,14 +41,14 @@ def test_covariances_are_moved_exactly(seed: int, shear: float, spread: float) -
     size = linear.norm(dim=(1, 2)).square() * still.norm(dim=(1, 2))
     thinnest = 4 * math.exp(-32)
     for dtype in (torch.float64, torch.float32):
-        found = moved_axes(linear.to(dtype), quats.to(dtype), log_scales.to(dtype))
+        found = transform_covariance(linear.to(dtype), quats.to(dtype), log_scales.to(dtype))
         error = relative_error(covariances(*(x.double() for x in found)), wanted, size)
         assert error < 100 * torch.finfo(dtype).eps + thinnest
 
 
 def test_nothing_moves_under_the_identity() -> None:
     quats, log_scales = normal(20, 4), normal(20, 3, seed=1)
-    found = moved_axes(torch.eye(3, dtype=torch.float64).expand(20, 3, 3), quats, log_scales)
+    found = transform_covariance(torch.eye(3, dtype=torch.float64).expand(20, 3, 3), quats, log_scales)
     torch.testing.assert_close(covariances(*found), covariances(quats, log_scales))
 
 
@@ -61,7 +61,7 @@ def test_gradients_are_those_of_the_covariance() -> None:
         return (weight * (linear @ covariances(quats, log_scales) @ linear.mT)).sum()
 
     def through_axes(linear: Tensor, quats: Tensor, log_scales: Tensor) -> Tensor:
-        symmetric = covariances(*moved_axes(linear, quats, log_scales))
+        symmetric = covariances(*transform_covariance(linear, quats, log_scales))
         return (weight * symmetric).sum()
 
     wanted = torch.autograd.grad(direct(*given), given)
@@ -74,7 +74,7 @@ def test_gradients_stay_finite_for_discs_balls_and_needles(log_scales: tuple[flo
     linear = rotations_of(torch.randn(5, 4, generator=torch.Generator().manual_seed(2)))
     given = [linear, torch.tensor([[1.0, 0, 0, 0]]).repeat(5, 1), torch.tensor([log_scales]).repeat(5, 1)]
     given = [x.requires_grad_() for x in given]
-    quats, moved = moved_axes(*given)
+    quats, moved = transform_covariance(*given)
     (quats.square() * torch.arange(4)).sum().backward()
     assert all(bool(x.grad is not None and x.grad.isfinite().all()) for x in given)
     assert bool(moved.isfinite().all())
@@ -83,13 +83,13 @@ def test_gradients_stay_finite_for_discs_balls_and_needles(log_scales: tuple[flo
 def test_a_reflection_gives_rotations_all_the_same() -> None:
     linear = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)).expand(4, 3, 3)
     quats, log_scales = normal(4, 4), normal(4, 3, seed=3)
-    found = moved_axes(linear, quats, log_scales)
+    found = transform_covariance(linear, quats, log_scales)
     wanted = linear @ covariances(quats, log_scales) @ linear.mT
     torch.testing.assert_close(covariances(*found), wanted)
 
 
 def test_no_gaussians_and_zero_quaternions() -> None:
-    quats, log_scales = moved_axes(torch.zeros(0, 3, 3), torch.zeros(0, 4), torch.zeros(0, 3))
+    quats, log_scales = transform_covariance(torch.zeros(0, 3, 3), torch.zeros(0, 4), torch.zeros(0, 3))
     assert quats.shape == (0, 4)
     assert log_scales.shape == (0, 3)
     torch.testing.assert_close(rotations_of(torch.zeros(1, 4)), torch.eye(3)[None])

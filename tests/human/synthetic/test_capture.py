@@ -33,21 +33,21 @@ from dyngs.human.synthetic.capture import (
     walk,
     write_human_capture,
 )
-from dyngs.human.synthetic.clothes import dressed, outfit_of, texture_of
-from dyngs.human.template.body import Body, default_body, posed_vertices
+from dyngs.human.synthetic.clothes import dress_body, paint_texture, random_outfit
+from dyngs.human.template.body import BodyTemplate, default_template, posed_vertices
 
 TINY = HumanOptions(size=24, num_frames=2, num_new=2, num_cameras=3, num_test=1, samples=1)
 LIGHT = np.array([0.35, 0.75, 0.56]) / np.linalg.norm([0.35, 0.75, 0.56])
 
 
 @cache
-def body() -> Body:
-    return default_body()
+def body() -> BodyTemplate:
+    return default_template()
 
 
 @cache
 def texture() -> np.ndarray:
-    return texture_of(body(), outfit_of(0))
+    return paint_texture(body(), random_outfit(0))
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +216,7 @@ def test_what_is_behind_the_camera_is_refused() -> None:
 
 
 @pytest.mark.parametrize("clip", [walk, squat])
-def test_the_person_stands_on_the_floor_within_sight(clip: Callable[[Body, int], Motion]) -> None:
+def test_the_person_stands_on_the_floor_within_sight(clip: Callable[[BodyTemplate, int], Motion]) -> None:
     """In every frame the lowest vertex is at y = 0, and all are inside a cylinder that the cameras see."""
     motion = clip(body(), 5)
     for frame in range(5):
@@ -273,11 +273,11 @@ def test_another_seed_is_another_person_of_another_size(root: Path, tmp_path: Pa
     """The parameters say how tall; the silhouette is that of the dressed template."""
     other = write_human_capture(tmp_path / "other", replace(TINY, seed=3))
     assert files(other).keys() == files(root).keys()
-    outfit = outfit_of(3)
+    outfit = random_outfit(3)
     motion = read_motion(other / "body_train.npz", body())
     torch.testing.assert_close(motion.scale, torch.full((2,), outfit.size))
     torch.testing.assert_close(motion.trans, outfit.size * walk(body(), 2).trans)
-    exact = dressed(body(), outfit).to(torch.float64)
+    exact = dress_body(body(), outfit).to(torch.float64)
     vertices = posed_vertices(exact, motion.poses.double(), motion.trans.double(), scale=motion.scale.double())
     for view in captured(other).splits["train"][:3]:
         is_person = pixels(view.image_path)[..., 3] == 255

@@ -11,19 +11,19 @@ import torch
 
 from dyngs.errors import DyngsError
 from dyngs.human.motion.motion import JOINTS
-from dyngs.human.synthetic.clothes import Outfit, dressed, outfit_of, texture_of
-from dyngs.human.template.body import Body, default_body
+from dyngs.human.synthetic.clothes import Outfit, dress_body, paint_texture, random_outfit
+from dyngs.human.template.body import BodyTemplate, default_template
 from dyngs.human.template.mesh import vertex_normals
 
 
 @cache
-def body() -> Body:
-    return default_body()
+def body() -> BodyTemplate:
+    return default_template()
 
 
 @cache
 def texture() -> np.ndarray:
-    return texture_of(body(), outfit_of(0))
+    return paint_texture(body(), random_outfit(0))
 
 
 def test_the_texture_differs_by_seed_side_and_front() -> None:
@@ -44,8 +44,8 @@ def test_the_texture_differs_by_seed_side_and_front() -> None:
     chest = (np.abs(vertices[:, 0]) < 0.1) & (np.abs(vertices[:, 1] - 0.35) < 0.1)
     front, back = (colors[chest & (sign * (vertices[:, 2] + 0.02) > 0.02)].mean(0) for sign in (1, -1))
     assert np.abs(front - back).max() > 0.1
-    other = texture_of(body(), outfit_of(1), 64)
-    assert np.abs(other - texture_of(body(), outfit_of(0), 64)).mean() > 0.05
+    other = paint_texture(body(), random_outfit(1), 64)
+    assert np.abs(other - paint_texture(body(), random_outfit(0), 64)).mean() > 0.05
     assert (other >= 0).all()
     assert (other <= 1).all()
 
@@ -53,38 +53,40 @@ def test_the_texture_differs_by_seed_side_and_front() -> None:
 def test_texels_beside_the_atlas_repeat_the_nearest_one() -> None:
     """No texel is left black, however coarse the texture; the darkest cloth is 0.08."""
     for resolution in (1, 7, 64):
-        assert texture_of(body(), outfit_of(0), resolution).shape == (resolution, resolution, 3)
-        assert texture_of(body(), outfit_of(0), resolution).max(-1).min() >= 0.08
+        assert paint_texture(body(), random_outfit(0), resolution).shape == (resolution, resolution, 3)
+        assert paint_texture(body(), random_outfit(0), resolution).max(-1).min() >= 0.08
 
 
 def test_a_body_without_an_atlas_is_refused() -> None:
     with pytest.raises(DyngsError, match="no texture coordinates"):
-        texture_of(replace(body(), uv=None, uv_faces=None), outfit_of(0))
+        paint_texture(replace(body(), uv=None, uv_faces=None), random_outfit(0))
 
 
 def test_patterns_are_as_wide_and_as_long_as_the_outfit_says() -> None:
     """Twice the pitch halves the changes of colour over the trousers; shorts and short sleeves show skin."""
-    palette = outfit_of(0).palette
-    fine, coarse = (texture_of(body(), Outfit(palette, pitch=pitch), 128) for pitch in (1.0, 2.0))
+    palette = random_outfit(0).palette
+    fine, coarse = (paint_texture(body(), Outfit(palette, pitch=pitch), 128) for pitch in (1.0, 2.0))
     changes = [(np.abs(np.diff(x, axis=0)).max(-1) > 0.05).sum() for x in (fine, coarse)]
     assert 0.4 < changes[1] / changes[0] < 0.9, "outlines of garments stay"
     skin = [
-        (texture_of(body(), Outfit(palette, long_sleeves=long, long_legs=long), 128) == palette["skin"]).all(-1).sum()
+        (paint_texture(body(), Outfit(palette, long_sleeves=long, long_legs=long), 128) == palette["skin"])
+        .all(-1)
+        .sum()
         for long in (True, False)
     ]
     assert skin[0] + 300 < skin[1]
 
 
 def test_the_first_person_is_the_template() -> None:
-    assert torch.equal(dressed(body(), outfit_of(0)).vertices, body().vertices)
-    assert outfit_of(0).size == 1
+    assert torch.equal(dress_body(body(), random_outfit(0)).vertices, body().vertices)
+    assert random_outfit(0).size == 1
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_clothes_stand_away_from_the_skin_by_up_to_four_centimetres(seed: int) -> None:
     """Along the normals, nowhere inwards; hands and the face stay; joints, weights and atlas too."""
-    outfit = outfit_of(seed)
-    clothed, skin = dressed(body(), outfit), body().vertices.double()
+    outfit = random_outfit(seed)
+    clothed, skin = dress_body(body(), outfit), body().vertices.double()
     moved = (clothed.vertices.double() - skin).numpy()
     height = (moved * vertex_normals(skin.numpy(), body().faces.numpy())).sum(1)
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.abs(height), atol=1e-6)  # float32 vertices
@@ -98,5 +100,5 @@ def test_clothes_stand_away_from_the_skin_by_up_to_four_centimetres(seed: int) -
 
 
 def test_a_seed_always_means_the_same() -> None:
-    a, b, other = outfit_of(7), outfit_of(7), outfit_of(8)
+    a, b, other = random_outfit(7), random_outfit(7), random_outfit(8)
     assert (a.pitch, a.shirt, a.size) == (b.pitch, b.shirt, b.size) != (other.pitch, other.shirt, other.size)

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.human.template.body import Body, default_body, posed_vertices, shaped
+from dyngs.human.template.body import BodyTemplate, apply_shape, default_template, posed_vertices
 
 LEFT_ELBOW, LEFT_WRIST, LEFT_FINGERS = 18, 20, range(25, 40)
 SIDES = {1: 2, 4: 5, 7: 8, 10: 11, 13: 14, 16: 17, 18: 19, 20: 21, 23: 24, **{i: i + 15 for i in range(25, 40)}}
@@ -22,18 +22,18 @@ SIDES = {1: 2, 4: 5, 7: 8, 10: 11, 13: 14, 16: 17, 18: 19, 20: 21, 23: 24, **{i:
 
 
 @pytest.fixture(scope="module")
-def template() -> Body:
-    return default_body()
+def template() -> BodyTemplate:
+    return default_template()
 
 
 def normal(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def tiny(shapes: int = 3, expressions: int = 2) -> Body:
+def tiny(shapes: int = 3, expressions: int = 2) -> BodyTemplate:
     """4 joints in a fork, 6 vertices, all that SMPL-X has; float64."""
     j, m = 4, 6
-    return Body(
+    return BodyTemplate(
         name="tiny",
         vertices=normal(m, 3),
         faces=torch.tensor([[0, 1, 2], [3, 4, 5]]),
@@ -57,7 +57,7 @@ def about_z(angle: float) -> Tensor:
 # --- the free template ------------------------------------------------------------------------------------------------
 
 
-def test_the_template_is_a_person_of_normal_size_who_faces_forward(template: Body) -> None:
+def test_the_template_is_a_person_of_normal_size_who_faces_forward(template: BodyTemplate) -> None:
     assert template.name == "anny"
     assert (len(template.joints), len(template.vertices), len(template.faces)) == (55, 13718, 27420)
     height = float(template.vertices[:, 1].max() - template.vertices[:, 1].min())
@@ -69,7 +69,7 @@ def test_the_template_is_a_person_of_normal_size_who_faces_forward(template: Bod
     assert template.num_shapes == template.num_expressions == 0
 
 
-def test_its_surface_is_closed_and_faces_outward(template: Body) -> None:
+def test_its_surface_is_closed_and_faces_outward(template: BodyTemplate) -> None:
     """By the divergence theorem the volume is positive: about that of 75 kg."""
     a, b, c = template.vertices.double()[template.faces].unbind(1)
     volume = float((a * torch.linalg.cross(b, c)).sum() / 6)
@@ -80,7 +80,7 @@ def test_its_surface_is_closed_and_faces_outward(template: Body) -> None:
     assert len(forward.unique()) == len(forward)
 
 
-def test_its_texture_coordinates_belong_to_the_corners(template: Body) -> None:
+def test_its_texture_coordinates_belong_to_the_corners(template: BodyTemplate) -> None:
     assert template.uv is not None
     assert template.uv_faces is not None
     assert template.uv.min() >= 0
@@ -90,12 +90,12 @@ def test_its_texture_coordinates_belong_to_the_corners(template: Body) -> None:
     assert len(pairs) == len(template.uv), "each texture coordinate belongs to one vertex"
 
 
-def test_rest_is_the_template(template: Body) -> None:
+def test_rest_is_the_template(template: BodyTemplate) -> None:
     found = posed_vertices(template, torch.zeros(2, 55, 3), torch.zeros(2, 3))
     torch.testing.assert_close(found, template.vertices.expand(2, -1, -1), rtol=0, atol=2e-7)  # one bit of 1.0 m
 
 
-def test_an_elbow_bent_by_90_degrees_lifts_the_forearm(template: Body) -> None:
+def test_an_elbow_bent_by_90_degrees_lifts_the_forearm(template: BodyTemplate) -> None:
     """The left arm lies along +x; about +z it goes from +x to +y. What follows only the hand turns about the elbow."""
     poses = torch.zeros(1, 55, 3)
     poses[0, LEFT_ELBOW] = about_z(math.pi / 2)
@@ -111,7 +111,7 @@ def test_an_elbow_bent_by_90_degrees_lifts_the_forearm(template: Body) -> None:
     torch.testing.assert_close(found[still], template.vertices[still], rtol=0, atol=2e-7)
 
 
-def test_the_mirrored_pose_is_the_mirrored_body(template: Body) -> None:
+def test_the_mirrored_pose_is_the_mirrored_body(template: BodyTemplate) -> None:
     """Left and right changed, y and z of the axes reversed. The template is symmetric to a fraction of a millimetre."""
     poses = 0.3 * normal(1, 55, 3).float()
     mirrored = poses * torch.tensor([1.0, -1.0, -1.0])
@@ -126,7 +126,7 @@ def test_the_mirrored_pose_is_the_mirrored_body(template: Body) -> None:
     assert float(gaps.max()) < 1e-2
 
 
-def test_the_root_turns_all_about_the_pelvis_before_scale_and_shift(template: Body) -> None:
+def test_the_root_turns_all_about_the_pelvis_before_scale_and_shift(template: BodyTemplate) -> None:
     poses = torch.zeros(1, 55, 3)
     poses[0, 0] = about_z(math.pi / 2)
     trans = torch.tensor([[1.0, 2.0, 3.0]])
@@ -141,7 +141,7 @@ def test_the_root_turns_all_about_the_pelvis_before_scale_and_shift(template: Bo
 
 def test_shape_moves_vertices_and_joints_linearly() -> None:
     body, betas, expression = tiny(), torch.tensor([0.5, -1, 2]).double(), torch.tensor([3.0, -0.25]).double()
-    vertices, joints = shaped(body, betas, expression)
+    vertices, joints = apply_shape(body, betas, expression)
     expected, expected_joints = body.vertices.clone(), body.joints.clone()
     for amounts, dirs, joint_dirs in (
         (betas, body.shape_dirs, body.joint_shape_dirs),
@@ -159,29 +159,29 @@ def test_shape_moves_vertices_and_joints_linearly() -> None:
 def test_parameters_not_given_are_zero() -> None:
     body = tiny()
     one = torch.tensor([0.7]).double()
-    torch.testing.assert_close(shaped(body, one), shaped(body, torch.tensor([0.7, 0, 0]).double()))
-    assert shaped(body, None) == (body.vertices, body.joints)
-    assert torch.equal(shaped(body, one[:0])[0], body.vertices)
+    torch.testing.assert_close(apply_shape(body, one), apply_shape(body, torch.tensor([0.7, 0, 0]).double()))
+    assert apply_shape(body, None) == (body.vertices, body.joints)
+    assert torch.equal(apply_shape(body, one[:0])[0], body.vertices)
 
 
-def test_zeros_that_the_body_has_no_use_for_are_fine(template: Body) -> None:
+def test_zeros_that_the_body_has_no_use_for_are_fine(template: BodyTemplate) -> None:
     """Motion files come with 10 or 16 of them."""
-    assert torch.equal(shaped(template, torch.zeros(10))[0], template.vertices)
+    assert torch.equal(apply_shape(template, torch.zeros(10))[0], template.vertices)
     found, expected = (
-        shaped(tiny(), torch.tensor([1.0, 2, 3, 0, 0]).double()),
-        shaped(tiny(), torch.tensor([1.0, 2, 3]).double()),
+        apply_shape(tiny(), torch.tensor([1.0, 2, 3, 0, 0]).double()),
+        apply_shape(tiny(), torch.tensor([1.0, 2, 3]).double()),
     )
     torch.testing.assert_close(found, expected)
 
 
-def test_parameters_that_the_body_lacks_are_refused(template: Body) -> None:
+def test_parameters_that_the_body_lacks_are_refused(template: BodyTemplate) -> None:
     with pytest.raises(DyngsError, match=r"^betas: 2 numbers given, but the anny body has none; .*set them to 0$"):
-        shaped(template, torch.tensor([0.0, 1.0]))
+        apply_shape(template, torch.tensor([0.0, 1.0]))
     with pytest.raises(DyngsError, match=r"^expression: 3 numbers given, but the tiny body has 2;"):
-        shaped(tiny(), None, torch.ones(3).double())
+        apply_shape(tiny(), None, torch.ones(3).double())
 
 
-def test_poses_of_another_body_are_refused(template: Body) -> None:
+def test_poses_of_another_body_are_refused(template: BodyTemplate) -> None:
     with pytest.raises(DyngsError, match=r"^poses must be \(frames, 55, 3\) for the anny body, got \(1, 24, 3\)$"):
         posed_vertices(template, torch.zeros(1, 24, 3), torch.zeros(1, 3))
 
@@ -212,11 +212,11 @@ def test_pose_blend_shapes_follow_all_rotations_but_the_root() -> None:
     assert not torch.allclose(posed_vertices(body, poses, normal(1, 3)), posed_vertices(plain, poses, normal(1, 3)))
 
 
-def test_no_frames_are_no_vertices(template: Body) -> None:
+def test_no_frames_are_no_vertices(template: BodyTemplate) -> None:
     assert posed_vertices(template, torch.zeros(0, 55, 3), torch.zeros(0, 3)).shape == (0, 13718, 3)
 
 
-def test_in_float64_nothing_is_left_in_float32(template: Body) -> None:
+def test_in_float64_nothing_is_left_in_float32(template: BodyTemplate) -> None:
     body = template.to(torch.float64)
     poses = 0.3 * normal(1, 55, 3)
     found = posed_vertices(body, poses, normal(1, 3))

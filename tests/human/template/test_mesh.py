@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from dyngs.human.template.mesh import interpolated, unit, vertex_normals, visible
+from dyngs.human.template.mesh import interpolate, normalized, rasterize, vertex_normals
 
 
 def test_the_nearer_triangle_is_seen() -> None:
     """Two that overlap: attributes at a grid point are those of the one with the larger nearness."""
     far = [[0.0, 0.0, 0.5], [8.0, 0.0, 0.5], [0.0, 8.0, 0.5]]
     near = [[0.0, 0.0, 1.0], [3.0, 0.0, 1.0], [0.0, 3.0, 1.0]]
-    hits = visible(np.array([far, near]), 8, 8)
+    hits = rasterize(np.array([far, near]), 8, 8)
     owner = np.full(64, -1)
     owner[hits.index] = hits.faces
     assert owner[0] == 1
     assert owner[9] == 1
     assert owner[4] == 0
     assert owner[63] == -1
-    columns = interpolated(hits.shares, np.array([far, near])[hits.faces][..., :1])[:, 0]
+    columns = interpolate(hits.shares, np.array([far, near])[hits.faces][..., :1])[:, 0]
     np.testing.assert_allclose(columns, hits.index % 8, atol=1e-12)  # sums of a few float64
     assert len(np.unique(hits.index)) == len(hits.index)
 
@@ -26,7 +26,7 @@ def test_the_nearer_triangle_is_seen() -> None:
 def test_triangles_without_area_or_outside_cover_nothing() -> None:
     line = [[0.0, 0.0, 1.0], [4.0, 4.0, 1.0], [2.0, 2.0, 1.0]]
     outside = [[-9.0, -9.0, 1.0], [-8.0, -9.0, 1.0], [-9.0, -8.0, 1.0]]
-    assert len(visible(np.array([line, outside]), 5, 5).index) == 0
+    assert len(rasterize(np.array([line, outside]), 5, 5).index) == 0
 
 
 def test_normals_of_a_pyramid() -> None:
@@ -39,4 +39,4 @@ def test_normals_of_a_pyramid() -> None:
 
 
 def test_unit_leaves_zero() -> None:
-    np.testing.assert_array_equal(unit(np.array([[0.0, 0, 0], [0, 3, 4]])), [[0, 0, 0], [0, 0.6, 0.8]])
+    np.testing.assert_array_equal(normalized(np.array([[0.0, 0, 0], [0, 3, 4]])), [[0, 0, 0], [0, 0.6, 0.8]])

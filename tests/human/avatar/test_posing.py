@@ -16,24 +16,24 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.avatar import (
+from dyngs.human.avatar.posing import (
     Anchors,
-    Posing,
+    BodyPose,
     Skeleton,
-    first_gaussians,
-    heaviest,
-    offsets_at_rest,
-    pose_offsets,
-    pose_shapes,
-    posed,
+    heaviest_joints,
+    learned_offsets,
+    pose_blend_shapes,
+    pose_gaussians,
+    rest_offsets,
+    rotate_sh,
     skinning_weights,
-    turned_colours,
+    texel_gaussians,
 )
 from dyngs.human.motion.motion import JOINTS
 from dyngs.human.pose.covariance import rotations_of
-from dyngs.human.pose.skinning import rotations
-from dyngs.human.template.body import Body, default_body, posed_vertices
-from dyngs.human.template.uv import texels_of
+from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.human.template.atlas import atlas_texels
+from dyngs.human.template.body import BodyTemplate, default_template, posed_vertices
 from dyngs.ops.harmonics import evaluate_harmonics
 
 RESOLUTION = 48
@@ -41,10 +41,10 @@ LEFT_ELBOW, LEFT_WRIST = JOINTS.index("left_elbow"), JOINTS.index("left_wrist")
 
 
 @cache
-def person(sh_degree: int = 0) -> tuple[Body, Gaussians, Anchors, Tensor]:
+def person(sh_degree: int = 0) -> tuple[BodyTemplate, Gaussians, Anchors, Tensor]:
     """The free template with one scaffold, and its dense weights."""
-    body = default_body()
-    gaussians, anchors = first_gaussians(texels_of(body, RESOLUTION), (0.0, 0.02), sh_degree)
+    body = default_template()
+    gaussians, anchors = texel_gaussians(atlas_texels(body, RESOLUTION), (0.0, 0.02), sh_degree)
     generator = torch.Generator().manual_seed(0)
     gaussians = gaussians.replace(sh=0.3 * torch.randn(gaussians.sh.shape, generator=generator))
     return body, gaussians, anchors, skinning_weights(anchors, len(body.joints))
@@ -56,8 +56,8 @@ def in_pose(turns: dict[int, tuple[float, float, float]], gaussians: Gaussians |
     poses = torch.zeros(len(body.joints), 3)
     for joint, turn in turns.items():
         poses[joint] = torch.tensor(turn)
-    posing = Posing(rotations(poses), torch.zeros(3), torch.tensor(1.0))
-    return posed(gaussians or rest, weights, Skeleton(body.joints, body.parents), posing)
+    posing = BodyPose(axis_angle_to_matrix(poses), torch.zeros(3), torch.tensor(1.0))
+    return pose_gaussians(gaussians or rest, weights, Skeleton(body.joints, body.parents), posing)
 
 
 def covariances(gaussians: Gaussians) -> Tensor:
@@ -76,8 +76,8 @@ def test_the_template_at_rest_is_canonical() -> None:
 def test_size_and_place_are_applied_last() -> None:
     body, rest, _, weights = person()
     nothing = torch.eye(3).expand(len(body.joints), 3, 3)
-    posing = Posing(nothing, torch.tensor([1.0, 2.0, 3.0]), torch.tensor(2.0))
-    found = posed(rest, weights, Skeleton(body.joints, body.parents), posing)
+    posing = BodyPose(nothing, torch.tensor([1.0, 2.0, 3.0]), torch.tensor(2.0))
+    found = pose_gaussians(rest, weights, Skeleton(body.joints, body.parents), posing)
     torch.testing.assert_close(found.means, 2 * rest.means + posing.trans)
     torch.testing.assert_close(covariances(found), 4 * covariances(rest), rtol=1e-3, atol=1e-9)
 
@@ -90,7 +90,7 @@ def test_a_bent_elbow_moves_exactly_its_texels() -> None:
     moved = (found.means - rest.means).norm(dim=1)
     assert bool((moved[share == 0] < 1e-6).all())
     assert bool((moved[share > 0.5] > 0.005).all())
-    elbow, turn = body.joints[LEFT_ELBOW], rotations(torch.tensor([0.0, 0.0, math.pi / 2]))
+    elbow, turn = body.joints[LEFT_ELBOW], axis_angle_to_matrix(torch.tensor([0.0, 0.0, math.pi / 2]))
     forearm = share > 1 - 1e-6
     assert int(forearm.sum()) > 20
     wanted = (rest.means[forearm] - elbow) @ turn.T + elbow
@@ -99,7 +99,7 @@ def test_a_bent_elbow_moves_exactly_its_texels() -> None:
     torch.testing.assert_close(covariances(found)[forearm], turned, rtol=1e-3, atol=1e-9)
 
 
-def ancestors(body: Body, joint: int) -> set[int]:
+def ancestors(body: BodyTemplate, joint: int) -> set[int]:
     """The joint and all above it."""
     found = set()
     while joint >= 0:
@@ -127,8 +127,8 @@ def test_a_mirrored_pose_mirrors_the_result() -> None:
     rest = Gaussians(means, quats, log_scales, torch.zeros(count), torch.zeros(count, 1, 3))
     flipped = rest.replace(means=mirror * means, quats=quats * torch.tensor([1.0, 1.0, -1.0, -1.0]))
     skeleton, still = Skeleton(joints, body.parents), (torch.zeros(3), torch.tensor(1.0))
-    one = posed(rest, weights, skeleton, Posing(rotations(poses), *still))
-    two = posed(flipped, weights[:, other], skeleton, Posing(rotations(mirrored_poses), *still))
+    one = pose_gaussians(rest, weights, skeleton, BodyPose(axis_angle_to_matrix(poses), *still))
+    two = pose_gaussians(flipped, weights[:, other], skeleton, BodyPose(axis_angle_to_matrix(mirrored_poses), *still))
     torch.testing.assert_close(two.means, mirror * one.means, rtol=0, atol=1e-5)
     wanted = mirror[:, None] * covariances(one) * mirror
     torch.testing.assert_close(covariances(two), wanted, rtol=1e-3, atol=1e-6)
@@ -138,12 +138,12 @@ def test_colours_turn_with_what_they_are_on() -> None:
     """Seen along a direction that is turned like the Gaussians, they look as they did."""
     generator = torch.Generator().manual_seed(2)
     sh = 0.3 * torch.randn(7, 4, 3, generator=generator)
-    turns = rotations(2 * torch.randn(7, 3, generator=generator))
+    turns = axis_angle_to_matrix(2 * torch.randn(7, 3, generator=generator))
     seen = torch.nn.functional.normalize(torch.randn(7, 3, generator=generator), dim=1)
     turned = (turns @ seen[..., None])[..., 0]
     radii, eye = torch.ones(1, 7, 2, dtype=torch.int32), torch.zeros(1, 3)
     before = evaluate_harmonics(seen, eye, sh, radii, 1)
-    after = evaluate_harmonics(turned, eye, turned_colours(sh, turns), radii, 1)
+    after = evaluate_harmonics(turned, eye, rotate_sh(sh, turns), radii, 1)
     torch.testing.assert_close(after, before, rtol=0, atol=1e-6)
     assert float((evaluate_harmonics(turned, eye, sh, radii, 1) - before).abs().max()) > 0.05
 
@@ -163,7 +163,7 @@ def test_corrections_act_only_where_parts_meet() -> None:
 
 def test_the_heaviest_joints_are_kept_and_normalised() -> None:
     weights = torch.tensor([[0.05] * 8 + [0.3, 0.3], [0.0] * 9 + [1.0]])
-    joints, shares = heaviest(weights)
+    joints, shares = heaviest_joints(weights)
     assert joints.shape == (2, 8)
     assert joints[0, :2].tolist() == [8, 9]
     assert joints[1, 0] == 9
@@ -172,8 +172,8 @@ def test_the_heaviest_joints_are_kept_and_normalised() -> None:
 
 
 def test_first_gaussians_lie_flat_on_their_scaffolds() -> None:
-    texels = texels_of(default_body(), RESOLUTION)
-    gaussians, anchors = first_gaussians(texels, (0.0, 0.03), 1)
+    texels = atlas_texels(default_template(), RESOLUTION)
+    gaussians, anchors = texel_gaussians(texels, (0.0, 0.03), 1)
     assert len(gaussians) == len(anchors) == 2 * len(texels)
     torch.testing.assert_close(gaussians.means[len(texels) :], texels.points + 0.03 * texels.normals)
     thin = rotations_of(gaussians.quats)[:, :, 2]
@@ -191,22 +191,22 @@ def test_offsets_follow_the_bends_of_the_joints_that_count() -> None:
     turns = torch.zeros(3, 3)
     turns[0, 1], turns[1, 0], turns[2, 2] = 1.0, 0.7, -0.4
     place = (torch.zeros(3), torch.tensor(1.0))
-    assert not pose_offsets(weights, Posing(rotations(torch.zeros(3, 3)), *place), directions).any()
-    found = pose_offsets(weights, Posing(rotations(turns), *place), directions)
-    bend = (rotations(turns[1]) - torch.eye(3)).flatten()
+    assert not learned_offsets(weights, BodyPose(axis_angle_to_matrix(torch.zeros(3, 3)), *place), directions).any()
+    found = learned_offsets(weights, BodyPose(axis_angle_to_matrix(turns), *place), directions)
+    bend = (axis_angle_to_matrix(turns[1]) - torch.eye(3)).flatten()
     torch.testing.assert_close(found[0], 0.75 * directions[0].reshape(3, 9) @ bend)
     assert not found[1].any()
 
 
 @cache
-def rigid_body() -> Body:
+def rigid_body() -> BodyTemplate:
     """A body of random triangles with SMPL's joints and pose blend shapes; each triangle follows one joint alone."""
     generator = np.random.default_rng(0)
     arrays = synthetic_bodies.model("smpl")
     groups = torch.arange(len(arrays["v_template"])) // 3
     faces = torch.stack([3 * groups.unique() + k for k in range(3)], dim=1)
     followed = torch.from_numpy(generator.integers(0, 24, len(faces)))[groups]
-    return Body(
+    return BodyTemplate(
         name="smpl",
         vertices=torch.from_numpy(arrays["v_template"]).float(),
         faces=faces,
@@ -224,12 +224,12 @@ def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
     body = rigid_body()
     generator = torch.Generator().manual_seed(0)
     poses = 0.5 * torch.randn(24, 3, generator=generator)
-    posing = Posing(rotations(poses), torch.tensor([1.0, 2.0, 3.0]), torch.tensor(1.5))
-    gaussians, anchors = first_gaussians(texels_of(body, 24), (0.0,), 0)
-    weights, shapes = skinning_weights(anchors, 24), pose_shapes(body)
+    posing = BodyPose(axis_angle_to_matrix(poses), torch.tensor([1.0, 2.0, 3.0]), torch.tensor(1.5))
+    gaussians, anchors = texel_gaussians(atlas_texels(body, 24), (0.0,), 0)
+    weights, shapes = skinning_weights(anchors, 24), pose_blend_shapes(body)
     assert shapes is not None
-    offsets = offsets_at_rest(anchors, weights, posing, shapes, None)
-    found = posed(gaussians, weights, Skeleton(body.joints, body.parents), posing, offsets).means
+    offsets = rest_offsets(anchors, weights, posing, shapes, None)
+    found = pose_gaussians(gaussians, weights, Skeleton(body.joints, body.parents), posing, offsets).means
     given = (poses[None], posing.trans[None], None, None, posing.scale[None])
     mesh, stiff = (posed_vertices(b, *given)[0] for b in (body, replace(body, pose_dirs=None)))
     wanted, without = ((anchors.barycentric[..., None] * x[body.faces[anchors.face]]).sum(1) for x in (mesh, stiff))
@@ -237,21 +237,21 @@ def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
     # 2^-11 of offsets of half a metre, shared by 207 numbers that round independently
     torch.testing.assert_close(found, wanted, rtol=0, atol=2e-4)
     exact = replace(shapes, directions=body.pose_dirs).offsets(anchors, posing.rotations)
-    found = posed(gaussians, weights, Skeleton(body.joints, body.parents), posing, exact).means
+    found = pose_gaussians(gaussians, weights, Skeleton(body.joints, body.parents), posing, exact).means
     torch.testing.assert_close(found, wanted, rtol=0, atol=2e-6)
 
 
 def test_offsets_of_the_template_and_learned_ones_add_up_and_reach_the_pose() -> None:
     body = rigid_body()
-    _, anchors = first_gaussians(texels_of(body, 16), (0.0, 0.02), 0)
-    weights, shapes = skinning_weights(anchors, 24), pose_shapes(body)
+    _, anchors = texel_gaussians(atlas_texels(body, 16), (0.0, 0.02), 0)
+    weights, shapes = skinning_weights(anchors, 24), pose_blend_shapes(body)
     assert shapes is not None
     generator = torch.Generator().manual_seed(0)
     dirs = 0.1 * torch.randn(len(anchors), 27, generator=generator)
     poses = (0.5 * torch.randn(24, 3, generator=generator)).requires_grad_()
-    posing = Posing(rotations(poses), torch.zeros(3), torch.tensor(1.0))
-    both = offsets_at_rest(anchors, weights, posing, shapes, dirs)
-    given, learned = shapes.offsets(anchors, posing.rotations), pose_offsets(weights, posing, dirs)
+    posing = BodyPose(axis_angle_to_matrix(poses), torch.zeros(3), torch.tensor(1.0))
+    both = rest_offsets(anchors, weights, posing, shapes, dirs)
+    given, learned = shapes.offsets(anchors, posing.rotations), learned_offsets(weights, posing, dirs)
     assert both is not None
     torch.testing.assert_close(both, given + learned)
     half = len(anchors) // 2
@@ -260,13 +260,13 @@ def test_offsets_of_the_template_and_learned_ones_add_up_and_reach_the_pose() ->
     assert poses.grad is not None
     assert not poses.grad[0].any(), "the root does not count"
     assert bool(poses.grad[1:].ne(0).any(1).all())
-    assert offsets_at_rest(anchors, weights, posing, None, None) is None
-    assert pose_shapes(replace(body, pose_dirs=None)) is None
+    assert rest_offsets(anchors, weights, posing, None, None) is None
+    assert pose_blend_shapes(replace(body, pose_dirs=None)) is None
 
 
 def test_anchors_know_their_place_on_the_template() -> None:
-    body = default_body()
-    _, anchors = first_gaussians(texels_of(body, RESOLUTION), (0.0, 0.02), 0)
+    body = default_template()
+    _, anchors = texel_gaussians(atlas_texels(body, RESOLUTION), (0.0, 0.02), 0)
     corners = (anchors.barycentric[..., None] * body.vertices[body.faces[anchors.face]]).sum(1)
     skin = anchors.height == 0
     torch.testing.assert_close(corners[skin], anchors.points[skin])
@@ -285,8 +285,8 @@ def test_posing_is_differentiable_in_everything(sh_degree: int) -> None:
     poses = torch.zeros(len(body.joints), 3, requires_grad=True)
     joints, corrections = body.joints.clone().requires_grad_(), torch.zeros_like(anchors.weights).requires_grad_()
     weights = skinning_weights(anchors, len(joints), corrections)
-    posing = Posing(rotations(poses + 0.3), torch.zeros(3), torch.tensor(1.0))
-    found = posed(Gaussians(**leaves), weights, Skeleton(joints, body.parents), posing)
+    posing = BodyPose(axis_angle_to_matrix(poses + 0.3), torch.zeros(3), torch.tensor(1.0))
+    found = pose_gaussians(Gaussians(**leaves), weights, Skeleton(joints, body.parents), posing)
     flat = torch.cat([x.flatten() for x in found.tensors().values()])
     (flat * torch.linspace(1, 2, len(flat))).sum().backward()
     for x in (*leaves.values(), poses, joints, corrections):

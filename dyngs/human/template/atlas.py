@@ -16,7 +16,7 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
-    from dyngs.human.template.body import Body
+    from dyngs.human.template.body import BodyTemplate
 
 _THINNEST = 1e-9
 """Twice the area over the square of the longest edge at which a triangle counts as degenerate."""
@@ -57,7 +57,7 @@ class Texels:
 
 
 @dataclass(frozen=True)
-class Shells:
+class ScaffoldPoints:
     """Places above the texels of an atlas, in any order and number: scaffolds for clothing and hair.
 
     Attributes:
@@ -71,16 +71,16 @@ class Shells:
     def __len__(self) -> int:
         return len(self.texel)
 
-    def select(self, index: Tensor) -> Shells:
+    def select(self, index: Tensor) -> ScaffoldPoints:
         """The places at ``index`` (long or bool)."""
-        return Shells(self.texel[index], self.height[index])
+        return ScaffoldPoints(self.texel[index], self.height[index])
 
     def points(self, texels: Texels) -> Tensor:
         """(Q, 3) rest positions, m, above the surface of ``texels``, x + height * normal."""
         return texels.points[self.texel] + self.height[:, None] * texels.normals[self.texel]
 
 
-def texels_of(body: Body, resolution: int, vertices: Tensor | None = None) -> Texels:
+def atlas_texels(body: BodyTemplate, resolution: int, vertices: Tensor | None = None) -> Texels:
     """The texels whose centres the atlas of ``body`` covers; where triangles touch or overlap, the first one has it.
 
     Triangles that are degenerate, in the atlas or on the surface, cover nothing. Gradients do not flow through.
@@ -124,7 +124,7 @@ def texels_of(body: Body, resolution: int, vertices: Tensor | None = None) -> Te
     )
 
 
-def shells(texels: Texels, heights: Sequence[float]) -> Shells:
+def scaffold_points(texels: Texels, heights: Sequence[float]) -> ScaffoldPoints:
     """Places at all ``heights`` (m, along the normal) above all texels: those of the first height, then of the next.
 
     Raises:
@@ -133,10 +133,10 @@ def shells(texels: Texels, heights: Sequence[float]) -> Shells:
     levels = texels.points.new_tensor(heights)
     if levels.numel() == 0 or not bool(levels.isfinite().all()):
         raise DyngsError(f"the heights of shells must be one or more finite numbers of metres, got {list(heights)}")
-    return Shells(torch.arange(len(texels)).repeat(len(levels)), levels.repeat_interleave(len(texels)))
+    return ScaffoldPoints(torch.arange(len(texels)).repeat(len(levels)), levels.repeat_interleave(len(texels)))
 
 
-def neighbours(points: Tensor, count: int = 5) -> Tensor:
+def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
     """(Q, count) int64 rows of the other points nearest to each of ``points`` (Q, 3), nearest first.
 
     Points may coincide; none is its own neighbour. Of few points all others are given: Q - 1 columns at most.

@@ -15,17 +15,17 @@ from dyngs.config import HumanModel
 from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.avatar import Posing, Skeleton, first_gaussians, pose_shapes, posing_of
 from dyngs.human.avatar.model import Subject
-from dyngs.human.motion.clips import footage
-from dyngs.human.template.body import Body
+from dyngs.human.avatar.posing import BodyPose, Skeleton, frame_pose, pose_blend_shapes, texel_gaussians
+from dyngs.human.motion.clip import captured_motion
+from dyngs.human.template.atlas import Texels, atlas_texels
+from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.load import rest_shape
 from dyngs.human.template.mesh import vertex_normals
-from dyngs.human.template.person import rest_shape
-from dyngs.human.template.uv import Texels, texels_of
 
 
 @dataclass(frozen=True)
-class Sitter:
+class CapturedPerson:
     """A person of whom there are pictures.
 
     Attributes:
@@ -40,7 +40,7 @@ class Sitter:
     """
 
     name: str
-    body: Body
+    body: BodyTemplate
     normals: Tensor
     texels: Texels
     heights: tuple[float, ...]
@@ -48,13 +48,13 @@ class Sitter:
     subject: Subject
     views: tuple[View, ...]
 
-    def posing(self, view: View) -> Posing:
+    def posing(self, view: View) -> BodyPose:
         """The pose in which ``view`` shows the person."""
         row = self.subject.footage.frames.index(-1 if view.frame is None else view.frame)
-        return posing_of(self.subject.footage.clip, row)
+        return frame_pose(self.subject.footage.clip, row)
 
 
-def sitter_of(capture: Capture, model: HumanModel, body: Body) -> Sitter:
+def captured_person(capture: Capture, model: HumanModel, body: BodyTemplate) -> CapturedPerson:
     """The person of a capture, on the template ``body``.
 
     Raises:
@@ -66,24 +66,24 @@ def sitter_of(capture: Capture, model: HumanModel, body: Body) -> Sitter:
         raise DyngsError(f"{capture.root}: the pictures have no silhouettes; give them alpha, see docs/human.md")
     given, views = capture.body["train"], capture.splits["train"]
     vertices, joints = rest_shape(body, torch.from_numpy(given.betas).float())
-    texels = texels_of(body, model.resolution, vertices)
+    texels = atlas_texels(body, model.resolution, vertices)
     heights = tuple(sorted(set(model.heights)))
-    gaussians, anchors = first_gaussians(texels, heights, 0)
-    filmed = footage(capture.root, given, views, joints)
+    gaussians, anchors = texel_gaussians(texels, heights, 0)
+    filmed = captured_motion(capture.root, given, views, joints)
     shape = {"shape_dirs": None, "joint_shape_dirs": None, "expression_dirs": None, "joint_expression_dirs": None}
-    return Sitter(
+    return CapturedPerson(
         name=capture.root.name,
         body=replace(body, vertices=vertices, joints=joints, **shape),
         normals=torch.from_numpy(vertex_normals(vertices.double().numpy(), body.faces.numpy())).float(),
         texels=texels,
         heights=heights,
         gaussians=gaussians,
-        subject=Subject(Skeleton(joints, body.parents), anchors, filmed, pose_shapes(body)),
+        subject=Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body)),
         views=views,
     )
 
 
-def spread_views(sitter: Sitter, count: int, first: int | None = None) -> list[int]:
+def spread_views(sitter: CapturedPerson, count: int, first: int | None = None) -> list[int]:
     """Indices of ``count`` views that see as much of the person as possible, ascending.
 
     Of one moment, the first with the most views, where that has enough; else of all. They maximize the mean over texels
@@ -116,7 +116,7 @@ def spread_views(sitter: Sitter, count: int, first: int | None = None) -> list[i
     return sorted(allowed[i] for i in chosen)
 
 
-def named_views(sitter: Sitter, names: Sequence[str]) -> list[int]:
+def named_views(sitter: CapturedPerson, names: Sequence[str]) -> list[int]:
     """Indices of the views of these names, or whose pictures are named so.
 
     Raises:
@@ -146,7 +146,7 @@ def _best(cosines: Tensor, others: list[int], count: int) -> list[int]:
     return chosen
 
 
-def _direction(sitter: Sitter, view: View) -> Tensor:
+def _direction(sitter: CapturedPerson, view: View) -> Tensor:
     """(3,) unit vector from the pelvis to the camera, in the frame of the body at rest."""
     posing = sitter.posing(view)
     pose = torch.from_numpy(view.cam_from_world).float()

@@ -16,7 +16,7 @@ from torch import Tensor
 from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, View
 from dyngs.human.motion.motion import ROWS, Motion
-from dyngs.human.pose.skinning import apply, joint_transforms, rotations
+from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 
 _SAME_TIME = 1e-9
 
@@ -25,7 +25,7 @@ _ALONG_AXIS = 0.87
 
 
 @dataclass(frozen=True)
-class Clip:
+class MotionClip:
     """Poses of a body at F >= 1 moments.
 
     Attributes:
@@ -43,11 +43,11 @@ class Clip:
     def __len__(self) -> int:
         return len(self.times)
 
-    def select(self, rows: Tensor) -> Clip:
+    def select(self, rows: Tensor) -> MotionClip:
         """The frames at ``rows``, ascending."""
-        return Clip(self.times[rows], self.poses[rows], self.trans[rows], self.scale[rows])
+        return MotionClip(self.times[rows], self.poses[rows], self.trans[rows], self.scale[rows])
 
-    def at(self, time: float | None) -> Clip:
+    def at(self, time: float | None) -> MotionClip:
         """The one frame at ``time``, clamped to those there are; None is the first.
 
         Between two frames rotations turn evenly the shorter way, all else is linear.
@@ -59,7 +59,7 @@ class Clip:
             return self.select(torch.tensor([after]))
         before = after - 1
         share = (moment - float(times[before])) / float(times[after] - times[before])
-        return Clip(
+        return MotionClip(
             times=torch.tensor([moment], dtype=times.dtype),
             poses=_turned_partly(self.poses[before], self.poses[after], share)[None],
             trans=torch.lerp(self.trans[before], self.trans[after], share)[None],
@@ -68,7 +68,7 @@ class Clip:
 
 
 @dataclass(frozen=True)
-class Footage:
+class CapturedMotion:
     """The frames of a clip that have pictures.
 
     Attributes:
@@ -76,11 +76,11 @@ class Footage:
         frames: (F,) frame number of each, as views name them.
     """
 
-    clip: Clip
+    clip: MotionClip
     frames: tuple[int, ...]
 
 
-def footage(where: Path, given: BodyFrames, views: Sequence[View], joints: Tensor) -> Footage:
+def captured_motion(where: Path, given: BodyFrames, views: Sequence[View], joints: Tensor) -> CapturedMotion:
     """The frames of ``given`` that ``views`` show, for a body with ``joints`` (J, 3) at rest.
 
     Joints that the body of ``given`` lacks do not turn. Views without times are spread over [0, 1] by frame number.
@@ -102,8 +102,8 @@ def footage(where: Path, given: BodyFrames, views: Sequence[View], joints: Tenso
     }
     order = sorted(moments, key=lambda row: (moments[row], row))
     kept = [row for i, row in enumerate(order) if i == 0 or moments[row] > moments[order[i - 1]]]
-    return Footage(
-        Clip(
+    return CapturedMotion(
+        MotionClip(
             times=torch.tensor([moments[row] for row in kept], dtype=torch.float64),
             poses=_for_joints(torch.from_numpy(found.poses[kept]).float(), len(joints)),
             trans=torch.from_numpy(found.trans[kept]).float(),
@@ -113,20 +113,20 @@ def footage(where: Path, given: BodyFrames, views: Sequence[View], joints: Tenso
     )
 
 
-def same_clip(a: BodyFrames, b: BodyFrames) -> bool:
+def same_bodies(a: BodyFrames, b: BodyFrames) -> bool:
     """Whether both hold the same bodies in the same frames."""
     pairs = ((getattr(a, name), getattr(b, name)) for name in ("poses", "trans", "scale"))
     return a.frames == b.frames and all(np.array_equal(x, y) for x, y in pairs)
 
 
-def clip_of_motion(motion: Motion) -> Clip:
+def motion_clip(motion: Motion) -> MotionClip:
     """The clip of a motion file, its frames spread evenly over [0, 1], where and as large as the file says."""
     count = len(motion)
     times = torch.from_numpy(np.linspace(0, 1, count)) if count > 1 else torch.zeros(1, dtype=torch.float64)
-    return Clip(times, motion.poses.float(), motion.trans.float(), motion.scale.float())
+    return MotionClip(times, motion.poses.float(), motion.trans.float(), motion.scale.float())
 
 
-def placed(clip: Clip, like: Clip, joints: Tensor, parents: tuple[int, ...]) -> Clip:
+def place_like(clip: MotionClip, like: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> MotionClip:
     """The clip of anybody, y up and in metres, brought to the size and the place of the person of ``like``.
 
     Up becomes the way in which the pelvis of ``like`` points on average, or the world axis that is within 30 degrees of
@@ -138,32 +138,32 @@ def placed(clip: Clip, like: Clip, joints: Tensor, parents: tuple[int, ...]) -> 
         joints: (J, 3) at rest, which both are given for.
         parents: of the joints.
     """
-    up = up_of(like)
+    up = up_direction(like)
     unit = like.scale.mean()
     turn = _least_rotation(joints.new_tensor([0.0, 1.0, 0.0]), up)
-    roots = turn @ rotations(clip.poses[:, 0])
+    roots = turn @ axis_angle_to_matrix(clip.poses[:, 0])
     poses = torch.cat([_axis_angle(roots)[:, None], clip.poses[:, 1:]], dim=1)
     pelvis = clip.scale[:, None] * joints[0]
-    moved = Clip(clip.times, poses, unit * ((clip.trans + pelvis) @ turn.T - pelvis), unit * clip.scale)
+    moved = MotionClip(clip.times, poses, unit * ((clip.trans + pelvis) @ turn.T - pelvis), unit * clip.scale)
     ours, theirs = (_joint_places(x, joints, parents) for x in (moved, like))
     shift = theirs[:, 0].mean(0) - ours[:, 0].mean(0)
     rise = (theirs @ up).amin() - (ours @ up).amin()
     return replace(moved, trans=moved.trans + shift + (rise - shift @ up) * up)
 
 
-def upright(like: Clip, joints: Tensor, parents: tuple[int, ...]) -> Clip:
+def rest_clip(like: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> MotionClip:
     """The rest pose on the floor of ``like``, as large and as high as the person there; one frame.
 
     What is ``placed`` like it, is placed as it would be like ``like``.
     """
     nothing = torch.zeros_like(like.poses[:1])
-    rest = Clip(torch.zeros(1, dtype=torch.float64), nothing, nothing[:, 0], torch.ones_like(like.scale[:1]))
-    return placed(rest, like, joints, parents)
+    rest = MotionClip(torch.zeros(1, dtype=torch.float64), nothing, nothing[:, 0], torch.ones_like(like.scale[:1]))
+    return place_like(rest, like, joints, parents)
 
 
-def up_of(clip: Clip) -> Tensor:
+def up_direction(clip: MotionClip) -> Tensor:
     """(3,) unit vector in which the pelvis points on average, or the world axis within 30 degrees of it."""
-    mean = torch.nn.functional.normalize(rotations(clip.poses[:, 0])[:, :, 1].mean(0), dim=0)
+    mean = torch.nn.functional.normalize(axis_angle_to_matrix(clip.poses[:, 0])[:, :, 1].mean(0), dim=0)
     largest = int(mean.abs().argmax())
     if float(mean[largest].abs()) < _ALONG_AXIS:
         return mean
@@ -176,7 +176,7 @@ def _least_rotation(start: Tensor, end: Tensor) -> Tensor:
     if float(axis.norm()) < 1e-6:
         across = torch.eye(3)[int(start.abs().argmin())]
         axis = torch.linalg.cross(start, across)
-    return rotations(torch.nn.functional.normalize(axis, dim=0) * cosine.acos())
+    return axis_angle_to_matrix(torch.nn.functional.normalize(axis, dim=0) * cosine.acos())
 
 
 def _axis_angle(turns: Tensor) -> Tensor:
@@ -186,9 +186,9 @@ def _axis_angle(turns: Tensor) -> Tensor:
     return torch.from_numpy(Rotation.from_matrix(turns.double().numpy()).as_rotvec()).to(turns)
 
 
-def _joint_places(clip: Clip, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
+def _joint_places(clip: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
     """(F, J, 3) joints in the world."""
-    moved = apply(joint_transforms(joints, parents, rotations(clip.poses)), joints)
+    moved = apply_transforms(joint_transforms(joints, parents, axis_angle_to_matrix(clip.poses)), joints)
     return clip.scale[:, None, None] * moved + clip.trans[:, None]
 
 

@@ -14,18 +14,18 @@ from torch import Tensor
 from dyngs.data.body_frames import body_frames
 from dyngs.data.capture import BodyFrames, View
 from dyngs.errors import DyngsError
-from dyngs.human.motion.clips import Clip, clip_of_motion, footage, placed, same_clip, upright
+from dyngs.human.motion.clip import MotionClip, captured_motion, motion_clip, place_like, rest_clip, same_bodies
 from dyngs.human.motion.motion import JOINTS, Motion
-from dyngs.human.pose.skinning import apply, joint_transforms, rotations
+from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 
 WHERE = Path("capture")
 
 
-def three_frames() -> Clip:
+def three_frames() -> MotionClip:
     poses = torch.zeros(3, 2, 3)
     poses[1, 1, 2], poses[2, 1, 2] = 0.5, 3.0
     trans = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [5.0, 0, 0]])
-    return Clip(torch.tensor([0.0, 0.25, 1.0], dtype=torch.float64), poses, trans, torch.tensor([1.0, 1.0, 2.0]))
+    return MotionClip(torch.tensor([0.0, 0.25, 1.0], dtype=torch.float64), poses, trans, torch.tensor([1.0, 1.0, 2.0]))
 
 
 def bodies(frames: list[int], joints: int = 55) -> BodyFrames:
@@ -57,7 +57,7 @@ def test_moments_outside_are_those_of_the_ends(time: float | None, row: int) -> 
 
 def test_footage_has_the_frames_that_views_show_in_order_of_time() -> None:
     given = bodies([3, 4, 7, 9])
-    filmed = footage(WHERE, given, [view(9, 1.0), view(3, 0.0), view(7, 0.5), view(3, 0.0)], torch.zeros(55, 3))
+    filmed = captured_motion(WHERE, given, [view(9, 1.0), view(3, 0.0), view(7, 0.5), view(3, 0.0)], torch.zeros(55, 3))
     assert filmed.frames == (3, 7, 9)
     assert filmed.clip.times.tolist() == [0.0, 0.5, 1.0]
     np.testing.assert_allclose(filmed.clip.trans.numpy(), given.trans[[0, 2, 3]])
@@ -65,31 +65,31 @@ def test_footage_has_the_frames_that_views_show_in_order_of_time() -> None:
 
 
 def test_footage_without_times_is_spread_by_frame_number() -> None:
-    filmed = footage(WHERE, bodies([0, 1, 2]), [view(2, None), view(1, None)], torch.zeros(55, 3))
+    filmed = captured_motion(WHERE, bodies([0, 1, 2]), [view(2, None), view(1, None)], torch.zeros(55, 3))
     assert filmed.frames == (1, 2)
     assert filmed.clip.times.tolist() == [0.5, 1.0]
 
 
 def test_a_view_without_parameters_is_named() -> None:
     with pytest.raises(DyngsError, match="no body parameters for 1 frames that have pictures"):
-        footage(WHERE, bodies([0, 1]), [view(5, 0.0)], torch.zeros(55, 3))
+        captured_motion(WHERE, bodies([0, 1]), [view(5, 0.0)], torch.zeros(55, 3))
 
 
 def test_poses_of_smpl_move_a_body_of_55_joints() -> None:
     given = bodies([0], joints=24)
-    poses = footage(WHERE, given, [view(0, 0.0)], torch.zeros(55, 3)).clip.poses[0]
+    poses = captured_motion(WHERE, given, [view(0, 0.0)], torch.zeros(55, 3)).clip.poses[0]
     np.testing.assert_allclose(poses[:22].numpy(), given.poses[0, :22], rtol=1e-6)
     assert not poses[22:].any()
 
 
 def test_clips_are_told_apart() -> None:
     one, other = bodies([0, 1]), bodies([0, 2])
-    assert same_clip(one, bodies([0, 1]))
-    assert not same_clip(one, other)
+    assert same_bodies(one, bodies([0, 1]))
+    assert not same_bodies(one, other)
 
 
-def joint_places(clip: Clip, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
-    moved = apply(joint_transforms(joints, parents, rotations(clip.poses)), joints)
+def joint_places(clip: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
+    moved = apply_transforms(joint_transforms(joints, parents, axis_angle_to_matrix(clip.poses)), joints)
     return clip.scale[:, None, None] * moved + clip.trans[:, None]
 
 
@@ -97,15 +97,15 @@ def joint_places(clip: Clip, joints: Tensor, parents: tuple[int, ...]) -> Tensor
 def test_a_motion_is_put_where_the_person_was(up: int) -> None:
     """As large, on the same floor, over the same place, the same way up; the motion itself is the same."""
     body = tiny_body()
-    clip = clip_of_motion(random_motion(5, angle=0.3, seed=4))
-    turn = torch.eye(3) if up == 1 else rotations(torch.tensor([math.pi / 2, 0.0, 0.0]))
-    like = clip_of_motion(random_motion(4, angle=0.1, seed=5))
+    clip = motion_clip(random_motion(5, angle=0.3, seed=4))
+    turn = torch.eye(3) if up == 1 else axis_angle_to_matrix(torch.tensor([math.pi / 2, 0.0, 0.0]))
+    like = motion_clip(random_motion(4, angle=0.1, seed=5))
     roots = turn.expand(4, 3, 3)
     from scipy.spatial.transform import Rotation
 
     turned = torch.from_numpy(Rotation.from_matrix(roots.numpy()).as_rotvec()).float()
-    like = Clip(like.times, torch.cat([turned[:, None], like.poses[:, 1:]], 1), like.trans, torch.full((4,), 2.0))
-    found = placed(clip, like, body.joints, body.parents)
+    like = MotionClip(like.times, torch.cat([turned[:, None], like.poses[:, 1:]], 1), like.trans, torch.full((4,), 2.0))
+    found = place_like(clip, like, body.joints, body.parents)
     ours, theirs = (joint_places(x, body.joints, body.parents) for x in (found, like))
     assert float(ours[..., up].min()) == pytest.approx(float(theirs[..., up].min()), abs=1e-4)
     for axis in {0, 1, 2} - {up}:
@@ -123,17 +123,17 @@ def test_what_is_placed_like_the_upright_pose_is_placed_like_the_clip_it_comes_f
     roots = 2.0 * axis + 0.05 * torch.randn(4, 3, generator=generator)
     poses = torch.cat([roots[:, None], 0.3 * torch.randn(4, 54, 3, generator=generator)], dim=1)
     trans, times = torch.randn(4, 3, generator=generator), torch.linspace(0, 1, 4, dtype=torch.float64)
-    like = Clip(times, poses, trans, torch.tensor([1.9, 2.0, 2.0, 2.1]))
-    clip = Clip(times, 0.2 * torch.randn(4, 55, 3, generator=generator), trans.flip(0), torch.ones(4))
-    rest = upright(like, body.joints, body.parents)
+    like = MotionClip(times, poses, trans, torch.tensor([1.9, 2.0, 2.0, 2.1]))
+    clip = MotionClip(times, 0.2 * torch.randn(4, 55, 3, generator=generator), trans.flip(0), torch.ones(4))
+    rest = rest_clip(like, body.joints, body.parents)
     assert len(rest) == 1
     assert not rest.poses[:, 1:].any()
-    one, other = (placed(clip, x, body.joints, body.parents) for x in (like, rest))
+    one, other = (place_like(clip, x, body.joints, body.parents) for x in (like, rest))
     for name in ("poses", "trans", "scale"):
         torch.testing.assert_close(getattr(other, name), getattr(one, name), rtol=0, atol=1e-4)
 
 
 def test_a_motion_of_one_frame_is_a_clip() -> None:
     poses = torch.zeros(1, len(JOINTS), 3)
-    one = clip_of_motion(Motion(poses, torch.zeros(1, 3), torch.zeros(0), 30.0, torch.ones(1)))
+    one = motion_clip(Motion(poses, torch.zeros(1, 3), torch.zeros(0), 30.0, torch.ones(1)))
     assert one.times.tolist() == [0.0]

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Picture
-from dyngs.human.avatar.avatar import Posing
-from dyngs.human.pose.skinning import apply, blended, joint_transforms
-from dyngs.human.prediction.sitter import Sitter
-from dyngs.human.template.mesh import interpolated, vertex_normals, visible
-from dyngs.human.template.uv import Texels
+from dyngs.human.avatar.posing import BodyPose
+from dyngs.human.pose.skinning import apply_transforms, blend_transforms, joint_transforms
+from dyngs.human.prediction.person import CapturedPerson
+from dyngs.human.template.atlas import Texels
+from dyngs.human.template.mesh import interpolate, rasterize, vertex_normals
 
 _FACING = 4
 """Power of the cosine between normal and view that weights colours: who sees a place head-on, sees it truly."""
@@ -34,7 +34,7 @@ _SLACK, _SLANT = 0.01, 1.5
 
 
 @dataclass(frozen=True)
-class Maps:
+class TexelMaps:
     """What pictures show, per texel.
 
     Attributes:
@@ -51,7 +51,7 @@ class Maps:
 
 
 @torch.no_grad()
-def maps_of(sitter: Sitter, shown: Iterable[tuple[Picture, Posing]]) -> Maps:
+def observe_texels(sitter: CapturedPerson, shown: Iterable[tuple[Picture, BodyPose]]) -> TexelMaps:
     """What the pictures, each with its pose, show of the person: at least one."""
     levels, count = len(sitter.heights), len(sitter.texels)
     colour, weight = torch.zeros(levels, count, 3), torch.zeros(levels, count)
@@ -74,7 +74,7 @@ def maps_of(sitter: Sitter, shown: Iterable[tuple[Picture, Posing]]) -> Maps:
     if offsets is None:
         raise ValueError("there must be a picture")
     rgb = (colour / weight.clamp_min(1e-6)[..., None]).clamp(0, 1)
-    return Maps(rgb, seen, torch.where(looked > 0, inside / looked.clamp_min(1), 1.0), offsets)
+    return TexelMaps(rgb, seen, torch.where(looked > 0, inside / looked.clamp_min(1), 1.0), offsets)
 
 
 def to_atlas(values: Tensor, texels: Texels) -> Tensor:
@@ -99,7 +99,7 @@ class _Sight:
     in_frame: Tensor
 
 
-def _sight(sitter: Sitter, picture: Picture, vertices: np.ndarray, normals: Tensor, scale: float) -> _Sight:
+def _sight(sitter: CapturedPerson, picture: Picture, vertices: np.ndarray, normals: Tensor, scale: float) -> _Sight:
     """What ``picture`` shows of the scaffold with ``vertices`` (M, 3) and ``normals`` (P, 3); ``scale`` is a metre."""
     camera = picture.cameras
     world = _at_texels(sitter, vertices)
@@ -124,9 +124,9 @@ def _nearest(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at: Tenso
     places, depth = (x.double().numpy() for x in _projected(torch.from_numpy(vertices), camera))
     corners = np.concatenate([places - 0.5, 1.0 / depth[:, None]], axis=1)[faces]
     corners[(depth[faces] <= 0).any(axis=1)] = 0.0  # behind the camera: without area, so that nothing is covered
-    hits = visible(corners, camera.width, camera.height)
+    hits = rasterize(corners, camera.width, camera.height)
     buffer = np.full((camera.height + 2, camera.width + 2), np.inf)
-    buffer[hits.index // camera.width + 1, hits.index % camera.width + 1] = interpolated(
+    buffer[hits.index // camera.width + 1, hits.index % camera.width + 1] = interpolate(
         hits.shares, depth[faces[hits.faces]][..., None]
     )[:, 0]
     least = np.minimum.reduce([buffer[:-1, :-1], buffer[1:, :-1], buffer[:-1, 1:], buffer[1:, 1:]])
@@ -153,18 +153,18 @@ def _sampled(picture: Tensor, at: Tensor) -> Tensor:
     return found[0, :, 0].T
 
 
-def _at_texels(sitter: Sitter, values: np.ndarray) -> Tensor:
+def _at_texels(sitter: CapturedPerson, values: np.ndarray) -> Tensor:
     """(P, 3) between the vertices around each texel of ``values`` (M, 3) at the vertices."""
     around = torch.from_numpy(values).float()[sitter.body.faces[sitter.texels.faces]]
     return (sitter.texels.barycentric[..., None] * around).sum(1)
 
 
-def _posed(sitter: Sitter, posing: Posing, height: float) -> np.ndarray:
+def _posed(sitter: CapturedPerson, posing: BodyPose, height: float) -> np.ndarray:
     """(M, 3) vertices of a scaffold in the world."""
     body = sitter.body
     vertices = body.vertices + height * sitter.normals
     if body.pose_dirs is not None:
         bends = (posing.rotations[1:] - torch.eye(3)).flatten()
         vertices = vertices + (bends @ body.pose_dirs).unflatten(0, (-1, 3))
-    transforms = blended(body.weights, joint_transforms(body.joints, body.parents, posing.rotations))
-    return (posing.scale * apply(transforms, vertices) + posing.trans).numpy()
+    transforms = blend_transforms(body.weights, joint_transforms(body.joints, body.parents, posing.rotations))
+    return (posing.scale * apply_transforms(transforms, vertices) + posing.trans).numpy()

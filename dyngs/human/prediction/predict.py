@@ -14,9 +14,9 @@ from torch import Tensor
 from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.model import Subject
-from dyngs.human.prediction.maps import Maps, from_atlas, to_atlas
 from dyngs.human.prediction.network import HEADS, AtlasNetwork
-from dyngs.human.prediction.sitter import Sitter
+from dyngs.human.prediction.person import CapturedPerson
+from dyngs.human.prediction.texel_maps import TexelMaps, from_atlas, to_atlas
 from dyngs.ops.quaternions import unit_quats
 
 _STRETCH = 1.5
@@ -30,19 +30,19 @@ _RISE = 0.01
 
 
 @dataclass(frozen=True)
-class Avatar:
+class PredictedAvatar:
     """N Gaussians at rest, and the person they belong to, whose anchors are theirs."""
 
     gaussians: Gaussians
     subject: Subject
 
 
-def num_channels(scaffolds: int) -> int:
+def num_input_channels(scaffolds: int) -> int:
     """Channels of the maps that a network for so many scaffolds takes."""
     return 5 * scaffolds + 10
 
 
-def inputs_of(sitter: Sitter, maps: Maps, mean: Tensor) -> Tensor:
+def network_inputs(sitter: CapturedPerson, maps: TexelMaps, mean: Tensor) -> Tensor:
     """(D, S, S) what the network sees: per scaffold colour, cosine and silhouettes; then offsets, places, mean colours.
 
     Args:
@@ -56,7 +56,9 @@ def inputs_of(sitter: Sitter, maps: Maps, mean: Tensor) -> Tensor:
     return to_atlas(values, sitter.texels)
 
 
-def filled(sitter: Sitter, maps: Maps, mean: Tensor, network: AtlasNetwork | None, carve: float) -> Avatar:
+def predict_gaussians(
+    sitter: CapturedPerson, maps: TexelMaps, mean: Tensor, network: AtlasNetwork | None, carve: float
+) -> PredictedAvatar:
     """The avatar that ``network`` predicts; differentiable in its weights. Without one: discs in seen or mean colours.
 
     All texels of the lowest scaffold have a Gaussian; those above it where a view sees them and they lie inside a share
@@ -66,7 +68,7 @@ def filled(sitter: Sitter, maps: Maps, mean: Tensor, network: AtlasNetwork | Non
     Args:
         sitter: the person.
         maps: of the pictures.
-        mean: (3, S, S) as in ``inputs_of``.
+        mean: (3, S, S) as in ``network_inputs``.
         network: None for none.
         carve: in [0, 1].
     """
@@ -78,8 +80,8 @@ def filled(sitter: Sitter, maps: Maps, mean: Tensor, network: AtlasNetwork | Non
     average = from_atlas(mean, sitter.texels)[rows % len(sitter.texels)]
     if network is None:
         rgb = torch.where(seen[:, None] > 0, shown, average)
-        return Avatar(first.replace(sh=((rgb - 0.5) / SH_C0)[:, None]), subject)
-    raw = network(inputs_of(sitter, maps, mean))
+        return PredictedAvatar(first.replace(sh=((rgb - 0.5) / SH_C0)[:, None]), subject)
+    raw = network(network_inputs(sitter, maps, mean))
     raw = torch.cat([from_atlas(level, sitter.texels) for level in raw]).index_select(0, rows)
     part = dict(zip(HEADS, raw.split(tuple(HEADS.values()), dim=1), strict=True))
     trust = (part["trust"] + _TRUST).sigmoid() * (seen[:, None] > 0)
@@ -92,7 +94,7 @@ def filled(sitter: Sitter, maps: Maps, mean: Tensor, network: AtlasNetwork | Non
         logit_opacities=first.logit_opacities + part["opacity"][:, 0],
         sh=((rgb - 0.5) / SH_C0)[:, None],
     )
-    return Avatar(gaussians, subject)
+    return PredictedAvatar(gaussians, subject)
 
 
 def _reach(heights: tuple[float, ...]) -> float:

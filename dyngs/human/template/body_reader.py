@@ -18,7 +18,7 @@ from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.limits import require_at_most
 from dyngs.files.numpy_files import read_arrays
 from dyngs.files.pickles import read_pickle
-from dyngs.human.template.body import Body
+from dyngs.human.template.body import BodyTemplate
 
 _SMPL = ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs", "posedirs")
 _TEMPLATE = ("v_template", "f", "weights_idx", "weights_val", "kintree_table", "J")
@@ -32,7 +32,7 @@ _LARGEST = 1e10
 """No number of a body is larger, in whatever unit; one that is comes from damage."""
 
 
-def load_body(path: Path, uv: Path | None = None) -> Body:
+def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
     """The body of a ``.npz`` or ``.pkl`` file, with the texture coordinates of ``uv`` or else its own, if any.
 
     SMPL, SMPL-H and SMPL-X are told apart by their 24, 52 or 55 joints. SMPL-X keeps shape and expression in one array:
@@ -57,7 +57,7 @@ def load_body(path: Path, uv: Path | None = None) -> Body:
         return _body(arrays, None if uv is None else Path(uv))
 
 
-def _body(arrays: _Arrays, uv: Path | None) -> Body:
+def _body(arrays: _Arrays, uv: Path | None) -> BodyTemplate:
     """The body of the arrays, with the texture coordinates of the file ``uv``, or their own where that is None."""
     parents = _parents(arrays)
     vertices = arrays.floats("v_template", (None, 3))
@@ -67,7 +67,7 @@ def _body(arrays: _Arrays, uv: Path | None) -> Body:
     corners = _own_uv(arrays, len(faces)) if uv is None else _read_obj(uv, faces, len(vertices))
     is_template = "weights_idx" in arrays.values
     weights, joints = (_template_skin if is_template else _smpl_skin)(arrays, vertices, len(parents))
-    body = Body(
+    body = BodyTemplate(
         name="anny" if is_template else _NAMES[len(parents)],
         vertices=_float(vertices),
         faces=torch.from_numpy(faces),
@@ -139,7 +139,7 @@ def _smpl_skin(arrays: _Arrays, vertices: np.ndarray, joints: int) -> tuple[np.n
     return _normalised(arrays.path, "weights", weights), regressor @ vertices
 
 
-def _with_blend_shapes(body: Body, arrays: _Arrays) -> Body:
+def _with_blend_shapes(body: BodyTemplate, arrays: _Arrays) -> BodyTemplate:
     m, j = body.weights.shape
     directions = arrays.floats("shapedirs", (m, 3, None))
     pose_dirs = arrays.floats("posedirs", (m, 3, 9 * (j - 1)))

@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.human.pose.polar import nearest_rotations, quats_of
+from dyngs.human.pose.nearest_rotation import nearest_rotations, quats_of
 
 EYE = torch.eye(3, dtype=torch.float64)
 AMBIGUOUS = {

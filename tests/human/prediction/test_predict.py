@@ -9,13 +9,13 @@ import torch
 from tiny_people import NET, people, person
 from torch import Tensor
 
-from dyngs.human.pose.skinning import rotations
-from dyngs.human.prediction.fill import Avatar, filled, inputs_of, num_channels
-from dyngs.human.prediction.maps import Maps
+from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.prediction.network import HEADS, AtlasNetwork
-from dyngs.human.prediction.sitter import Sitter
+from dyngs.human.prediction.person import CapturedPerson
+from dyngs.human.prediction.predict import PredictedAvatar, network_inputs, num_input_channels, predict_gaussians
+from dyngs.human.prediction.texel_maps import TexelMaps
 
-Shown = tuple[Sitter, Maps]
+Shown = tuple[CapturedPerson, TexelMaps]
 MEAN = torch.full((3, NET.resolution, NET.resolution), 0.25)
 
 
@@ -27,27 +27,29 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
 
 def network(bias: dict[str, float] | None = None) -> AtlasNetwork:
     """One that says the same everywhere: 0, or ``bias`` in every number of some heads."""
-    made = AtlasNetwork(num_channels(2), 2, (8, 8), torch.Generator().manual_seed(0))
+    made = AtlasNetwork(num_input_channels(2), 2, (8, 8), torch.Generator().manual_seed(0))
     names = [name for _ in range(2) for name, count in HEADS.items() for _ in range(count)]
     with torch.no_grad():
         made.heads.bias.copy_(torch.tensor([(bias or {}).get(name, 0.0) for name in names]))  # type: ignore[union-attr]
     return made
 
 
-def predicted(shown: Shown, bias: dict[str, float] | None = None) -> Avatar:
+def predicted(shown: Shown, bias: dict[str, float] | None = None) -> PredictedAvatar:
     with torch.no_grad():
-        return filled(*shown, MEAN, network(bias), 0.9)
+        return predict_gaussians(*shown, MEAN, network(bias), 0.9)
 
 
 def matrices(quats: Tensor) -> Tensor:
     """(N, 3, 3) of unit quaternions."""
     w, xyz = quats[:, :1].clamp(-1, 1), quats[:, 1:]
-    return rotations(torch.nn.functional.normalize(xyz, dim=1) * 2 * torch.atan2(xyz.norm(dim=1, keepdim=True), w))
+    return axis_angle_to_matrix(
+        torch.nn.functional.normalize(xyz, dim=1) * 2 * torch.atan2(xyz.norm(dim=1, keepdim=True), w)
+    )
 
 
 def test_without_a_network_texels_have_seen_or_mean_colours(shown: Shown) -> None:
     sitter, maps = shown
-    bare = filled(sitter, maps, MEAN, None, 0.9).gaussians
+    bare = predict_gaussians(sitter, maps, MEAN, None, 0.9).gaussians
     count = len(sitter.texels)
     seen = maps.seen[0] > 0
     torch.testing.assert_close(bare.base_rgb[:count][seen], maps.rgb[0][seen])
@@ -57,7 +59,7 @@ def test_without_a_network_texels_have_seen_or_mean_colours(shown: Shown) -> Non
 
 def test_an_untrained_network_changes_colours_a_little_and_nothing_else(shown: Shown) -> None:
     """It trusts pictures by 98 %."""
-    bare, untrained = filled(*shown, MEAN, None, 0.9), predicted(shown)
+    bare, untrained = predict_gaussians(*shown, MEAN, None, 0.9), predicted(shown)
     for name in ("means", "log_scales", "logit_opacities"):
         assert torch.equal(getattr(bare.gaussians, name), getattr(untrained.gaussians, name))
     torch.testing.assert_close(untrained.gaussians.quats, bare.gaussians.quats)
@@ -73,7 +75,7 @@ def test_the_skin_is_whole_and_scaffolds_are_carved(shown: Shown) -> None:
     torch.testing.assert_close(
         found.points[len(sitter.texels) :], (sitter.texels.points + 0.02 * sitter.texels.normals)[kept]
     )
-    every = filled(sitter, maps, MEAN, None, 0.0).gaussians
+    every = predict_gaussians(sitter, maps, MEAN, None, 0.0).gaussians
     assert len(found) < len(every) == len(sitter.texels) + int((maps.seen[1] > 0).sum())
 
 
@@ -82,7 +84,7 @@ def test_every_quaternion_is_normalised_by_itself(shown: Shown) -> None:
     bare, turned = predicted(shown).gaussians, predicted(shown, {"turn": 1.0}).gaussians
     torch.testing.assert_close(turned.quats.norm(dim=1), torch.ones(len(turned)))
     angle = 2 * torch.tensor(2 / 7**0.5).acos()
-    expected = matrices(bare.quats) @ rotations(torch.ones(3) / 3**0.5 * angle)
+    expected = matrices(bare.quats) @ axis_angle_to_matrix(torch.ones(3) / 3**0.5 * angle)
     torch.testing.assert_close(matrices(turned.quats), expected, atol=1e-5, rtol=0)  # float32
 
 
@@ -109,7 +111,7 @@ def test_unseen_texels_are_painted_and_mistrusted_ones_too(shown: Shown) -> None
 
 def test_all_heads_learn(shown: Shown) -> None:
     made = network()
-    avatar = filled(*shown, MEAN, made, 0.9)
+    avatar = predict_gaussians(*shown, MEAN, made, 0.9)
     sum(x.square().sum() for x in avatar.gaussians.tensors().values()).backward()  # type: ignore[union-attr]
     grad = made.heads.bias.grad
     assert grad is not None
@@ -119,9 +121,9 @@ def test_all_heads_learn(shown: Shown) -> None:
 
 def test_inputs_hold_everything_in_the_atlas(shown: Shown) -> None:
     sitter, maps = shown
-    found = inputs_of(sitter, maps, MEAN)
-    assert found.shape == (num_channels(2), NET.resolution, NET.resolution)
+    found = network_inputs(sitter, maps, MEAN)
+    assert found.shape == (num_input_channels(2), NET.resolution, NET.resolution)
     assert found[-1].sum() == len(sitter.texels)
-    other = inputs_of(sitter, replace(maps, rgb=1 - maps.rgb), MEAN)
+    other = network_inputs(sitter, replace(maps, rgb=1 - maps.rgb), MEAN)
     changed = (found != other).flatten(1).any(1)
     assert changed.tolist() == [True] * 3 + [False] * 2 + [True] * 3 + [False] * 12

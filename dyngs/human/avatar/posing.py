@@ -14,14 +14,14 @@ from torch import Tensor
 
 from dyngs.conventions import num_sh_terms
 from dyngs.gaussians import Gaussians
-from dyngs.human.motion.clips import Clip
-from dyngs.human.pose.covariance import moved_axes
-from dyngs.human.pose.polar import nearest_rotations, quats_of
-from dyngs.human.pose.skinning import apply, blended, joint_transforms, rotations
-from dyngs.human.template.body import Body
-from dyngs.human.template.uv import Texels, shells
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.pose.covariance import transform_covariance
+from dyngs.human.pose.nearest_rotation import nearest_rotations, quats_of
+from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
+from dyngs.human.template.atlas import Texels, scaffold_points
+from dyngs.human.template.body import BodyTemplate
 
-FOLLOWED = 8
+MAX_JOINTS = 8
 """Joints that one Gaussian follows at most; the template's vertices follow no more."""
 
 _WIDTH, _THICKNESS = 0.5, 0.25
@@ -76,7 +76,7 @@ class Skeleton:
 
 
 @dataclass(frozen=True)
-class PoseShapes:
+class PoseBlendShapes:
     """What a template's vertices do at rest when joints turn: SMPL's pose blend shapes (Loper et al. 2015).
 
     Attributes:
@@ -100,16 +100,16 @@ class PoseShapes:
         return (anchors.barycentric[..., None] * parts).sum(1)
 
 
-def pose_shapes(body: Body) -> PoseShapes | None:
+def pose_blend_shapes(body: BodyTemplate) -> PoseBlendShapes | None:
     """The pose blend shapes of ``body``, None where it has none; rounded to half precision, as runs store them.
 
     Each direction errs by 2^-11 of itself at most; where random ones shift points by 1 cm, points err by 8 micrometres.
     """
-    return None if body.pose_dirs is None else PoseShapes(body.pose_dirs.half().float(), body.faces)
+    return None if body.pose_dirs is None else PoseBlendShapes(body.pose_dirs.half().float(), body.faces)
 
 
 @dataclass(frozen=True)
-class Posing:
+class BodyPose:
     """One pose; differentiable.
 
     Attributes:
@@ -123,15 +123,15 @@ class Posing:
     scale: Tensor
 
 
-def first_gaussians(texels: Texels, heights: Sequence[float], sh_degree: int) -> tuple[Gaussians, Anchors]:
+def texel_gaussians(texels: Texels, heights: Sequence[float], sh_degree: int) -> tuple[Gaussians, Anchors]:
     """Grey discs on every texel, ``heights`` (m) above the surface, at rest; the lowest height is nearly opaque.
 
     A disc lies in the tangent plane, as wide as its texel; those of one height follow those of the one before.
     """
-    places = shells(texels, heights)
+    places = scaffold_points(texels, heights)
     of = places.texel
     size = texels.size[of]
-    joints, weights = heaviest(texels.weights)
+    joints, weights = heaviest_joints(texels.weights)
     rows, columns = (texels.index // texels.resolution, texels.index % texels.resolution)
     uv = torch.stack([columns + 0.5, texels.resolution - 0.5 - rows], dim=1).to(size) / texels.resolution
     anchors = Anchors(
@@ -156,9 +156,9 @@ def first_gaussians(texels: Texels, heights: Sequence[float], sh_degree: int) ->
     return gaussians, anchors
 
 
-def heaviest(weights: Tensor) -> tuple[Tensor, Tensor]:
+def heaviest_joints(weights: Tensor) -> tuple[Tensor, Tensor]:
     """Joints (P, K) int64 and shares (P, K), normalised, of the heaviest of ``weights`` (P, J); ties by index."""
-    count = min(FOLLOWED, weights.shape[1])
+    count = min(MAX_JOINTS, weights.shape[1])
     ordered = weights.sort(dim=1, descending=True, stable=True)
     kept = ordered.values[:, :count]
     return ordered.indices[:, :count].contiguous(), kept / kept.sum(1, keepdim=True)
@@ -177,8 +177,8 @@ def skinning_weights(anchors: Anchors, num_joints: int, corrections: Tensor | No
     return dense.scatter_add(1, anchors.joints, shares)
 
 
-def posed(
-    gaussians: Gaussians, weights: Tensor, skeleton: Skeleton, posing: Posing, offsets: Tensor | None = None
+def pose_gaussians(
+    gaussians: Gaussians, weights: Tensor, skeleton: Skeleton, posing: BodyPose, offsets: Tensor | None = None
 ) -> Gaussians:
     """The N Gaussians of the rest pose in another one, in the world; differentiable in everything.
 
@@ -193,31 +193,31 @@ def posed(
         posing: the pose.
         offsets: (N, 3) m, added to the means at rest; None is none.
     """
-    transforms = blended(weights, joint_transforms(skeleton.joints, skeleton.parents, posing.rotations))
+    transforms = blend_transforms(weights, joint_transforms(skeleton.joints, skeleton.parents, posing.rotations))
     linear = transforms[..., :3]
     means = gaussians.means if offsets is None else gaussians.means + offsets
-    quats, log_scales = moved_axes(linear, gaussians.quats, gaussians.log_scales)
+    quats, log_scales = transform_covariance(linear, gaussians.quats, gaussians.log_scales)
     return Gaussians(
-        means=posing.scale * apply(transforms, means) + posing.trans,
+        means=posing.scale * apply_transforms(transforms, means) + posing.trans,
         quats=quats,
         log_scales=log_scales + posing.scale.log(),
         logit_opacities=gaussians.logit_opacities,
-        sh=gaussians.sh if gaussians.sh.shape[1] == 1 else turned_colours(gaussians.sh, nearest_rotations(linear)),
+        sh=gaussians.sh if gaussians.sh.shape[1] == 1 else rotate_sh(gaussians.sh, nearest_rotations(linear)),
     )
 
 
-def offsets_at_rest(
-    anchors: Anchors, weights: Tensor, posing: Posing, shapes: PoseShapes | None, pose_dirs: Tensor | None
+def rest_offsets(
+    anchors: Anchors, weights: Tensor, posing: BodyPose, shapes: PoseBlendShapes | None, pose_dirs: Tensor | None
 ) -> Tensor | None:
     """(N, 3) what a pose adds to the places at rest, m: of the template and as learned, either of which may lack."""
     given = None if shapes is None else shapes.offsets(anchors, posing.rotations)
     if pose_dirs is None:
         return given
-    learned = pose_offsets(weights, posing, pose_dirs)
+    learned = learned_offsets(weights, posing, pose_dirs)
     return learned if given is None else given + learned
 
 
-def pose_offsets(weights: Tensor, posing: Posing, pose_dirs: Tensor) -> Tensor:
+def learned_offsets(weights: Tensor, posing: BodyPose, pose_dirs: Tensor) -> Tensor:
     """(N, 3) offsets P vec(sum_j w_j (R_j - 1)), m, with P the ``pose_dirs`` (N, 27) as 3 x 9; the root does not count.
 
     As SMPL's pose blend shapes (Loper et al. 2015), but learned, and only of the joints that a Gaussian follows.
@@ -231,7 +231,7 @@ def _bends(rotations: Tensor) -> Tensor:
     return rotations - torch.eye(3, dtype=rotations.dtype)
 
 
-def turned_colours(sh: Tensor, turns: Tensor) -> Tensor:
+def rotate_sh(sh: Tensor, turns: Tensor) -> Tensor:
     """(N, 4, 3) coefficients of degree 1 such that the colour seen along ``turns`` (N, 3, 3) d is what it was along d.
 
     The terms of degree 1 are -y, z, -x: coefficients are a vector v, the colour v . d.
@@ -241,6 +241,6 @@ def turned_colours(sh: Tensor, turns: Tensor) -> Tensor:
     return torch.stack([sh[:, 0], -y, z, -x], dim=1)
 
 
-def posing_of(clip: Clip, row: int) -> Posing:
+def frame_pose(clip: MotionClip, row: int) -> BodyPose:
     """The pose of one frame of a clip."""
-    return Posing(rotations(clip.poses[row]), clip.trans[row], clip.scale[row])
+    return BodyPose(axis_angle_to_matrix(clip.poses[row]), clip.trans[row], clip.scale[row])

@@ -15,16 +15,16 @@ from torch import Tensor
 
 from dyngs.config import HumanModel
 from dyngs.deform.learned import LearnedTensors
-from dyngs.human.avatar.avatar import Anchors, Posing, Skeleton, skinning_weights
-from dyngs.human.motion.clips import Clip
-from dyngs.human.pose.skinning import rotations
+from dyngs.human.avatar.posing import Anchors, BodyPose, Skeleton, skinning_weights
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.pose.skinning import axis_angle_to_matrix
 
 POSE_CM = 0.05
 """Turn of a joint, rad, that counts as much as a centimetre."""
 
 
 @dataclass(frozen=True)
-class Fit:
+class SharedCorrection:
     """What was learned about all poses of a person.
 
     Attributes:
@@ -41,10 +41,10 @@ class Corrections:
 
     Names: ``poses`` (F, J, 3) axis-angle, applied before the given rotation of a joint; ``trans`` (F, 3); ``turns``
     (J, 3) as ``poses`` but of all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K); as an option
-    ``pose_dirs`` (N, 27), see ``dyngs.human.avatar.avatar.pose_offsets``.
+    ``pose_dirs`` (N, 27), see ``dyngs.human.avatar.posing.learned_offsets``.
     """
 
-    def __init__(self, options: HumanModel, clip: Clip, skeleton: Skeleton, anchors: Anchors) -> None:
+    def __init__(self, options: HumanModel, clip: MotionClip, skeleton: Skeleton, anchors: Anchors) -> None:
         self.options = options
         unit = float(clip.scale.mean())
         rates = {
@@ -93,17 +93,19 @@ class Corrections:
         return terms
 
 
-def corrected_posing(learned: LearnedTensors | Mapping[str, Tensor], clip: Clip, row: int) -> Posing:
+def corrected_pose(learned: LearnedTensors | Mapping[str, Tensor], clip: MotionClip, row: int) -> BodyPose:
     """The pose of frame ``row`` of the clip that was trained on."""
-    own = rotations(learned["turns"] + learned["poses"][row])
-    return Posing(
-        rotations(clip.poses[row]) @ own,
+    own = axis_angle_to_matrix(learned["turns"] + learned["poses"][row])
+    return BodyPose(
+        axis_angle_to_matrix(clip.poses[row]) @ own,
         clip.trans[row] + learned["trans"][row],
         clip.scale[row] * learned["log_scale"][0].exp(),
     )
 
 
-def corrected_clip(fit: Fit, clip: Clip, poses: Tensor | None = None, trans: Tensor | None = None) -> Clip:
+def corrected_clip(
+    fit: SharedCorrection, clip: MotionClip, poses: Tensor | None = None, trans: Tensor | None = None
+) -> MotionClip:
     """The clip with ``fit`` applied, and with what was learned about its own ``poses`` (F, J, 3) and ``trans`` (F, 3).
 
     The poses of ``corrected_posing`` as axis-angle vectors.

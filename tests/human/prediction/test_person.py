@@ -11,23 +11,23 @@ from tiny_people import NET, body, people, person
 from dyngs.config import DataConfig
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.human.prediction.sitter import Sitter, named_views, sitter_of, spread_views
+from dyngs.human.prediction.person import CapturedPerson, captured_person, named_views, spread_views
 from dyngs.train.predictor import human_options
 
 
 @pytest.fixture(scope="module")
-def sitter(tmp_path_factory: pytest.TempPathFactory) -> Sitter:
+def sitter(tmp_path_factory: pytest.TempPathFactory) -> CapturedPerson:
     return person(people(tmp_path_factory.mktemp("people"), (1,)) / "p1").sitter
 
 
-def gaps(sitter: Sitter, chosen: list[int]) -> list[float]:
+def gaps(sitter: CapturedPerson, chosen: list[int]) -> list[float]:
     """Degrees between neighbours on the ring, all around."""
     centers = [-v.cam_from_world[:3, :3].T @ v.cam_from_world[:3, 3] for v in (sitter.views[i] for i in chosen)]
     azimuths = np.sort([np.degrees(np.arctan2(c[0], c[2])) % 360 for c in centers])
     return sorted(np.diff([*azimuths, azimuths[0] + 360]))
 
 
-def test_chosen_views_are_spread_around_the_person(sitter: Sitter) -> None:
+def test_chosen_views_are_spread_around_the_person(sitter: CapturedPerson) -> None:
     """Of eight cameras 45 degrees apart, three leave no gap above 135 degrees, two are opposite, four every other."""
     np.testing.assert_allclose(gaps(sitter, spread_views(sitter, 3)), [90, 135, 135])
     np.testing.assert_allclose(gaps(sitter, spread_views(sitter, 2)), [180, 180])
@@ -38,13 +38,13 @@ def test_chosen_views_are_spread_around_the_person(sitter: Sitter) -> None:
 
 
 @pytest.mark.parametrize("first", range(8))
-def test_a_given_view_is_among_them(sitter: Sitter, first: int) -> None:
+def test_a_given_view_is_among_them(sitter: CapturedPerson, first: int) -> None:
     chosen = spread_views(sitter, 3, first)
     assert first in chosen
     np.testing.assert_allclose(gaps(sitter, chosen), [90, 135, 135])
 
 
-def test_views_by_name(sitter: Sitter) -> None:
+def test_views_by_name(sitter: CapturedPerson) -> None:
     """In the order given; of the view, or of its file."""
     assert named_views(sitter, ["f000_c05.png", sitter.views[2].name]) == [5, 2]
     with pytest.raises(DyngsError, match="no training view is 'nobody'; the first is"):
@@ -53,7 +53,7 @@ def test_views_by_name(sitter: Sitter) -> None:
         named_views(sitter, ["f000_c05.png", sitter.views[5].name])
 
 
-def test_a_sitter_has_a_disc_per_texel_and_scaffold(sitter: Sitter) -> None:
+def test_a_sitter_has_a_disc_per_texel_and_scaffold(sitter: CapturedPerson) -> None:
     assert sitter.heights == (0.0, 0.02)
     assert len(sitter.gaussians) == len(sitter.subject.anchors) == 2 * len(sitter.texels)
     assert sitter.body.num_shapes == 0
@@ -61,9 +61,9 @@ def test_a_sitter_has_a_disc_per_texel_and_scaffold(sitter: Sitter) -> None:
     np.testing.assert_allclose(away.numpy(), 0.02, atol=1e-6)  # float32
 
 
-def test_captures_without_a_body_or_silhouettes_are_refused(sitter: Sitter, tmp_path: Path) -> None:
+def test_captures_without_a_body_or_silhouettes_are_refused(sitter: CapturedPerson, tmp_path: Path) -> None:
     capture = read_capture(DataConfig.model_validate({"root": people(tmp_path, (2,)) / "p2"}))
     with pytest.raises(DyngsError, match="no body parameters"):
-        sitter_of(capture.replace(body=None), human_options(NET), body())
+        captured_person(capture.replace(body=None), human_options(NET), body())
     with pytest.raises(DyngsError, match="no silhouettes"):
-        sitter_of(capture.replace(has_alpha=False), human_options(NET), body())
+        captured_person(capture.replace(has_alpha=False), human_options(NET), body())

@@ -13,15 +13,15 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Picture
-from dyngs.human.avatar.avatar import Posing, Skeleton
-from dyngs.human.pose.skinning import apply, blended, joint_transforms
+from dyngs.human.avatar.posing import BodyPose, Skeleton
+from dyngs.human.pose.skinning import apply_transforms, blend_transforms, joint_transforms
 
 _FACING = 4
 """Power of the cosine between normal and view that weights colours: who sees a place head-on, sees it truly."""
 
 
 @dataclass(frozen=True)
-class Places:
+class SurfacePoints:
     """N places on a body at rest, m.
 
     Attributes:
@@ -34,16 +34,16 @@ class Places:
     points: Tensor
     normals: Tensor
     weights: Tensor
-    offsets: Callable[[Posing], Tensor | None] | None = None
+    offsets: Callable[[BodyPose], Tensor | None] | None = None
 
-    def at_rest(self, posing: Posing) -> Tensor:
+    def at_rest(self, posing: BodyPose) -> Tensor:
         """(N, 3) the points as they are before skinning to a pose, m."""
         offsets = None if self.offsets is None else self.offsets(posing)
         return self.points if offsets is None else self.points + offsets
 
 
 @dataclass(frozen=True)
-class Sightings:
+class PointObservations:
     """What pictures show where N places are.
 
     Attributes:
@@ -57,14 +57,18 @@ class Sightings:
 
 
 @torch.no_grad()
-def sightings(places: Places, skeleton: Skeleton, shown: Iterable[tuple[Picture, Posing]]) -> Sightings:
+def observe_points(
+    places: SurfacePoints, skeleton: Skeleton, shown: Iterable[tuple[Picture, BodyPose]]
+) -> PointObservations:
     """Where the pictures show the places, each in the pose of its picture. What hides what is not considered."""
     count = len(places.points)
     inside, looked, weight = (torch.zeros(count) for _ in range(3))
     colour = torch.zeros(count, 3)
     for picture, posing in shown:
-        transforms = blended(places.weights, joint_transforms(skeleton.joints, skeleton.parents, posing.rotations))
-        world = posing.scale * apply(transforms, places.at_rest(posing)) + posing.trans
+        transforms = blend_transforms(
+            places.weights, joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
+        )
+        world = posing.scale * apply_transforms(transforms, places.at_rest(posing)) + posing.trans
         normals = (transforms[..., :3] * places.normals[:, None]).sum(-1)
         column, row, in_frame = _pixels(world, picture.cameras)
         covered = in_frame.float() if picture.alpha is None else picture.alpha[row, column] * in_frame
@@ -76,7 +80,7 @@ def sightings(places: Places, skeleton: Skeleton, shown: Iterable[tuple[Picture,
         weight += facing * covered
     seen = weight > 1e-3
     rgb = torch.where(seen[:, None], colour / weight.clamp_min(1e-3)[:, None], 0.5)
-    return Sightings(torch.where(looked > 0, inside / looked.clamp_min(1), 1.0), rgb.clamp(0, 1))
+    return PointObservations(torch.where(looked > 0, inside / looked.clamp_min(1), 1.0), rgb.clamp(0, 1))
 
 
 def _pixels(world: Tensor, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:

@@ -17,16 +17,16 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.human.template.body import Body, default_body
-from dyngs.human.template.uv import Texels, neighbours, shells, texels_of
+from dyngs.human.template.atlas import Texels, atlas_texels, nearest_neighbours, scaffold_points
+from dyngs.human.template.body import BodyTemplate, default_template
 
 NUM_JOINTS = 2
 
 
-def body_of(vertices: Tensor, faces: Tensor, uv: Tensor, uv_faces: Tensor | None = None) -> Body:
+def body_of(vertices: Tensor, faces: Tensor, uv: Tensor, uv_faces: Tensor | None = None) -> BodyTemplate:
     """A template with two joints; the share of the second grows with x, from 0 at x = 0 to 1 at x = 1."""
     share = vertices[:, :1]
-    return Body(
+    return BodyTemplate(
         name="test",
         vertices=vertices,
         faces=faces,
@@ -38,19 +38,19 @@ def body_of(vertices: Tensor, faces: Tensor, uv: Tensor, uv_faces: Tensor | None
     )
 
 
-def sheet(uv: Tensor, faces: Tensor) -> Body:
+def sheet(uv: Tensor, faces: Tensor) -> BodyTemplate:
     """The part of the plane z = 0.25 whose texture is itself, facing +z where ``faces`` are counter-clockwise."""
     return body_of(torch.cat([uv, torch.full((len(uv), 1), 0.25)], dim=1), faces, uv)
 
 
-def square(flipped: bool = False) -> Body:
+def square(flipped: bool = False) -> BodyTemplate:
     """A square of side 1 of two triangles; its texture upright or mirrored."""
     corners = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     body = sheet(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]))
     return replace(body, uv=corners * torch.tensor([-1.0, 1]) + torch.tensor([1.0, 0])) if flipped else body
 
 
-def cube(turned_diagonals: int) -> Body:
+def cube(turned_diagonals: int) -> BodyTemplate:
     """The cube [0, 1]^3, each side a third of the atlas' width and half of its height; 6 bits turn its diagonals."""
     vertices = torch.tensor(list(product((0.0, 1.0), repeat=3)))
     sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -70,7 +70,7 @@ def centres(texels: Texels) -> Tensor:
     return torch.stack([(column + 0.5) / texels.resolution, 1 - (row + 0.5) / texels.resolution], dim=1)
 
 
-def face_normals(body: Body, faces: Tensor) -> Tensor:
+def face_normals(body: BodyTemplate, faces: Tensor) -> Tensor:
     corners = body.vertices[body.faces[faces]].double()
     cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], dim=-1)
     return torch.nn.functional.normalize(cross, dim=-1)
@@ -86,7 +86,7 @@ def assert_frames(texels: Texels) -> None:
 @cache
 def anny(resolution: int) -> Texels:
     """Texels of the shipped template."""
-    return texels_of(default_body(), resolution)
+    return atlas_texels(default_template(), resolution)
 
 
 # --- which triangle has a texel ---------------------------------------------------------------------------------------
@@ -112,7 +112,7 @@ def test_the_first_triangle_that_holds_the_centre_has_the_texel(corners: np.ndar
     """On a grid on which centres lie on edges and corners; triangles overlap, are degenerate, or leave the atlas."""
     uv = torch.from_numpy(corners.reshape(-1, 2) / 64).float()
     body = body_of(torch.rand(12, 3, generator=torch.Generator().manual_seed(0)), torch.arange(12).reshape(4, 3), uv)
-    texels = texels_of(body, resolution)
+    texels = atlas_texels(body, resolution)
     found = dict(zip(texels.index.tolist(), texels.faces.tolist(), strict=True))
     expected = {}
     for row, column in product(range(resolution), repeat=2):
@@ -132,7 +132,7 @@ def test_a_triangulated_square_has_neither_holes_nor_overlap(seed: int, resoluti
     uv = np.concatenate([points, [[0, 0], [1, 0], [1, 1], [0, 1]], np.round(points * resolution) / resolution])
     uv = np.unique(uv.astype(np.float32), axis=0)
     faces = torch.from_numpy(Delaunay(uv).simplices).long()
-    texels = texels_of(sheet(torch.from_numpy(uv), faces), resolution)
+    texels = atlas_texels(sheet(torch.from_numpy(uv), faces), resolution)
     assert torch.equal(texels.index, torch.arange(resolution**2))
     shares = texels.barycentric
     assert float(shares.min()) >= 0
@@ -148,15 +148,15 @@ def test_no_texel_is_lost_on_a_shared_edge(start: float, column: int, row: int) 
     u, v = (column + 0.5) / 7, 1 - (row + 0.5) / 7
     end = start + (v - start) / u
     uv = torch.tensor([[0.0, -9], [1, -9], [0, start], [1, end], [0, 9], [1, 9]], dtype=torch.float64)
-    texels = texels_of(sheet(uv, torch.tensor([[0, 1, 3], [0, 3, 2], [2, 3, 5], [2, 5, 4]])), 7)
+    texels = atlas_texels(sheet(uv, torch.tensor([[0, 1, 3], [0, 3, 2], [2, 3, 5], [2, 5, 4]])), 7)
     assert torch.equal(texels.index, torch.arange(49))
 
 
 def test_the_first_row_is_at_the_top() -> None:
     """v grows upwards: the upper left texel is that at u = 0, v = 1."""
     body = sheet(torch.tensor([[0.0, 1], [0, 0.75], [0.25, 1]]), torch.tensor([[0, 1, 2]]))
-    assert texels_of(body, 4).index.tolist() == [0]
-    assert texels_of(body, 8).index.tolist() == [0, 1, 8]
+    assert atlas_texels(body, 4).index.tolist() == [0]
+    assert atlas_texels(body, 8).index.tolist() == [0, 1, 8]
 
 
 def test_degenerate_triangles_cover_nothing() -> None:
@@ -165,24 +165,24 @@ def test_degenerate_triangles_cover_nothing() -> None:
     assert body.uv is not None
     flat = body.vertices.clone()
     flat[1] = flat[0]
-    texels = texels_of(body, 4, vertices=flat)
+    texels = atlas_texels(body, 4, vertices=flat)
     assert texels.index.tolist() == [0, 1, 2, 3, 4, 5, 6, 8, 9, 12]
     assert set(texels.faces.tolist()) == {1}
     uv = body.uv.clone()
     uv[1] = 0.5 * (uv[0] + uv[2])
-    assert torch.equal(texels_of(replace(body, uv=uv), 4).index, texels.index)
+    assert torch.equal(atlas_texels(replace(body, uv=uv), 4).index, texels.index)
     sliver = uv.double()
     sliver[1, 0] += 1e-11
-    assert set(texels_of(replace(body, uv=sliver), 4).faces.tolist()) == {1}
+    assert set(atlas_texels(replace(body, uv=sliver), 4).faces.tolist()) == {1}
     uv[1] = math.nan
-    assert torch.equal(texels_of(replace(body, uv=uv), 4).index, texels.index)
+    assert torch.equal(atlas_texels(replace(body, uv=uv), 4).index, texels.index)
 
 
 # --- where it lies on the surface -------------------------------------------------------------------------------------
 
 
 def test_on_a_plane_everything_is_known() -> None:
-    texels = texels_of(square(), 8)
+    texels = atlas_texels(square(), 8)
     u, v = centres(texels).unbind(1)
     assert len(texels) == 64
     torch.testing.assert_close(texels.points, torch.stack([u, v, torch.full((64,), 0.25)], dim=1))
@@ -195,14 +195,14 @@ def test_a_skewed_atlas_keeps_the_tangent_along_u() -> None:
     """x = 3 u - v, y = 2 v: u grows along +x where v is constant; area 6 of the unit square."""
     body = square()
     x, y, z = body.vertices.unbind(1)
-    texels = texels_of(body, 4, vertices=torch.stack([3 * x - y, 2 * y, z], dim=1))
+    texels = atlas_texels(body, 4, vertices=torch.stack([3 * x - y, 2 * y, z], dim=1))
     torch.testing.assert_close(texels.frames, torch.eye(3).expand(16, 3, 3))
     torch.testing.assert_close(texels.size, torch.full((16,), math.sqrt(6) / 4))
 
 
 def test_mirrored_texture_has_right_handed_frames_all_the_same() -> None:
     """Only the tangent and the bitangent turn round."""
-    texels = texels_of(square(flipped=True), 8)
+    texels = atlas_texels(square(flipped=True), 8)
     expected = torch.diag(torch.tensor([-1.0, -1, 1])).expand(64, 3, 3)
     torch.testing.assert_close(texels.frames, expected)
     torch.testing.assert_close(texels.points[:, 0], 1 - centres(texels)[:, 0])
@@ -212,7 +212,7 @@ def test_mirrored_texture_has_right_handed_frames_all_the_same() -> None:
 def test_cube(turned_diagonals: int) -> None:
     """Normals at corners are diagonal however its sides are cut; elsewhere they are blends; areas are exact."""
     body = cube(turned_diagonals)
-    texels = texels_of(body, 24)
+    texels = atlas_texels(body, 24)
     assert len(texels) == 24 * 24
     around = body.faces[texels.faces]
     corners = 2 * body.vertices[around] - 1
@@ -230,7 +230,7 @@ def test_a_sheet_with_two_sides_has_the_normals_of_its_faces() -> None:
     uv = torch.tensor([[0.0, 0], [0.5, 0], [0, 0.5], [1, 1], [0.5, 1], [1, 0.5]])
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     body = body_of(vertices, torch.tensor([[0, 1, 2], [0, 2, 1]]), uv, torch.tensor([[0, 1, 2], [3, 4, 5]]))
-    texels = texels_of(body, 8)
+    texels = atlas_texels(body, 8)
     assert set(texels.faces.tolist()) == {0, 1}
     expected = torch.tensor([[0.0, 0, 1], [0, 0, -1]])[texels.faces]
     torch.testing.assert_close(texels.normals, expected)
@@ -244,7 +244,7 @@ def test_a_normal_along_the_tangent_still_has_a_frame() -> None:
     faces = torch.tensor([[0, 1, 2], [0, 2, 1], [0, 3, 4], [1, 5, 6], [2, 7, 8]])
     uv_faces = torch.tensor([[0, 1, 2], [3, 3, 3], [3, 3, 3], [3, 3, 3], [3, 3, 3]])
     uv = torch.cat([sides[:, :2], torch.zeros(1, 2)])
-    texels = texels_of(body_of(torch.cat([sides, fins]), faces, uv, uv_faces), 8)
+    texels = atlas_texels(body_of(torch.cat([sides, fins]), faces, uv, uv_faces), 8)
     assert set(texels.faces.tolist()) == {0}
     torch.testing.assert_close(texels.normals, torch.tensor([1.0, 0, 0]).expand(len(texels), 3))
     assert_frames(texels)
@@ -252,8 +252,8 @@ def test_a_normal_along_the_tangent_still_has_a_frame() -> None:
 
 def test_a_larger_person_has_larger_texels() -> None:
     """The rest shape may be another than the template's."""
-    body = default_body()
-    usual, large = anny(64), texels_of(body, 64, vertices=2 * body.vertices)
+    body = default_template()
+    usual, large = anny(64), atlas_texels(body, 64, vertices=2 * body.vertices)
     assert torch.equal(large.index, usual.index)
     torch.testing.assert_close(large.points, 2 * usual.points)
     torch.testing.assert_close(large.size, 2 * usual.size)
@@ -264,13 +264,13 @@ def test_a_larger_person_has_larger_texels() -> None:
 def test_what_cannot_be_done() -> None:
     body = square()
     with pytest.raises(DyngsError, match="'test' has no texture coordinates"):
-        texels_of(replace(body, uv=None, uv_faces=None), 8)
+        atlas_texels(replace(body, uv=None, uv_faces=None), 8)
     with pytest.raises(DyngsError, match="at least 1, got 0"):
-        texels_of(body, 0)
+        atlas_texels(body, 0)
     with pytest.raises(DyngsError, match=r"must be \(4, 3\) finite numbers, got \(5, 3\)"):
-        texels_of(body, 8, vertices=torch.zeros(5, 3))
+        atlas_texels(body, 8, vertices=torch.zeros(5, 3))
     with pytest.raises(DyngsError, match="NaN"):
-        texels_of(body, 8, vertices=torch.full((4, 3), math.nan))
+        atlas_texels(body, 8, vertices=torch.full((4, 3), math.nan))
 
 
 # --- the shipped template ---------------------------------------------------------------------------------------------
@@ -290,7 +290,7 @@ def test_texels_of_the_template(resolution: int, count: int) -> None:
 
 def test_texels_lie_on_their_faces_which_look_outwards() -> None:
     """Smooth normals differ from those of faces, but nowhere by 90 degrees."""
-    body, texels = default_body(), anny(256)
+    body, texels = default_template(), anny(256)
     flat = face_normals(body, texels.faces)
     corner = body.vertices[body.faces[texels.faces, 0]].double()
     above = ((texels.points.double() - corner) * flat).sum(1)
@@ -304,7 +304,7 @@ def test_texels_lie_on_their_faces_which_look_outwards() -> None:
 
 
 def test_squares_of_the_sizes_add_up_to_the_surface() -> None:
-    body = default_body()
+    body = default_template()
     corners = body.vertices[body.faces].double()
     cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], dim=-1)
     area = 0.5 * float(cross.norm(dim=1).sum())
@@ -318,7 +318,7 @@ def test_squares_of_the_sizes_add_up_to_the_surface() -> None:
 
 def test_shells_are_displaced_by_exactly_their_height() -> None:
     texels, heights = anny(64), (0.0, 0.01, 0.04)
-    places = shells(texels, heights)
+    places = scaffold_points(texels, heights)
     count = len(texels)
     assert len(places) == 3 * count
     apart = (places.points(texels) - texels.points[places.texel]).double()
@@ -332,11 +332,11 @@ def test_shells_are_displaced_by_exactly_their_height() -> None:
 
 
 def test_a_subset_of_places_stays_above_another_rest_shape() -> None:
-    texels = texels_of(square(), 4)
-    places = shells(texels, (0.0, 0.5)).select(torch.tensor([17, 3, 17]))
+    texels = atlas_texels(square(), 4)
+    places = scaffold_points(texels, (0.0, 0.5)).select(torch.tensor([17, 3, 17]))
     assert places.texel.tolist() == [1, 3, 1]
     assert places.height.tolist() == [0.5, 0.0, 0.5]
-    raised = texels_of(square(), 4, vertices=square().vertices + torch.tensor([0.0, 0, 1]))
+    raised = atlas_texels(square(), 4, vertices=square().vertices + torch.tensor([0.0, 0, 1]))
     assert places.points(raised).tolist() == [[0.375, 0.875, 1.75], [0.875, 0.875, 1.25], [0.375, 0.875, 1.75]]
     assert len(places.select(torch.tensor([True, False, True]))) == 2
 
@@ -344,7 +344,7 @@ def test_a_subset_of_places_stays_above_another_rest_shape() -> None:
 @pytest.mark.parametrize("heights", [(), (0.0, math.nan), (math.inf,)])
 def test_heights_are_numbers(heights: tuple[float, ...]) -> None:
     with pytest.raises(DyngsError, match="one or more finite numbers"):
-        shells(texels_of(square(), 2), heights)
+        scaffold_points(atlas_texels(square(), 2), heights)
 
 
 # --- neighbours -------------------------------------------------------------------------------------------------------
@@ -355,7 +355,7 @@ def test_heights_are_numbers(heights: tuple[float, ...]) -> None:
 def test_neighbours_are_the_nearest_others(places: np.ndarray, count: int) -> None:
     """By all distances; on a grid, so that many points coincide and are equally far."""
     points = torch.from_numpy(places)
-    found = neighbours(points, count)
+    found = nearest_neighbours(points, count)
     columns = max(0, min(count, len(points) - 1))
     assert found.shape == (len(points), columns)
     apart = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
@@ -368,7 +368,7 @@ def test_neighbours_are_the_nearest_others(places: np.ndarray, count: int) -> No
 
 def test_neighbours_on_the_skin_are_next_texels() -> None:
     texels = anny(64)
-    found = neighbours(texels.points)
+    found = nearest_neighbours(texels.points)
     assert found.shape == (len(texels), 5)
     apart = (texels.points[found] - texels.points[:, None]).norm(dim=-1)
     assert bool((apart.diff(dim=1) >= 0).all())
@@ -379,4 +379,4 @@ def test_neighbours_need_finite_points() -> None:
     points = torch.rand(10, 3)
     points[4, 1] = math.nan
     with pytest.raises(DyngsError, match="not finite"):
-        neighbours(points)
+        nearest_neighbours(points)

@@ -6,10 +6,10 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Picture
-from dyngs.human.avatar.avatar import Posing, Skeleton
-from dyngs.human.avatar.carve import Places, sightings
+from dyngs.human.avatar.observations import SurfacePoints, observe_points
+from dyngs.human.avatar.posing import BodyPose, Skeleton
 
-STILL = Posing(torch.eye(3)[None], torch.zeros(3), torch.tensor(1.0))
+STILL = BodyPose(torch.eye(3)[None], torch.zeros(3), torch.tensor(1.0))
 SKELETON = Skeleton(torch.zeros(1, 3), (-1,))
 
 
@@ -25,33 +25,33 @@ def picture(rgb: tuple[float, float, float], half: float, with_alpha: bool = Tru
     return Picture("disc", cameras, alpha[..., None] * torch.tensor(rgb), alpha if with_alpha else None, None, 0.0, 0)
 
 
-def places(points: list[list[float]], normal: tuple[float, float, float] = (0.0, 0.0, -1.0)) -> Places:
+def places(points: list[list[float]], normal: tuple[float, float, float] = (0.0, 0.0, -1.0)) -> SurfacePoints:
     count = len(points)
-    return Places(torch.tensor(points), torch.tensor([normal]).repeat(count, 1), torch.ones(count, 1))
+    return SurfacePoints(torch.tensor(points), torch.tensor([normal]).repeat(count, 1), torch.ones(count, 1))
 
 
 def test_the_share_of_silhouettes_counts() -> None:
     shown = [(picture((1, 0, 0), half), STILL) for half in (0.5, 0.5, 0.1, 0.5)]
-    found = sightings(places([[0.0, 0, 0], [0.3, 0, 0], [0.8, 0, 0], [50.0, 0, 0]]), SKELETON, shown)
+    found = observe_points(places([[0.0, 0, 0], [0.3, 0, 0], [0.8, 0, 0], [50.0, 0, 0]]), SKELETON, shown)
     assert found.inside.tolist() == [1.0, 0.75, 0.0, 1.0]
 
 
 def test_places_are_looked_up_in_the_pose_of_the_picture() -> None:
-    moved = Posing(torch.eye(3)[None], torch.tensor([-0.6, 0.0, 0.0]), torch.tensor(2.0))
-    found = sightings(places([[0.3, 0, 0], [0.0, 0, 0]]), SKELETON, [(picture((1, 0, 0), 0.3), moved)])
+    moved = BodyPose(torch.eye(3)[None], torch.tensor([-0.6, 0.0, 0.0]), torch.tensor(2.0))
+    found = observe_points(places([[0.3, 0, 0], [0.0, 0, 0]]), SKELETON, [(picture((1, 0, 0), 0.3), moved)])
     assert found.inside.tolist() == [1.0, 0.0]
 
 
 def test_colours_are_those_of_the_cameras_in_front() -> None:
     shown = [(picture((1.0, 0.2, 0.0), 0.5), STILL), (picture((0.0, 0.0, 1.0), 0.5, turned=True), STILL)]
-    front = sightings(places([[0.0, 0, 0]]), SKELETON, shown).rgb[0]
-    back = sightings(places([[0.0, 0, 0]], (0.0, 0.0, 1.0)), SKELETON, shown).rgb[0]
+    front = observe_points(places([[0.0, 0, 0]]), SKELETON, shown).rgb[0]
+    back = observe_points(places([[0.0, 0, 0]], (0.0, 0.0, 1.0)), SKELETON, shown).rgb[0]
     torch.testing.assert_close(front, torch.tensor([1.0, 0.2, 0.0]))
     torch.testing.assert_close(back, torch.tensor([0.0, 0.0, 1.0]))
 
 
 def test_what_nobody_sees_is_grey_and_without_alpha_nothing_is_carved() -> None:
-    aside = sightings(places([[0.0, 0, 0]], (1.0, 0.0, 0.0)), SKELETON, [(picture((1, 0, 0), 0.5), STILL)])
+    aside = observe_points(places([[0.0, 0, 0]], (1.0, 0.0, 0.0)), SKELETON, [(picture((1, 0, 0), 0.5), STILL)])
     torch.testing.assert_close(aside.rgb[0], torch.full((3,), 0.5))
-    opaque = sightings(places([[0.8, 0, 0]]), SKELETON, [(picture((1, 0, 0), 0.5, with_alpha=False), STILL)])
+    opaque = observe_points(places([[0.8, 0, 0]]), SKELETON, [(picture((1, 0, 0), 0.5, with_alpha=False), STILL)])
     assert opaque.inside.tolist() == [1.0]

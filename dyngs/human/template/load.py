@@ -9,32 +9,32 @@ from torch import Tensor
 
 from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
-from dyngs.human.template.body import DEFAULT_FILE, Body, default_body, shaped
-from dyngs.human.template.body_files import load_body
+from dyngs.human.template.body import DEFAULT_FILE, BodyTemplate, apply_shape, default_template
+from dyngs.human.template.body_reader import read_body
 
 
-def template_file(model: HumanModel) -> Path:
+def template_path(model: HumanModel) -> Path:
     """The body file that ``model`` names, or that of the free template."""
     return DEFAULT_FILE if model.body is None else model.body
 
 
-def template(model: HumanModel) -> Body:
+def load_template(model: HumanModel) -> BodyTemplate:
     """The body file that ``model`` names, or the free template.
 
     Raises:
         DyngsError: the file cannot be read.
     """
     if model.body is None and model.uv is None:
-        return default_body()
+        return default_template()
     if model.body is None:
         raise DyngsError(f"model.uv={model.uv} goes with model.body; the free template has texture coordinates")
-    return load_body(model.body, model.uv)
+    return read_body(model.body, model.uv)
 
 
-def rest_shape(body: Body, betas: Tensor) -> tuple[Tensor, Tensor]:
+def rest_shape(body: BodyTemplate, betas: Tensor) -> tuple[Tensor, Tensor]:
     """Vertices (M, 3) and joints (J, 3) at rest in the shape ``betas`` (B,), of which those count that ``body`` has.
 
     A body without a shape space is as it is: bone lengths are learned.
     """
     with torch.no_grad():
-        return shaped(body, betas[: body.num_shapes])
+        return apply_shape(body, betas[: body.num_shapes])

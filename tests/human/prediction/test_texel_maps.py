@@ -18,14 +18,14 @@ from dyngs.data.capture import BodyFrames, Capture, View
 from dyngs.data.geometry.poses import cam_from_opengl
 from dyngs.data.loader import Picture
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
-from dyngs.human.avatar.avatar import Posing
+from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.motion.motion import JOINTS
-from dyngs.human.prediction.maps import from_atlas, maps_of, to_atlas
-from dyngs.human.prediction.sitter import Sitter, sitter_of
+from dyngs.human.prediction.person import CapturedPerson, captured_person
+from dyngs.human.prediction.texel_maps import from_atlas, observe_texels, to_atlas
 from dyngs.human.synthetic.capture import PosedMesh, render_mesh
-from dyngs.human.synthetic.clothes import atlas_of, texture_places
-from dyngs.human.template.body import Body, default_body, posed_vertices
-from dyngs.human.template.mesh import interpolated, visible
+from dyngs.human.synthetic.clothes import texel_coordinates, texture_coordinates
+from dyngs.human.template.body import BodyTemplate, default_template, posed_vertices
+from dyngs.human.template.mesh import interpolate, rasterize
 
 SIZE = 96
 FRONT = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3.5], [0, 0, 0, 1]])
@@ -34,16 +34,16 @@ RIGHT = np.array([[0.0, 0, -1, -3.5], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
 @cache
-def body() -> Body:
-    return default_body()
+def body() -> BodyTemplate:
+    return default_template()
 
 
-def sitter(poses: Tensor) -> Sitter:
+def sitter(poses: Tensor) -> CapturedPerson:
     """A person of whom there is one view, in the pose (55, 3), scaffolds at 0 and 4 cm."""
     view = View("v", Path("v.png"), cam_from_opengl(FRONT), np.eye(3), SIZE, SIZE, frame=0)
     frames = BodyFrames((0,), poses[None].double().numpy(), np.zeros((1, 3)), np.zeros(10), np.ones(1))
     capture = Capture(Path("person"), "body_json", {"train": (view,)}, has_alpha=True, body={"train": frames})
-    return sitter_of(capture, HumanModel(resolution=64, heights=(0.0, 0.04)), body())
+    return captured_person(capture, HumanModel(resolution=64, heights=(0.0, 0.04)), body())
 
 
 def arms_before_the_chest() -> Tensor:
@@ -57,19 +57,19 @@ def arms_before_the_chest() -> Tensor:
 
 def painted(colour_of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
     """(256, 256, 3) texture by places (P, 3) of the T-pose and the joint (P,) that moves each."""
-    uv, uv_faces = atlas_of(body())
-    columns, rows = texture_places(uv, 256)
-    hits = visible(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], 256, 256)
+    uv, uv_faces = texture_coordinates(body())
+    columns, rows = texel_coordinates(uv, 256)
+    hits = rasterize(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], 256, 256)
     around = body().faces.numpy()[hits.faces]
-    places = interpolated(hits.shares, body().vertices.double().numpy()[around])
-    joints = interpolated(hits.shares, body().weights.double().numpy()[around]).argmax(1)
+    places = interpolate(hits.shares, body().vertices.double().numpy()[around])
+    joints = interpolate(hits.shares, body().weights.double().numpy()[around]).argmax(1)
     texture = np.full((256 * 256, 3), 0.5)
     texture[hits.index] = colour_of(places, joints)
     return texture.reshape(256, 256, 3)
 
 
 def picture(poses: Tensor, texture: np.ndarray, pose: np.ndarray) -> Picture:
-    exact, (uv, uv_faces) = body().to(torch.float64), atlas_of(body())
+    exact, (uv, uv_faces) = body().to(torch.float64), texture_coordinates(body())
     vertices = posed_vertices(exact, poses[None].double(), torch.zeros(1, 3).double())[0].numpy()
     pixels = render_mesh(PosedMesh(vertices, body().faces.numpy(), uv, uv_faces, texture), pose, SIZE, 2)
     rgba = torch.from_numpy(pixels).float()
@@ -85,7 +85,7 @@ def is_arm(joints: np.ndarray | Tensor) -> np.ndarray:
     return np.array([any(part in name for part in arm) for name in names])
 
 
-def posing(of: Sitter) -> Posing:
+def posing(of: CapturedPerson) -> BodyPose:
     return of.posing(of.views[0])
 
 
@@ -94,14 +94,14 @@ def test_what_is_behind_an_arm_does_not_get_its_colour() -> None:
     that are seen when the arms are aside. Mixed colours remain where a pixel covers both."""
     texture = painted(lambda _, joints: np.where(is_arm(joints)[:, None], [0.9, 0.0, 0.0], [0.0, 0.0, 0.9]))
     crossed = sitter(arms_before_the_chest())
-    maps = maps_of(crossed, [(picture(arms_before_the_chest(), texture, FRONT), posing(crossed))])
+    maps = observe_texels(crossed, [(picture(arms_before_the_chest(), texture, FRONT), posing(crossed))])
     arms = torch.from_numpy(is_arm(crossed.texels.weights.argmax(1)))
     redness = maps.rgb[0, :, 0] / maps.rgb[0].sum(1).clamp_min(1e-6)
     seen = maps.seen[0] > 0.3
     assert (redness[seen & arms] > 0.5).float().mean() > 0.9, "fingers are thinner than a pixel"
     assert (redness[seen & ~arms] < 0.5).float().mean() > 0.98
     aside = sitter(torch.zeros(55, 3))
-    free = maps_of(aside, [(picture(torch.zeros(55, 3), texture, FRONT), posing(aside))])
+    free = observe_texels(aside, [(picture(torch.zeros(55, 3), texture, FRONT), posing(aside))])
     x, y, _ = aside.texels.points.T
     chest = (free.seen[0] > 0.8) & ~arms & (x.abs() < 0.2) & ((y - 0.55).abs() < 0.08)
     assert (maps.seen[0][chest] == 0).float().mean() > 0.1, "forearms cover a part of it"
@@ -112,7 +112,7 @@ def test_a_texel_has_the_colour_of_its_place() -> None:
     texture = painted(lambda places, _: 0.5 + 0.4 * np.sin(3 * places))
     aside = sitter(torch.zeros(55, 3))
     shown = [(picture(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
-    maps = maps_of(aside, shown)
+    maps = observe_texels(aside, shown)
     seen = maps.seen[0] > 0.5
     truth = 0.5 + 0.4 * torch.sin(3 * aside.texels.points)
     hue = [x / x.sum(1, keepdim=True).clamp_min(1e-6) for x in (maps.rgb[0][seen], truth[seen])]
@@ -124,7 +124,7 @@ def test_only_what_faces_a_camera_is_seen() -> None:
     """From before: nothing of the back, and most of the front; more from two sides than from one."""
     texture, aside = np.full((8, 8, 3), 0.5), sitter(torch.zeros(55, 3))
     shown = [(picture(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
-    one, two = maps_of(aside, shown[:1]), maps_of(aside, shown)
+    one, two = observe_texels(aside, shown[:1]), observe_texels(aside, shown)
     normals = aside.texels.normals
     assert (one.seen[0][normals[:, 2] < -0.2] == 0).all()
     assert (one.seen[0][normals[:, 2] > 0.8] > 0).float().mean() > 0.85, "not inside the mouth"
@@ -137,7 +137,7 @@ def test_scaffolds_far_from_the_skin_leave_the_silhouette() -> None:
     """At 0 nearly all texels are inside, at 4 cm those that point aside are not; a second view carves more."""
     texture, aside = np.full((8, 8, 3), 0.5), sitter(torch.zeros(55, 3))
     shown = [(picture(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
-    one, two = maps_of(aside, shown[:1]), maps_of(aside, shown)
+    one, two = observe_texels(aside, shown[:1]), observe_texels(aside, shown)
     assert (one.inside[0] == 1).float().mean() > 0.9
     assert (one.inside[1] == 1).float().mean() < 0.8
     assert (two.inside[1] == 1).float().mean() < 0.8 * (one.inside[1] == 1).float().mean()
@@ -148,12 +148,12 @@ def test_scaffolds_far_from_the_skin_leave_the_silhouette() -> None:
 def test_without_alpha_everything_is_inside() -> None:
     aside, rest = sitter(torch.zeros(55, 3)), torch.zeros(55, 3)
     opaque = replace(picture(rest, np.full((8, 8, 3), 0.5), FRONT), alpha=None)
-    assert (maps_of(aside, [(opaque, posing(aside))]).inside == 1).all()
+    assert (observe_texels(aside, [(opaque, posing(aside))]).inside == 1).all()
 
 
 def test_no_picture_is_an_error() -> None:
     with pytest.raises(ValueError, match="must be a picture"):
-        maps_of(sitter(torch.zeros(55, 3)), [])
+        observe_texels(sitter(torch.zeros(55, 3)), [])
 
 
 def test_to_the_atlas_and_back() -> None:

@@ -34,13 +34,13 @@ from synthetic_bodies import (
 )
 
 from dyngs.errors import DyngsError
-from dyngs.human.template.body import Body, default_body, posed_vertices
-from dyngs.human.template.body_files import load_body
+from dyngs.human.template.body import BodyTemplate, default_template, posed_vertices
+from dyngs.human.template.body_reader import read_body
 
-TEMPLATE = Path(inspect.getfile(Body)).parent / "files" / "anny_smplx55.npz"
+TEMPLATE = Path(inspect.getfile(BodyTemplate)).parent / "files" / "anny_smplx55.npz"
 
 
-def assert_same(body: Body, arrays: Arrays) -> None:
+def assert_same(body: BodyTemplate, arrays: Arrays) -> None:
     """The loaded body poses as the raw arrays say, in float32 and float64, to a micrometre."""
     generator, count = np.random.default_rng(1), arrays["shapedirs"].shape[2]
     poses, trans = 0.5 * generator.standard_normal((2, len(body.joints), 3)), generator.standard_normal((2, 3))
@@ -74,7 +74,7 @@ def chumpy(monkeypatch: pytest.MonkeyPatch) -> Callable[[object], object]:
 def refusal(path: Path, uv: Path | None = None) -> str:
     """The one line that a wrong file ends in; it names the file."""
     with pytest.raises(DyngsError) as caught:
-        load_body(path, uv)
+        read_body(path, uv)
     message = str(caught.value)
     assert "\n" not in message
     assert str(uv or path) in message
@@ -87,7 +87,7 @@ def refusal(path: Path, uv: Path | None = None) -> str:
 @pytest.mark.parametrize("kind", NUM_JOINTS)
 def test_an_npz_poses_as_the_paper_says(kind: str, tmp_path: Path) -> None:
     arrays = model(kind)
-    body = load_body(write_npz(tmp_path / "model.npz", arrays))
+    body = read_body(write_npz(tmp_path / "model.npz", arrays))
     assert body.name == kind
     assert body.parents == tuple(parents_of(kind))
     np.testing.assert_array_equal(body.faces, arrays["f"].astype(np.int64))
@@ -100,7 +100,7 @@ def test_an_npz_poses_as_the_paper_says(kind: str, tmp_path: Path) -> None:
 def test_a_pickle_is_the_same_as_an_npz(kind: str, protocol: int, tmp_path: Path) -> None:
     """With a sparse regressor, arrays of another memory order, and a class beside them that is of no use."""
     arrays = model(kind)
-    whole = load_body(write_npz(tmp_path / "model.npz", arrays))
+    whole = read_body(write_npz(tmp_path / "model.npz", arrays))
     changed = arrays | {
         "J_regressor": scipy.sparse.csc_matrix(arrays["J_regressor"]),
         "posedirs": np.asfortranarray(arrays["posedirs"]),
@@ -111,10 +111,10 @@ def test_a_pickle_is_the_same_as_an_npz(kind: str, protocol: int, tmp_path: Path
         "weights_prior": np.zeros(0),
         "sex": np.float64(1),
     }
-    assert_equal(load_body(write_pickle(tmp_path / "model.pkl", changed, protocol)), whole)
+    assert_equal(read_body(write_pickle(tmp_path / "model.pkl", changed, protocol)), whole)
 
 
-def assert_equal(one: Body, other: Body) -> None:
+def assert_equal(one: BodyTemplate, other: BodyTemplate) -> None:
     for name, value in vars(one).items():
         expected = getattr(other, name)
         assert torch.equal(value, expected) if isinstance(value, torch.Tensor) else value == expected, name
@@ -124,7 +124,7 @@ def assert_equal(one: Body, other: Body) -> None:
 def test_pickles_of_python_2_with_chumpy(chumpy: Callable[[object], object], protocol: int, tmp_path: Path) -> None:
     """As the original SMPL files are; chumpy is not installed when they are read."""
     arrays = model("smpl")
-    whole = load_body(write_npz(tmp_path / "model.npz", arrays))
+    whole = read_body(write_npz(tmp_path / "model.npz", arrays))
     old = arrays | {key: chumpy(arrays[key]) for key in ("v_template", "shapedirs", "posedirs", "weights")}
     old["J"] = chumpy(None)
     old["J_regressor"] = scipy.sparse.csc_matrix(arrays["J_regressor"])
@@ -133,15 +133,15 @@ def test_pickles_of_python_2_with_chumpy(chumpy: Callable[[object], object], pro
     assert b"numpy.core" in path.read_bytes()
     for name in ("chumpy", "chumpy.ch"):
         del sys.modules[name]
-    assert_equal(load_body(path), whole)
+    assert_equal(read_body(path), whole)
 
 
 @pytest.mark.parametrize("make", [scipy.sparse.csc_matrix, scipy.sparse.csr_matrix, scipy.sparse.csr_array])
 def test_sparse_regressors(make: Callable[[object], object], tmp_path: Path) -> None:
     arrays = model("smpl")
     regressor = np.where(arrays["J_regressor"] > 0.02, arrays["J_regressor"], 0)
-    whole = load_body(write_npz(tmp_path / "model.npz", arrays | {"J_regressor": regressor}))
-    found = load_body(write_pickle(tmp_path / "model.pkl", arrays | {"J_regressor": make(regressor)}))
+    whole = read_body(write_npz(tmp_path / "model.npz", arrays | {"J_regressor": regressor}))
+    found = read_body(write_pickle(tmp_path / "model.pkl", arrays | {"J_regressor": make(regressor)}))
     assert torch.equal(found.joints, whole.joints)
     assert_equal(found, whole)
 
@@ -151,14 +151,14 @@ def test_sparse_regressors(make: Callable[[object], object], tmp_path: Path) -> 
 )
 def test_expressions_follow_the_shapes(kind: str, directions: int, shapes: int, tmp_path: Path) -> None:
     arrays = model(kind, directions=directions)
-    body = load_body(write_npz(tmp_path / "model.npz", arrays))
+    body = read_body(write_npz(tmp_path / "model.npz", arrays))
     assert (body.num_shapes, body.num_expressions) == (shapes, directions - shapes)
     found = [x for x in (body.shape_dirs, body.expression_dirs) if x is not None]
     np.testing.assert_array_equal(torch.cat(found, 2), np.asarray(arrays["shapedirs"], dtype=np.float32))
 
 
 def test_the_template_is_what_its_file_says() -> None:
-    body = default_body()
+    body = default_template()
     with np.load(TEMPLATE, allow_pickle=False) as raw:
         np.testing.assert_array_equal(body.vertices, raw["v_template"])
         np.testing.assert_array_equal(body.joints, raw["J"])
@@ -175,7 +175,7 @@ def test_the_template_is_what_its_file_says() -> None:
 def test_weights_in_half_precision_are_made_shares_again(tmp_path: Path) -> None:
     arrays = model("smpl")
     arrays["weights"] = arrays["weights"].astype(np.float16)
-    body = load_body(write_npz(tmp_path / "model.npz", arrays))
+    body = read_body(write_npz(tmp_path / "model.npz", arrays))
     torch.testing.assert_close(body.weights.sum(1), torch.ones(M), rtol=0, atol=2e-7)
 
 
@@ -190,12 +190,12 @@ def textured() -> tuple[Arrays, np.ndarray, np.ndarray]:
 
 def test_uvs_of_the_file_belong_to_corners(tmp_path: Path) -> None:
     arrays = model("smplx")
-    body = load_body(write_npz(tmp_path / "model.npz", arrays))
+    body = read_body(write_npz(tmp_path / "model.npz", arrays))
     assert body.uv is not None
     assert body.uv_faces is not None
     np.testing.assert_array_equal(body.uv_faces, arrays["ft"].astype(np.int64))
     np.testing.assert_allclose(body.uv, arrays["vt"], atol=1e-7)
-    assert load_body(write_npz(tmp_path / "other.npz", model("smpl"))).uv is None
+    assert read_body(write_npz(tmp_path / "other.npz", model("smpl"))).uv is None
 
 
 @settings(max_examples=20, deadline=None)
@@ -208,7 +208,7 @@ def test_uvs_of_an_obj_belong_to_corners_in_whatever_order(seed: int) -> None:
     one = np.take_along_axis(faces[order], corners, 1)
     other = np.take_along_axis(uv_faces[order], corners, 1)
     file, obj = write_npz(Path("model.npz"), arrays), write_obj(Path("uv.obj"), one, uv, other)
-    body = load_body(file, obj)
+    body = read_body(file, obj)
     assert body.uv is not None
     assert body.uv_faces is not None
     np.testing.assert_array_equal(body.uv_faces, uv_faces)
@@ -219,14 +219,14 @@ def test_an_obj_comes_before_the_uvs_of_the_file(tmp_path: Path) -> None:
     _, uv, uv_faces = textured()
     arrays = model("smplx")
     obj = write_obj(tmp_path / "uv.obj", arrays["f"].astype(np.int64), uv, uv_faces)
-    body = load_body(write_npz(tmp_path / "model.npz", arrays), obj)
+    body = read_body(write_npz(tmp_path / "model.npz", arrays), obj)
     np.testing.assert_array_equal(body.uv_faces, uv_faces)  # pyright: ignore[reportArgumentType]
 
 
 def test_numbers_from_the_end_in_an_obj(tmp_path: Path) -> None:
     arrays, uv, uv_faces = textured()
     obj = write_obj(tmp_path / "uv.obj", arrays["f"].astype(np.int64) - M - 1, uv, uv_faces - len(uv) - 1)
-    body = load_body(write_npz(tmp_path / "model.npz", arrays), obj)
+    body = read_body(write_npz(tmp_path / "model.npz", arrays), obj)
     np.testing.assert_array_equal(body.uv_faces, uv_faces)  # pyright: ignore[reportArgumentType]
 
 
@@ -333,7 +333,7 @@ WRONG: dict[str, tuple[Arrays, str]] = {
 def test_wrong_arrays_are_named(case: str, tmp_path: Path) -> None:
     arrays, words = WRONG[case]
     with pytest.raises(DyngsError, match=words):
-        load_body(write_npz(tmp_path / "model.npz", arrays))
+        read_body(write_npz(tmp_path / "model.npz", arrays))
     refusal(tmp_path / "model.npz")
 
 
@@ -415,7 +415,7 @@ def test_arrays_of_objects_are_refused_where_needed_and_left_alone_elsewhere(tmp
     evil = np.array([Evil(os.system, f"touch {mark}")], dtype=object)
     wrong = write_npz(tmp_path / "model.npz", model("smpl") | {"weights": evil})
     assert "'weights' is not an array of numbers (ValueError: it holds Python objects)" in refusal(wrong)
-    load_body(write_npz(tmp_path / "model.npz", model("smpl") | {"part2num": evil}))
+    read_body(write_npz(tmp_path / "model.npz", model("smpl") | {"part2num": evil}))
     assert not mark.exists()
     objects = np.array([1, 2], dtype=object)
     assert "'f' is not an array of numbers" in refusal(write_pickle(tmp_path / "a.pkl", model("smpl") | {"f": objects}))
@@ -440,7 +440,7 @@ def test_damage_anywhere_ends_in_one_line_or_does_no_harm(kind: str, damage: lis
     path.write_bytes(content)
     message = ""
     try:
-        load_body(path)
+        read_body(path)
     except DyngsError as error:
         message = str(error)
     assert "\n" not in message
