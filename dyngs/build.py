@@ -26,9 +26,10 @@ from dyngs.deform.residual import Residuals, cameras_in_place, residuals_of, vie
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import render_options
 from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.model import HumanScene, Subject, first_look
-from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, texel_gaussians
-from dyngs.human.motion.clip import captured_motion
+from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes
+from dyngs.human.motion.captured import captured_motion
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.load import load_template, rest_shape
 from dyngs.rendering import RenderOptions

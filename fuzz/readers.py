@@ -62,7 +62,7 @@ def read_whole_capture(root: Path) -> object:
     from dyngs.data.loader import PictureLoader
     from dyngs.data.read import read_capture
     from dyngs.errors import DyngsError
-    from dyngs.human.motion.clip import captured_motion
+    from dyngs.human.motion.captured import captured_motion
 
     options = DataConfig.model_validate({"root": root})
     try:
@@ -138,7 +138,7 @@ def read_a_body(root: Path) -> object:
 def read_a_motion(root: Path) -> object:
     """The motion, as a clip on a small body."""
     from dyngs.human.motion.clip import motion_clip
-    from dyngs.human.motion.motion import read_motion
+    from dyngs.human.motion.read import read_motion
 
     motion = read_motion(only(root), small_body(55))
     return motion, motion_clip(motion).at(0.3)
@@ -303,7 +303,7 @@ READERS: dict[str, Reader] = {
     "video": Reader({"mp4": files.write_mp4}, read_a_video),
     "pickles": Reader({"new": files.write_fits, "old": files.write_old_fits}, read_a_pickle),
     "bodies": Reader(_BODIES, read_a_body),
-    "amass": Reader({"smplh": files.write_amass, "own": files.write_own_motion}, read_a_motion),
+    "amass": Reader({"smplh": files.write_smplh_motion, "own": files.write_own_motion}, read_a_motion),
     "bvh": Reader({"walk": files.write_walk_bvh}, read_a_motion),
     "gltf": Reader({"linear": files.write_walk_glb, "cubic": files.write_cubic_glb}, read_a_motion),
     "ply": Reader({"splats": files.write_splats}, read_splats),

@@ -21,7 +21,8 @@ from dyngs.deform.fields import field_state
 from dyngs.export.avatar import _KIND as AVATAR_KIND
 from dyngs.export.ply import write_ply
 from dyngs.files.tensor_file import write_tensors
-from dyngs.human.motion.motion import JOINTS, save_motion
+from dyngs.human.motion.amass import write_amass
+from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.storage.file import SceneInfo, encoded
 from dyngs.view.paths import CameraPath, write_path
@@ -97,7 +98,7 @@ def write_smplx_with_uv(root: Path) -> None:
     write_obj(root / "uv.obj", arrays["f"].astype(np.int64), arrays["vt"], arrays["ft"].astype(np.int64))
 
 
-def write_amass(root: Path) -> None:
+def write_smplh_motion(root: Path) -> None:
     """As AMASS has SMPL-H."""
     motion = random_motion(3)
     poses = motion.for_joints(52).poses.reshape(3, -1).numpy()
@@ -107,24 +108,24 @@ def write_amass(root: Path) -> None:
 
 def write_own_motion(root: Path) -> None:
     """As dyngs writes it."""
-    save_motion(random_motion(3), root / "a.npz")
+    write_amass(random_motion(3), root / "a.npz")
 
 
 def write_walk_bvh(root: Path) -> None:
     """The joints of SMPL."""
-    own, motion = skeleton(JOINTS[:22]), random_motion(3)
+    own, motion = skeleton(JOINT_NAMES[:22]), random_motion(3)
     write_bvh(root / "a.bvh", own, as_local(motion, own), motion.trans.double().numpy())
 
 
 def write_walk_glb(root: Path) -> None:
     """The joints of SMPL, linear."""
-    own, motion = skeleton(JOINTS[:22]), random_motion(3)
+    own, motion = skeleton(JOINT_NAMES[:22]), random_motion(3)
     glb_of(own, Clip(as_local(motion, own), motion.trans.double().numpy())).write(root / "a.glb")
 
 
 def write_cubic_glb(root: Path) -> None:
     """The joints of SMPL, cubic splines, a node above."""
-    own, motion = skeleton(JOINTS[:22]), random_motion(3)
+    own, motion = skeleton(JOINT_NAMES[:22]), random_motion(3)
     clip = Clip(as_local(motion, own), motion.trans.double().numpy(), interpolation="CUBICSPLINE", above=np.eye(4))
     glb_of(own, clip).write(root / "a.glb")
 

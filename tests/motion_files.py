@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from dyngs.human.motion.motion import JOINTS, ROWS, Motion
+from dyngs.human.motion.motion import Motion
 from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 
 ABOVE = {"pelvis": "", "spine1": "pelvis", "spine2": "spine1", "spine3": "spine2", "neck": "spine3", "head": "neck"}
 ABOVE |= {"jaw": "head"}
@@ -47,7 +48,7 @@ class Skeleton:
     rest: np.ndarray  # (S, 3)
 
 
-def skeleton(names: Sequence[str] = JOINTS) -> Skeleton:
+def skeleton(names: Sequence[str] = JOINT_NAMES) -> Skeleton:
     """These of our joints in T-pose, metres, y up, facing +z; each hangs on the nearest joint above that is there."""
     parents = []
     for name in names:
@@ -61,7 +62,7 @@ def skeleton(names: Sequence[str] = JOINTS) -> Skeleton:
 def tiny_body(count: int = 55, shapes: int = 0) -> BodyTemplate:
     """165 vertices around 55 (or 52, 24) joints, with random weights and, if asked, shape directions."""
     torch.manual_seed(count)
-    names = [JOINTS[i] for i in ROWS[count]]
+    names = [JOINT_NAMES[i] for i in SMPLX_ROWS[count]]
     own = skeleton(names)
     joints, parents = torch.tensor(own.rest).float(), own.parents
     if count == 24:
@@ -261,6 +262,6 @@ def glb_of(own: Skeleton, clip: Clip) -> Glb:
 
 def as_local(motion: Motion, own: Skeleton) -> np.ndarray:
     """(F, S, 3, 3) local rotations of those of our joints that the skeleton has; others are taken as still."""
-    rows = [JOINTS.index(name) for name in own.names]
+    rows = [JOINT_NAMES.index(name) for name in own.names]
     poses = motion.poses.double().numpy()[:, rows]
     return Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)

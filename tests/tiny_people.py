@@ -8,7 +8,8 @@ from pathlib import Path
 
 from dyngs.config import DataConfig, HumanNetModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.human.template.body import BodyTemplate, default_template
+from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.load import default_template
 from dyngs.train.predictor import Filmed, filmed
 
 TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)

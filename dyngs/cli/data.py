@@ -149,9 +149,10 @@ def run_sfm(arguments: argparse.Namespace) -> int:
 
 def run_motion(arguments: argparse.Namespace) -> int:
     """Convert the motion and say what it is."""
-    from dyngs.human.motion.motion import read_motion, save_motion
-    from dyngs.human.template.body import default_template
+    from dyngs.human.motion.amass import write_amass
+    from dyngs.human.motion.read import read_motion
     from dyngs.human.template.body_reader import read_body
+    from dyngs.human.template.load import default_template
 
     out: Path = arguments.out
     if out.exists():
@@ -160,7 +161,7 @@ def run_motion(arguments: argparse.Namespace) -> int:
         raise DyngsError(f"cannot write {out}: a motion is written as .npz")
     body = default_template() if arguments.body is None else read_body(arguments.body)
     motion = read_motion(arguments.file, body, arguments.fps, arguments.up, arguments.clip)
-    save_motion(motion, out)
+    write_amass(motion, out)
     print(f"written: {out}\n         {_summary(motion)}")
     return 0
 

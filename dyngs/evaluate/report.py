@@ -25,7 +25,7 @@ from dyngs.evaluate.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
 from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.files.write import write_text
 from dyngs.human.avatar.trained import AvatarScene
-from dyngs.human.motion.clip import captured_motion, same_bodies
+from dyngs.human.motion.captured import captured_motion, same_bodies
 from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import COMPACT_NAME, LoadedRun, is_compact, load_run
 from dyngs.scene import Scene, moment_of, num_colour_values

@@ -19,12 +19,14 @@ from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
-from dyngs.human.avatar.posing import Anchors, PoseBlendShapes, Skeleton, skinning_weights
+from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
 from dyngs.human.avatar.trained import AvatarScene
-from dyngs.human.motion.clip import MotionClip, rest_clip
-from dyngs.human.motion.motion import ROWS
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.placement import rest_clip
 from dyngs.human.pose.skinning import check_tree
+from dyngs.human.template.joints import SMPLX_ROWS
 from dyngs.human.template.load import template_path
 from dyngs.runs.checkpoint import LoadedRun, info_of
 
@@ -167,7 +169,7 @@ def _check(tensors: Mapping[str, Tensor]) -> None:
             raise ValueError(f"'{name}' is {tensor.dtype} {tuple(tensor.shape)}, not {shape}")
         if name not in integers and not bool(tensor.isfinite().all()):
             raise ValueError(f"'{name}' holds NaN or infinite numbers")
-    if j not in ROWS or terms not in (1, 4) or not n:
+    if j not in SMPLX_ROWS or terms not in (1, 4) or not n:
         raise ValueError(f"{n} Gaussians of {terms} harmonics on {j} joints")
     check_tree(tuple(tensors["skeleton.parents"].tolist()))
     _require_index("anchors.joints", tensors["anchors.joints"], j)

@@ -129,7 +129,7 @@ def _is_needed(name: str) -> bool:
 
 
 def _with_corrected_weights(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Skinning weights w e^c, normalised, in place of w and c; see ``dyngs.human.avatar.posing.skinning_weights``."""
+    """Skinning weights w e^c, normalised, in place of w and c; see ``dyngs.human.avatar.anchors.skinning_weights``."""
     corrections, weights = tensors.pop(CORRECTIONS), tensors["model.anchors.weights"]
     if not bool(corrections.any()):
         return {}

@@ -13,7 +13,7 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options
 from dyngs.export.avatar import read_avatar
 from dyngs.human.avatar.trained import AvatarScene
-from dyngs.human.motion.clip import up_direction
+from dyngs.human.motion.placement import up_direction
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.view.frames import Shot
 from dyngs.view.paths import CameraPath, frame_orbit_for_points, frozen_path, read_path, spiral_path, with_times

@@ -10,8 +10,8 @@ import torch
 from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
 from dyngs.human.avatar.trained import AvatarScene
-from dyngs.human.motion.clip import motion_clip, place_like, rest_clip
-from dyngs.human.motion.motion import read_motion
+from dyngs.human.motion.clip import motion_clip
+from dyngs.human.motion.placement import place_like, rest_clip
 from dyngs.human.template.load import load_template
 from dyngs.runs.checkpoint import LoadedRun
 
@@ -33,6 +33,8 @@ def playing_motion(run: LoadedRun, path: Path) -> Played:
     Raises:
         DyngsError: the run is not one of a person, or the file cannot be read.
     """
+    from dyngs.human.motion.read import read_motion  # late: scipy's rotations, which no other drawing needs
+
     scene, model = _avatar(run, f"--motion {path}")
     motion = read_motion(path, load_template(model))
     if motion.poses.shape[1] != len(scene.given_joints):

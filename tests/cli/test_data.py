@@ -14,7 +14,9 @@ from refused import error_line
 from dyngs.cli import data, main
 from dyngs.config import DataConfig
 from dyngs.data.read import read_capture
-from dyngs.human.motion.motion import Motion, read_motion, save_motion
+from dyngs.human.motion.amass import write_amass
+from dyngs.human.motion.motion import Motion
+from dyngs.human.motion.read import read_motion
 from dyngs.human.template import body as body_module
 from dyngs.human.template.body_reader import read_body
 
@@ -34,7 +36,7 @@ def known_motion() -> Motion:
 
 
 def test_a_motion_is_converted_and_summed_up(tmp_path: Path, capsys: PrintedOutput) -> None:
-    save_motion(known_motion(), tmp_path / "in.npz")
+    write_amass(known_motion(), tmp_path / "in.npz")
     out = tmp_path / "new" / "out.npz"
     assert main(["data", "motion", str(tmp_path / "in.npz"), str(out)]) == 0
     printed = capsys.readouterr().out
@@ -44,7 +46,7 @@ def test_a_motion_is_converted_and_summed_up(tmp_path: Path, capsys: PrintedOutp
 
 
 def test_one_frame_has_no_speed(tmp_path: Path, capsys: PrintedOutput) -> None:
-    save_motion(random_motion(1), tmp_path / "in.npz")
+    write_amass(random_motion(1), tmp_path / "in.npz")
     assert main(["data", "motion", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 0
     text = "1 frame, 0.00 s at 30 frames per second; 0 of 55 joints turn, the root moves at up to 0.00 m/s"
     assert text in capsys.readouterr().out
@@ -52,7 +54,7 @@ def test_one_frame_has_no_speed(tmp_path: Path, capsys: PrintedOutput) -> None:
 
 def test_frames_per_second_and_the_up_axis_are_passed_on(tmp_path: Path, capsys: PrintedOutput) -> None:
     """Five frames of three; what moved along the file's z moves along y, what moved along y away from z."""
-    save_motion(known_motion(), tmp_path / "in.npz")
+    write_amass(known_motion(), tmp_path / "in.npz")
     words = ["--up", "z", "--fps", "4"]
     assert main(["data", "motion", str(tmp_path / "in.npz"), str(tmp_path / "out.npz"), *words]) == 0
     assert "5 frames, 1.00 s at 4 frames" in capsys.readouterr().out
@@ -105,7 +107,7 @@ def test_motion_is_refused_in_one_line(
     words: str, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: PrintedOutput
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    save_motion(known_motion(), Path("in.npz"))
+    write_amass(known_motion(), Path("in.npz"))
     Path("used.npz").write_text("keep")
     assert main(["data", "motion", *words.split()]) != 0
     lines = capsys.readouterr().err.strip().splitlines()

@@ -20,7 +20,8 @@ from dyngs.export import avatar
 from dyngs.export.avatar import read_avatar, write_avatar
 from dyngs.files.tensor_file import read_tensors, write_tensors
 from dyngs.human.avatar.trained import AvatarScene
-from dyngs.human.motion.motion import Motion, save_motion
+from dyngs.human.motion.amass import write_amass
+from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.train.trainer import train
@@ -58,7 +59,7 @@ def file(run_dir: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def motion(tmp_path: Path) -> Path:
     poses = 0.3 * torch.randn(3, 55, 3, generator=torch.Generator().manual_seed(0))
-    save_motion(Motion(poses, torch.zeros(3, 3), torch.zeros(10), 10.0, torch.ones(3)), tmp_path / "walk.npz")
+    write_amass(Motion(poses, torch.zeros(3, 3), torch.zeros(10), 10.0, torch.ones(3)), tmp_path / "walk.npz")
     return tmp_path / "walk.npz"
 
 

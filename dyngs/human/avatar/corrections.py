@@ -15,7 +15,8 @@ from torch import Tensor
 
 from dyngs.config import HumanModel
 from dyngs.deform.learned import LearnedTensors
-from dyngs.human.avatar.posing import Anchors, BodyPose, Skeleton, skinning_weights
+from dyngs.human.avatar.anchors import Anchors, skinning_weights
+from dyngs.human.avatar.posing import BodyPose, Skeleton
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 

@@ -14,20 +14,13 @@ from dyngs.conventions import SH_C0
 from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.corrections import Corrections, corrected_pose, corrected_skeleton, corrected_weights
+from dyngs.human.avatar.neighbours import nearest_neighbours
 from dyngs.human.avatar.observations import SurfacePoints, observe_points
-from dyngs.human.avatar.posing import (
-    Anchors,
-    BodyPose,
-    PoseBlendShapes,
-    Skeleton,
-    frame_pose,
-    pose_gaussians,
-    rest_offsets,
-    skinning_weights,
-)
-from dyngs.human.motion.clip import CapturedMotion
-from dyngs.human.template.atlas import Texels, nearest_neighbours
+from dyngs.human.avatar.posing import BodyPose, PoseBlendShapes, Skeleton, frame_pose, pose_gaussians, rest_offsets
+from dyngs.human.motion.captured import CapturedMotion
+from dyngs.human.template.atlas import Texels
 from dyngs.static.densify import EditResult
 from dyngs.static.model import Drawn
 from dyngs.static.rates import Rates

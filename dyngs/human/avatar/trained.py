@@ -11,8 +11,9 @@ from torch import Tensor
 
 from dyngs.colour.network import ColourNetwork, Frame
 from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_skeleton, corrected_weights
-from dyngs.human.avatar.posing import Anchors, PoseBlendShapes, Skeleton, frame_pose, pose_gaussians, rest_offsets
+from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton, frame_pose, pose_gaussians, rest_offsets
 from dyngs.human.avatar.validation import require_avatar, require_shapes
 from dyngs.human.motion.clip import MotionClip
 from dyngs.rendering import Shader

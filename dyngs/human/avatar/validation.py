@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians import Gaussians
-from dyngs.human.motion.motion import ROWS
 from dyngs.human.pose.skinning import check_tree
+from dyngs.human.template.joints import SMPLX_ROWS
 from dyngs.tensor_checks import require_indices, require_moments, require_positive, require_tensor
 
 _MOST_FACES = 2**31
@@ -54,7 +54,7 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
 def require_body(gaussians: Gaussians, parents: Tensor, num_joints: int) -> None:
     """Nothing, if there are Gaussians of at most 4 harmonics, on a skeleton of a known kind. Raises ValueError."""
     terms = gaussians.sh.shape[1]
-    if num_joints not in ROWS or terms not in (1, 4):
+    if num_joints not in SMPLX_ROWS or terms not in (1, 4):
         raise ValueError(f"{len(gaussians)} Gaussians of {terms} harmonics on {num_joints} joints")
     if parents.is_floating_point() or tuple(parents.shape) != (num_joints,):
         raise ValueError(f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({num_joints},)")

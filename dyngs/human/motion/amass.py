@@ -13,12 +13,17 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError, reading
 from dyngs.files.numpy_files import read_arrays
-from dyngs.human.motion.motion import ROWS, Motion, Up, require_moderate, require_rate
-from dyngs.human.motion.retarget import on_floor
-from dyngs.human.template.body import Body
-from dyngs.human.motion.motion import ROWS, Motion, UpAxis, require_frame_count, require_frame_rate
+from dyngs.files.write import whole_file
+from dyngs.human.motion.floor import place_on_floor
+from dyngs.human.motion.motion import (
+    Motion,
+    UpAxis,
+    require_frame_count,
+    require_frame_rate,
+)
 from dyngs.human.motion.retarget import place_on_floor
 from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.joints import SMPLX_ROWS
 
 _MODELS = {72: "smpl", 156: "smplh", 165: "smplx"}
 _PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
@@ -46,6 +51,31 @@ def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
     """
     with reading(path):
         return _motion(path, _arrays(path), body, up)
+
+
+def write_amass(motion: Motion, path: Path) -> None:
+    """Write the motion of 55 joints as an AMASS file of SMPL-X that says ``up_axis`` y, from which it is read back
+    exactly.
+
+    Raises:
+        DyngsError: the suffix is not ``.npz``, or the file cannot be written.
+    """
+    if path.suffix.lower() != ".npz":
+        raise DyngsError(f"cannot write {path}: a motion is written as .npz")
+    if motion.poses.shape[1:] != (55, 3):
+        raise ValueError(f"poses must be (F, 55, 3), got {tuple(motion.poses.shape)}")
+    with whole_file(path) as temporary, temporary.open("wb") as file:
+        np.savez(
+            file,
+            poses=motion.poses.reshape(len(motion), -1).numpy(),
+            trans=motion.trans.numpy(),
+            betas=motion.betas.numpy(),
+            scale=motion.scale.numpy(),
+            mocap_frame_rate=np.float64(motion.fps),
+            surface_model_type="smplx",
+            gender="neutral",
+            up_axis="y",
+        )
 
 
 def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: UpAxis) -> Motion:
@@ -91,7 +121,7 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
     if not len(flat):
         raise DyngsError(f"{path}: has no frames")
     require_frame_count(path, len(flat), 55)
-    rows = list(ROWS[flat.shape[1] // 3])
+    rows = list(SMPLX_ROWS[flat.shape[1] // 3])
     poses = np.zeros((len(flat), 55, 3))
     poses[:, rows] = flat.reshape(len(flat), -1, 3)[:, : len(rows)]
     return poses, flat.shape[1]

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.errors import DyngsError, reading
 from dyngs.files.limits import require_at_most
 from dyngs.human.motion.motion import frame_chunks, require_frame_count, sample_times
-from dyngs.human.motion.retarget import SkeletonMotion
+from dyngs.human.motion.skeleton_motion import SkeletonMotion
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

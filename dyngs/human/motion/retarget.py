@@ -5,26 +5,19 @@ Local letters: J joints of the body, S joints of the other skeleton, F frames, M
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from pathlib import Path
-
 import numpy as np
 import torch
-from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.human.motion.motion import JOINTS, ROWS, Motion, frame_chunks
+from dyngs.human.motion.floor import place_on_floor
+from dyngs.human.motion.motion import Motion, frame_chunks
 from dyngs.human.motion.rigs import match_joints
-from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
+from dyngs.human.motion.skeleton_motion import SkeletonMotion
 from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.joints import JOINT_NAMES, JOINT_PARENTS, SMPLX_ROWS
 
-_PARENTS = (
-    *(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 15, 15, 15),
-    *(20, 25, 26, 20, 28, 29, 20, 31, 32, 20, 34, 35, 20, 37, 38),
-    *(21, 40, 41, 21, 43, 44, 21, 46, 47, 21, 49, 50, 21, 52, 53),
-)
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 _BONE_ENDS = {f"{finger}{i}": f"{finger}{i + 1}" for finger in _FINGERS for i in (1, 2)} | {
     "hip": "knee",
@@ -44,29 +37,6 @@ _FOLLOWS = {f"{finger}{i}": f"{finger}{i - 1}" if i > 1 else "wrist" for finger 
 _SNAP_COS = np.cos(np.radians(15.0))
 
 
-@dataclass(frozen=True)
-class SkeletonMotion:
-    """How the S joints of some other skeleton move; float64, in any unit of length.
-
-    Attributes:
-        path: of the file, for messages.
-        names: S.
-        rest: (S, 3) joints of the rest pose, in axes of its own.
-        rotations: (F, S, 3, 3) world_from_rest of each joint.
-        positions: (F, S, 3) of the joints in the world.
-        fps: frames per second.
-        world_is_y_up: whether the world is known to be y up; otherwise its axes are those of the rest pose.
-    """
-
-    path: Path
-    names: tuple[str, ...]
-    rest: np.ndarray
-    rotations: np.ndarray
-    positions: np.ndarray
-    fps: float
-    world_is_y_up: bool
-
-
 def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
     """The source's motion on ``body``: 55 joints, y up, float32, its rest pose facing +z.
 
@@ -84,7 +54,7 @@ def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
     found = match_joints(source.path, source.names)
     target_from_rest = _target_from_rest(source, found)
     target_from_world = np.eye(3) if source.world_is_y_up else target_from_rest
-    ours = {JOINTS[row]: body.joints[i].double().numpy() for i, row in enumerate(ROWS[len(body.joints)])}
+    ours = {JOINT_NAMES[row]: body.joints[i].double().numpy() for i, row in enumerate(SMPLX_ROWS[len(body.joints)])}
     theirs = {name: target_from_rest @ source.rest[i] for name, i in found.items()}
     turns = _alignments(ours, theirs)
     to_target = {name: (i, target_from_rest.T @ turns[name]) for name, i in found.items()}
@@ -115,50 +85,19 @@ def _turned(
     ``to_target`` has, for each of our joints that the source has, which that is and what turns it at rest.
     """
     world = np.empty((len(rotations_of), 55, 3, 3))
-    for i, name in enumerate(JOINTS):
+    for i, name in enumerate(JOINT_NAMES):
         if name in to_target:
             joint, turn = to_target[name]
             world[:, i] = target_from_world @ rotations_of[:, joint] @ turn
         else:
-            world[:, i] = world[:, _PARENTS[i]]
+            world[:, i] = world[:, JOINT_PARENTS[i]]
     return world
 
 
 def _axis_angles(world: np.ndarray) -> Tensor:
     """(F, 55, 3) float32 rotations relative to the parents, of those in the world (F, 55, 3, 3)."""
-    local = np.concatenate([world[:, :1], world[:, _PARENTS[1:]].swapaxes(2, 3) @ world[:, 1:]], axis=1)
+    local = np.concatenate([world[:, :1], world[:, JOINT_PARENTS[1:]].swapaxes(2, 3) @ world[:, 1:]], axis=1)
     return torch.from_numpy(Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec()).float().reshape(-1, 55, 3)
-
-
-def place_on_floor(motion: Motion, body: BodyTemplate) -> Motion:
-    """The motion of 55 joints moved up or down as a whole: the lowest vertex of its mean shape comes to y = 0.
-
-    Pose blendshapes, which are millimetres, are not considered.
-    """
-    lowest = _lowest(motion.for_joints(len(body.joints)).poses, body) * motion.scale + motion.trans[:, 1]
-    trans = motion.trans.clone()
-    trans[:, 1] -= lowest.min()
-    return replace(motion, trans=trans)
-
-
-def _lowest(poses: Tensor, body: BodyTemplate) -> Tensor:
-    """(F,) smallest y of the vertices in the poses (F, J, 3), of blended transforms of which only row y is needed."""
-    followed = body.weights.nonzero(as_tuple=True)
-    points = torch.cat([body.vertices, torch.ones_like(body.vertices[:, :1])], dim=1)
-    shares = (body.weights[followed][:, None] * points[followed[0]]).double().numpy()
-    columns = (4 * followed[1][:, None] + torch.arange(4)).numpy()
-    vertex = followed[0].repeat_interleave(4).numpy()
-    height = csr_array((shares.ravel(), (vertex, columns.ravel())), shape=(len(points), 4 * len(body.joints)))
-    lowest = []
-    for part in frame_chunks(len(poses)):
-        rows = (
-            joint_transforms(body.joints, body.parents, axis_angle_to_matrix(poses[part]))[:, :, 1]
-            .flatten(1)
-            .double()
-            .numpy()
-        )
-        lowest += [(height @ few.T).min(axis=0) for few in np.array_split(rows, range(64, len(rows), 64))]
-    return torch.from_numpy(np.concatenate(lowest)).to(poses.dtype)
 
 
 def _target_from_rest(source: SkeletonMotion, found: dict[str, int]) -> np.ndarray:
@@ -195,7 +134,7 @@ def _nearest_axis(direction: np.ndarray) -> np.ndarray:
 def _alignments(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """(3, 3) align(d_b, M d_s) of each joint of theirs; identity for joints of no limb."""
     turns: dict[str, np.ndarray] = {}
-    for name in JOINTS:
+    for name in JOINT_NAMES:
         side, _, joint = name.partition("_")
         end = f"{side}_{_BONE_ENDS.get(joint, '')}"
         bones = [at[end] - at[name] if name in at and end in at else np.zeros(3) for at in (ours, theirs)]

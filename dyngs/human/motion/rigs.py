@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dyngs.errors import DyngsError
-from dyngs.human.motion.motion import JOINTS
+from dyngs.human.template.joints import JOINT_NAMES
 
 _OURS = (
     "pelvis spine1 spine2 spine3 neck head *_collar *_shoulder *_elbow *_wrist *_hip *_knee *_ankle *_foot "
@@ -125,7 +125,7 @@ def match_joints(path: Path, names: Sequence[str]) -> dict[str, int]:
         wanted = dict(rig.joints())
         for prefix in _prefixes(plain, wanted["pelvis"]):
             found = _found(wanted, {x.removeprefix(prefix): i for i, x in reversed([*enumerate(plain)])})
-            rank = (sum(name in found for name in _NEEDED), sum(name in found for name in JOINTS[:22]))
+            rank = (sum(name in found for name in _NEEDED), sum(name in found for name in JOINT_NAMES[:22]))
             if rank > best_rank:
                 best, best_rig, best_rank = found, rig, rank
     wanted = dict(best_rig.joints())

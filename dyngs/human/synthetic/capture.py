@@ -12,7 +12,6 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -22,7 +21,8 @@ from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image, write_text
-from dyngs.human.motion.motion import JOINTS, Motion, save_motion
+from dyngs.human.motion.amass import write_amass
+from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.clothes import (
     dress_body,
     paint_texture,
@@ -30,10 +30,10 @@ from dyngs.human.synthetic.clothes import (
     texel_coordinates,
     texture_coordinates,
 )
+from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.template.load import default_template
 from dyngs.human.template.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
-
-if TYPE_CHECKING:
-    from dyngs.human.template.body import BodyTemplate
 
 _FPS = 12.0
 _RADIUS = 3.5
@@ -97,8 +97,6 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     Raises:
         DyngsError: nothing asked for, ``out`` holds something already, or cannot be written.
     """
-    from dyngs.human.template.body import default_template
-
     if min(options.size, options.num_frames, options.num_cameras, options.samples) < 1:
         raise DyngsError("a synthetic person needs size, num_frames, num_cameras and samples of at least 1")
     if min(options.num_new, options.num_test, options.seed) < 0:
@@ -118,7 +116,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
         splits = {"train": train, "test": test} if name == "train" else {"pose": test}
         for split, cameras in splits.items():
             _write_split(out, split, meshes, cameras, options)
-        save_motion(motion, out / f"body_{name}.npz")
+        write_amass(motion, out / f"body_{name}.npz")
     return out
 
 
@@ -208,8 +206,6 @@ def _write_split(
 
 def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> Iterator[PosedMesh]:
     """The mesh of each frame, posed in float64."""
-    from dyngs.human.template.body import posed_vertices
-
     uv, uv_faces = texture_coordinates(body)
     exact, faces = body.to(torch.float64), body.faces.numpy()
     for pose, trans, scale in zip(*(x.double() for x in (motion.poses, motion.trans, motion.scale)), strict=True):
@@ -219,11 +215,9 @@ def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> It
 
 def _on_floor(body: BodyTemplate, turns: dict[str, np.ndarray], num_frames: int) -> Motion:
     """The motion of joints that turn by axis-angle (F, 3) or (3,), its lowest vertex at y = 0 in every frame."""
-    from dyngs.human.template.body import posed_vertices
-
-    poses = torch.zeros(num_frames, len(JOINTS), 3)
+    poses = torch.zeros(num_frames, len(JOINT_NAMES), 3)
     for name, turn in turns.items():
-        poses[:, JOINTS.index(name)] = torch.from_numpy(turn).float()
+        poses[:, JOINT_NAMES.index(name)] = torch.from_numpy(turn).float()
     trans = torch.zeros(num_frames, 3)
     exact = body.to(torch.float64)
     for frame, pose in enumerate(poses.double()):

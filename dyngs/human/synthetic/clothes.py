@@ -7,18 +7,15 @@ from __future__ import annotations
 
 import colorsys
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 
 from dyngs.errors import DyngsError
-from dyngs.human.motion.motion import JOINTS
+from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.human.template.mesh import interpolate, rasterize, vertex_normals
-
-if TYPE_CHECKING:
-    from dyngs.human.template.body import BodyTemplate
 
 _PARTS = {
     "eye": ("eye",),
@@ -137,12 +134,12 @@ def texel_coordinates(uv: np.ndarray, resolution: int) -> tuple[np.ndarray, np.n
 
 def _left_eye(body: BodyTemplate) -> np.ndarray:
     """(3,)"""
-    return body.joints[JOINTS.index("left_eye")].double().numpy()
+    return body.joints[JOINT_NAMES.index("left_eye")].double().numpy()
 
 
 def _shares_of_parts(body: BodyTemplate) -> np.ndarray:
     """(M, 8) how much every vertex belongs to each of ``_PARTS``; rows sum to 1."""
-    bases = [name.removeprefix("left_").removeprefix("right_").rstrip("123") for name in JOINTS]
+    bases = [name.removeprefix("left_").removeprefix("right_").rstrip("123") for name in JOINT_NAMES]
     member = np.array([[base in names for names in _PARTS.values()] for base in bases], dtype=np.float64)
     return body.weights.double().numpy() @ member
 

@@ -7,16 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-
-if TYPE_CHECKING:
-    from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.body import BodyTemplate
 
 _THINNEST = 1e-9
 """Twice the area over the square of the longest edge at which a triangle counts as degenerate."""
@@ -134,29 +131,6 @@ def scaffold_points(texels: Texels, heights: Sequence[float]) -> ScaffoldPoints:
     if levels.numel() == 0 or not bool(levels.isfinite().all()):
         raise DyngsError(f"the heights of shells must be one or more finite numbers of metres, got {list(heights)}")
     return ScaffoldPoints(torch.arange(len(texels)).repeat(len(levels)), levels.repeat_interleave(len(texels)))
-
-
-def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
-    """(Q, count) int64 rows of the other points nearest to each of ``points`` (Q, 3), nearest first.
-
-    Points may coincide; none is its own neighbour. Of few points all others are given: Q - 1 columns at most.
-
-    Raises:
-        DyngsError: a point that is not finite.
-    """
-    from scipy.spatial import KDTree
-
-    num_points = len(points)
-    count = min(count, num_points - 1)
-    if count < 1:
-        return torch.zeros(num_points, 0, dtype=torch.long)
-    places = points.detach().double().numpy()
-    if not np.isfinite(places).all():
-        raise DyngsError("neighbours: a point is not finite; check the positions for NaN")
-    found = np.asarray(KDTree(places).query(places, k=count + 1)[1])
-    own = found == np.arange(num_points)[:, None]
-    own[~own.any(1), -1] = True  # more points coincide than were asked for: the last one makes way
-    return torch.from_numpy(found[~own].reshape(num_points, count)).long()
 
 
 def _rasterized(corners: np.ndarray, usable: np.ndarray, resolution: int) -> tuple[Tensor, Tensor, Tensor]:

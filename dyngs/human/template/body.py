@@ -6,7 +6,6 @@ Local letters: J joints, M vertices, T triangles, U UV vertices, F frames, B sha
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -19,9 +18,6 @@ from dyngs.human.pose.skinning import (
     check_tree,
     joint_transforms,
 )
-
-DEFAULT_FILE = Path(__file__).parent / "files" / "anny_smplx55.npz"
-"""The free template that comes with the package."""
 
 
 @dataclass(frozen=True)
@@ -92,13 +88,6 @@ class BodyTemplate:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         floats = {k: x.to(dtype) for k, x in values.items() if isinstance(x, Tensor) and x.is_floating_point()}
         return replace(self, **floats)
-
-
-def default_template() -> BodyTemplate:
-    """The free template that comes with the package: an adult of 1.76 m in T-pose, 55 joints in the order of SMPL-X."""
-    from dyngs.human.template.body_reader import read_body
-
-    return read_body(DEFAULT_FILE)
 
 
 def apply_shape(body: BodyTemplate, betas: Tensor | None, expression: Tensor | None = None) -> tuple[Tensor, Tensor]:

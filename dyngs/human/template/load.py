@@ -9,13 +9,21 @@ from torch import Tensor
 
 from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
-from dyngs.human.template.body import DEFAULT_FILE, BodyTemplate, apply_shape, default_template
+from dyngs.human.template.body import BodyTemplate, apply_shape
 from dyngs.human.template.body_reader import read_body
+
+DEFAULT_TEMPLATE = Path(__file__).parent / "files" / "anny_smplx55.npz"
+"""The free template that comes with the package."""
+
+
+def default_template() -> BodyTemplate:
+    """The free template that comes with the package: an adult of 1.76 m in T-pose, 55 joints in the order of SMPL-X."""
+    return read_body(DEFAULT_TEMPLATE)
 
 
 def template_path(model: HumanModel) -> Path:
     """The body file that ``model`` names, or that of the free template."""
-    return DEFAULT_FILE if model.body is None else model.body
+    return DEFAULT_TEMPLATE if model.body is None else model.body
 
 
 def load_template(model: HumanModel) -> BodyTemplate:

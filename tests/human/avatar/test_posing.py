@@ -16,28 +16,26 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.anchors import Anchors, skinning_weights, texel_gaussians
 from dyngs.human.avatar.posing import (
-    Anchors,
     BodyPose,
     Skeleton,
-    heaviest_joints,
     learned_offsets,
     pose_blend_shapes,
     pose_gaussians,
     rest_offsets,
     rotate_sh,
-    skinning_weights,
-    texel_gaussians,
 )
-from dyngs.human.motion.motion import JOINTS
 from dyngs.human.pose.covariance import rotations_of
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body import BodyTemplate, default_template, posed_vertices
+from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.template.load import default_template
 from dyngs.ops.harmonics import evaluate_harmonics
 
 RESOLUTION = 48
-LEFT_ELBOW, LEFT_WRIST = JOINTS.index("left_elbow"), JOINTS.index("left_wrist")
+LEFT_ELBOW, LEFT_WRIST = JOINT_NAMES.index("left_elbow"), JOINT_NAMES.index("left_wrist")
 
 
 @cache
@@ -112,15 +110,15 @@ def test_a_mirrored_pose_mirrors_the_result() -> None:
     """x -> -x: the two sides change places, and axis-angle vectors keep x only."""
     body, _, _, _ = person()
     swapped = {"left": "right", "right": "left"}
-    sides = (name.partition("_") for name in JOINTS)
-    other = [JOINTS.index(swapped.get(side, side) + line + rest) for side, line, rest in sides]
+    sides = (name.partition("_") for name in JOINT_NAMES)
+    other = [JOINT_NAMES.index(swapped.get(side, side) + line + rest) for side, line, rest in sides]
     mirror = torch.tensor([-1.0, 1.0, 1.0])
     joints = 0.5 * (body.joints + mirror * body.joints[other])
     generator = torch.Generator().manual_seed(1)
-    poses = 0.4 * torch.randn(len(JOINTS), 3, generator=generator)
+    poses = 0.4 * torch.randn(len(JOINT_NAMES), 3, generator=generator)
     mirrored_poses = -mirror * poses[other]
     count = 30
-    weights = torch.rand(count, len(JOINTS), generator=generator).pow(4)
+    weights = torch.rand(count, len(JOINT_NAMES), generator=generator).pow(4)
     weights = weights / weights.sum(1, keepdim=True)
     means, quats = torch.randn(count, 3, generator=generator), torch.randn(count, 4, generator=generator)
     log_scales = torch.randn(count, 3, generator=generator) - 3
@@ -146,41 +144,6 @@ def test_colours_turn_with_what_they_are_on() -> None:
     after = evaluate_harmonics(turned, eye, rotate_sh(sh, turns), radii, 1)
     torch.testing.assert_close(after, before, rtol=0, atol=1e-6)
     assert float((evaluate_harmonics(turned, eye, sh, radii, 1) - before).abs().max()) > 0.05
-
-
-def test_corrections_act_only_where_parts_meet() -> None:
-    _, _, anchors, weights = person()
-    generator = torch.Generator().manual_seed(3)
-    corrections = torch.randn(anchors.weights.shape, generator=generator)
-    found = skinning_weights(anchors, weights.shape[1], corrections)
-    torch.testing.assert_close(found.sum(1), torch.ones(len(found)))
-    alone = anchors.weights[:, 0] == 1
-    assert bool(alone.any())
-    torch.testing.assert_close(found[alone], weights[alone])
-    assert bool(((found > 0) <= (weights > 0)).all()), "no joint is followed that was not"
-    assert float((found - weights)[~alone].abs().max()) > 0.1
-
-
-def test_the_heaviest_joints_are_kept_and_normalised() -> None:
-    weights = torch.tensor([[0.05] * 8 + [0.3, 0.3], [0.0] * 9 + [1.0]])
-    joints, shares = heaviest_joints(weights)
-    assert joints.shape == (2, 8)
-    assert joints[0, :2].tolist() == [8, 9]
-    assert joints[1, 0] == 9
-    torch.testing.assert_close(shares.sum(1), torch.ones(2))
-    torch.testing.assert_close(shares[0, 0], torch.tensor(0.3 / 0.9))
-
-
-def test_first_gaussians_lie_flat_on_their_scaffolds() -> None:
-    texels = atlas_texels(default_template(), RESOLUTION)
-    gaussians, anchors = texel_gaussians(texels, (0.0, 0.03), 1)
-    assert len(gaussians) == len(anchors) == 2 * len(texels)
-    torch.testing.assert_close(gaussians.means[len(texels) :], texels.points + 0.03 * texels.normals)
-    thin = rotations_of(gaussians.quats)[:, :, 2]
-    torch.testing.assert_close(thin[: len(texels)], texels.normals, rtol=0, atol=1e-5)
-    assert gaussians.log_scales.argmin(1).eq(2).all()
-    assert gaussians.opacities[0] > 0.5 > gaussians.opacities[-1]
-    assert gaussians.sh.shape == (2 * len(texels), 4, 3)
 
 
 def test_offsets_follow_the_bends_of_the_joints_that_count() -> None:
@@ -262,20 +225,6 @@ def test_offsets_of_the_template_and_learned_ones_add_up_and_reach_the_pose() ->
     assert bool(poses.grad[1:].ne(0).any(1).all())
     assert rest_offsets(anchors, weights, posing, None, None) is None
     assert pose_blend_shapes(replace(body, pose_dirs=None)) is None
-
-
-def test_anchors_know_their_place_on_the_template() -> None:
-    body = default_template()
-    _, anchors = texel_gaussians(atlas_texels(body, RESOLUTION), (0.0, 0.02), 0)
-    corners = (anchors.barycentric[..., None] * body.vertices[body.faces[anchors.face]]).sum(1)
-    skin = anchors.height == 0
-    torch.testing.assert_close(corners[skin], anchors.points[skin])
-    distances = (anchors.points - corners)[~skin].norm(dim=1)
-    torch.testing.assert_close(distances, anchors.height[~skin], rtol=1e-4, atol=0)
-    assert body.uv is not None
-    assert body.uv_faces is not None
-    uv = (anchors.barycentric[..., None] * body.uv[body.uv_faces[anchors.face]]).sum(1)
-    torch.testing.assert_close(anchors.uv, uv, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1])

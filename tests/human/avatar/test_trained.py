@@ -13,14 +13,16 @@ from dyngs.camera import Cameras
 from dyngs.config import HumanModel
 from dyngs.deform.learned import LearnedTensors
 from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_pose
 from dyngs.human.avatar.model import HumanScene, Subject
-from dyngs.human.avatar.posing import Skeleton, texel_gaussians
+from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.trained import AvatarScene, trained_avatar
-from dyngs.human.motion.clip import CapturedMotion, MotionClip
+from dyngs.human.motion.captured import CapturedMotion
+from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body import default_template
+from dyngs.human.template.load import default_template
 from dyngs.rendering import render
 from dyngs.static.rates import Rates
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,12 @@ from hypothesis import strategies as st
 from motion_files import random_motion, slow_vertices, tiny_body
 
 from dyngs.errors import DyngsError
-from dyngs.human.motion.amass import read_amass
-from dyngs.human.motion.motion import JOINTS, Motion, UpAxis
+from dyngs.human.motion.amass import read_amass, write_amass
+from dyngs.human.motion.motion import Motion, UpAxis
+from dyngs.human.template.joints import JOINT_NAMES
 
 SHARED = Path(__file__).parents[3] / "../shared/data"
+BODY = tiny_body()
 MODELS = {24: "smpl", 52: "smplh", 55: "smplx"}
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 FRAMES = 4
@@ -127,8 +130,8 @@ def test_joints_of_every_width(tmp_path: Path, count: int) -> None:
     motion = read(tmp_path, arrays, count)
     assert motion.poses.shape == (FRAMES, 55, 3)
     assert motion.poses.dtype == motion.trans.dtype == torch.float32
-    written = dict(zip(JOINTS, random_motion(FRAMES).poses.unbind(1), strict=True))
-    for i, name in enumerate(JOINTS):
+    written = dict(zip(JOINT_NAMES, random_motion(FRAMES).poses.unbind(1), strict=True))
+    for i, name in enumerate(JOINT_NAMES):
         is_there = i < 22 or (count == 55) or (count == 52 and name not in ("jaw", "left_eye", "right_eye"))
         assert torch.equal(motion.poses[:, i], written[name] if is_there else torch.zeros(FRAMES, 3)), name
 
@@ -270,3 +273,37 @@ def test_the_turned_root_of_a_person_lying_on_the_back(tmp_path: Path) -> None:
     poses[:, 0] = np.pi / 2
     motion = read(tmp_path, numbers(poses=poses))
     assert motion.poses.abs().max() < 1e-6
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fps", [30.0, 29.97, 1 / 3])
+def test_saved_motions_are_read_exactly(tmp_path: Path, fps: float) -> None:
+    """On whatever body, and the same motion is the same file."""
+    motion = replace(random_motion(), fps=fps, betas=torch.randn(7), scale=torch.rand(4) + 0.1)
+    write_amass(motion, tmp_path / "new" / "x.npz")
+    for body in (BODY, tiny_body(24)):
+        found = read_amass(tmp_path / "new" / "x.npz", body)
+        for name in ("poses", "trans", "betas", "scale"):
+            assert torch.equal(getattr(found, name), getattr(motion, name)), name
+        assert found.fps == fps
+    write_amass(found, tmp_path / "y.npz")
+    assert (tmp_path / "y.npz").read_bytes() == (tmp_path / "new" / "x.npz").read_bytes()
+
+
+def test_saved_files_are_those_of_amass(tmp_path: Path) -> None:
+    write_amass(random_motion(), tmp_path / "x.npz")
+    with np.load(tmp_path / "x.npz", allow_pickle=False) as file:
+        assert file["poses"].shape == (4, 165)
+        assert {str(file[key]) for key in ("surface_model_type", "gender", "up_axis")} == {"smplx", "neutral", "y"}
+
+
+def test_what_cannot_be_saved(tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match=r"x\.bvh: a motion is written as \.npz"):
+        write_amass(random_motion(), tmp_path / "x.bvh")
+    with pytest.raises(ValueError, match="must be"):
+        write_amass(random_motion().for_joints(24), tmp_path / "x.npz")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DyngsError, match="cannot write"):
+        write_amass(random_motion(), tmp_path / "file" / "x.npz")

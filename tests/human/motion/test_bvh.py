@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
 from dyngs.human.motion.bvh import read_bvh
-from dyngs.human.motion.motion import JOINTS
 from dyngs.human.motion.retarget import retarget
+from dyngs.human.template.joints import JOINT_NAMES
 
 TWO = """HIERARCHY
 ROOT Hip Bone {
@@ -89,13 +89,13 @@ def test_round_trip_of_a_body(tmp_path: Path, order: str) -> None:
 
 def test_a_bent_elbow(tmp_path: Path) -> None:
     """A T-pose, then the forearm up by a quarter turn about z."""
-    own = skeleton(JOINTS[:22])
+    own = skeleton(JOINT_NAMES[:22])
     angles = np.zeros((2, 22, 3))
-    angles[1, JOINTS.index("left_elbow"), 0] = 90
+    angles[1, JOINT_NAMES.index("left_elbow"), 0] = 90
     local = Rotation.from_euler("ZXY", angles.reshape(-1, 3), degrees=True).as_matrix().reshape(2, 22, 3, 3)
     motion = retarget(read_bvh(write_bvh(tmp_path / "x.bvh", own, local, np.zeros((2, 3)))), tiny_body())
     assert motion.poses[0].abs().max() < 1e-6
-    np.testing.assert_allclose(motion.poses[1, JOINTS.index("left_elbow")], (0, 0, np.pi / 2), atol=1e-6)
+    np.testing.assert_allclose(motion.poses[1, JOINT_NAMES.index("left_elbow")], (0, 0, np.pi / 2), atol=1e-6)
 
 
 @pytest.mark.parametrize("change", [("\n", "\r\n"), ("  ", "\t"), ("  OFFSET", "  \n\n  offset"), ("{", "\n{\n\n")])

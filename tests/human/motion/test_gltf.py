@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
 from dyngs.human.motion.gltf import read_gltf
-from dyngs.human.motion.motion import JOINTS, Motion
+from dyngs.human.motion.motion import Motion
 from dyngs.human.motion.retarget import retarget
+from dyngs.human.template.joints import JOINT_NAMES
 
 BODY = tiny_body()
 MOTION = random_motion(5, angle=0.8)
@@ -52,7 +53,7 @@ def same(found: Motion, expected: Motion, atol: float = 1e-5) -> None:
 def test_round_trip_of_a_body(tmp_path: Path, interpolation: str) -> None:
     path = glb_of(OWN, clip(interpolation=interpolation)).write(tmp_path / "x.glb")
     source = read_gltf(path)
-    assert source.names == JOINTS
+    assert source.names == JOINT_NAMES
     assert source.world_is_y_up
     same(retarget(source, BODY), MOTION)
 

@@ -10,23 +10,19 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from motion_files import Clip, as_local, glb_of, pelvis_path, random_motion, skeleton, tiny_body, write_bvh
+from motion_files import random_motion, tiny_body
 from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
 from dyngs.human.motion.motion import (
-    JOINTS,
     MAX_JOINT_POSES,
-    ROWS,
     Motion,
     frame_chunks,
-    read_motion,
     require_frame_count,
     require_frame_rate,
     sample_times,
-    save_motion,
 )
-from dyngs.human.template.body import default_template, posed_vertices
+from dyngs.human.template.joints import SMPLX_ROWS
 
 BODY = tiny_body()
 
@@ -35,89 +31,7 @@ def matrices(motion: Motion) -> np.ndarray:
     return Rotation.from_rotvec(motion.poses.double().numpy().reshape(-1, 3)).as_matrix()
 
 
-def test_the_joints_are_those_of_smplx() -> None:
-    known = {0: "pelvis", 9: "spine3", 15: "head", 18: "left_elbow", 21: "right_wrist", 22: "jaw", 24: "right_eye"}
-    known |= {25: "left_index1", 36: "left_ring3", 39: "left_thumb3", 40: "right_index1", 54: "right_thumb3"}
-    assert len(set(JOINTS)) == 55
-    assert {i: JOINTS[i] for i in known} == known
-
-
 # --- files ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("fps", [30.0, 29.97, 1 / 3])
-def test_saved_motions_are_read_exactly(tmp_path: Path, fps: float) -> None:
-    """On whatever body, and the same motion is the same file."""
-    motion = replace(random_motion(), fps=fps, betas=torch.randn(7), scale=torch.rand(4) + 0.1)
-    save_motion(motion, tmp_path / "new" / "x.npz")
-    for body in (BODY, tiny_body(24)):
-        found = read_motion(tmp_path / "new" / "x.npz", body)
-        for name in ("poses", "trans", "betas", "scale"):
-            assert torch.equal(getattr(found, name), getattr(motion, name)), name
-        assert found.fps == fps
-    save_motion(found, tmp_path / "y.npz")
-    assert (tmp_path / "y.npz").read_bytes() == (tmp_path / "new" / "x.npz").read_bytes()
-
-
-def test_saved_files_are_those_of_amass(tmp_path: Path) -> None:
-    save_motion(random_motion(), tmp_path / "x.npz")
-    with np.load(tmp_path / "x.npz", allow_pickle=False) as file:
-        assert file["poses"].shape == (4, 165)
-        assert {str(file[key]) for key in ("surface_model_type", "gender", "up_axis")} == {"smplx", "neutral", "y"}
-
-
-def test_what_cannot_be_saved(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match=r"x\.bvh: a motion is written as \.npz"):
-        save_motion(random_motion(), tmp_path / "x.bvh")
-    with pytest.raises(ValueError, match="must be"):
-        save_motion(random_motion().for_joints(24), tmp_path / "x.npz")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(DyngsError, match="cannot write"):
-        save_motion(random_motion(), tmp_path / "file" / "x.npz")
-
-
-def test_the_suffix_says_what_a_file_is(tmp_path: Path) -> None:
-    """The same motion from BVH and GLB, in upper case too."""
-    motion, own = random_motion(), skeleton()
-    local, root = as_local(motion, own), pelvis_path(BODY, motion)
-    files = [write_bvh(tmp_path / "x.BVH", own, local, root), glb_of(own, Clip(local, root)).write(tmp_path / "x.glb")]
-    for path in files:
-        found = read_motion(path, BODY)
-        np.testing.assert_allclose(matrices(found), matrices(motion), atol=1e-5)
-        assert found.fps == pytest.approx(30, rel=1e-6)
-        assert found.poses.dtype == torch.float32
-    halved = read_motion(files[0], BODY, fps=15.0)
-    np.testing.assert_allclose(
-        matrices(halved), matrices(motion).reshape(4, 55, 3, 3)[::2].reshape(-1, 3, 3), atol=1e-5
-    )
-    assert len(read_motion(files[1], BODY, fps=60.0, clip="Walk")) == 7
-
-
-def test_the_body_that_comes_with_dyngs_is_the_default(tmp_path: Path) -> None:
-    """Its feet come to the floor, its pelvis to the height of its legs."""
-    own = skeleton()
-    motion = read_motion(write_bvh(tmp_path / "x.bvh", own, np.tile(np.eye(3), (1, 55, 1, 1)), own.rest[:1]))
-    body = default_template()
-    lowest = posed_vertices(body, motion.poses, motion.trans)[..., 1].min()
-    assert float(lowest) == pytest.approx(0, abs=1e-5)
-    assert 0.8 < float(body.joints[0, 1] + motion.trans[0, 1]) < 1.1
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "problem"),
-    [
-        ("x.fbx", {}, r"x\.fbx: unknown kind of motion; give an AMASS \.npz"),
-        ("x.bvh", {"up": "z"}, "the up axis can only be told of an .npz"),
-        ("x.npz", {"clip": "Walk"}, "holds one motion without a name"),
-        ("x.bvh", {}, "cannot be read"),
-        ("x.glb", {}, "cannot be read"),
-        ("x.npz", {}, "no such file"),
-    ],
-)
-def test_what_cannot_be_read(tmp_path: Path, name: str, options: dict[str, str], problem: str) -> None:
-    with pytest.raises(DyngsError, match=problem) as caught:
-        read_motion(tmp_path / name, BODY, **options)  # pyright: ignore[reportArgumentType]
-    assert str(tmp_path / name) in str(caught.value)
 
 
 # --- joints and times -------------------------------------------------------------------------------------------------
@@ -128,9 +42,9 @@ def test_joints_of_a_body(count: int) -> None:
     motion = random_motion()
     poses = motion.for_joints(count).poses
     assert poses.shape == (4, count, 3)
-    for i, row in enumerate(ROWS[count]):
+    for i, row in enumerate(SMPLX_ROWS[count]):
         assert torch.equal(poses[:, i], motion.poses[:, row])
-    assert not poses[:, len(ROWS[count]) :].any()
+    assert not poses[:, len(SMPLX_ROWS[count]) :].any()
 
 
 @settings(max_examples=15, deadline=None)

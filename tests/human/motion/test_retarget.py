@@ -13,7 +13,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from motion_files import (
     Skeleton,
-    pelvis_path,
     random_motion,
     skeleton,
     slow_vertices,
@@ -23,10 +22,13 @@ from motion_files import (
 from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
-from dyngs.human.motion.motion import JOINTS, Motion
-from dyngs.human.motion.retarget import SkeletonMotion, least_rotation, place_on_floor, retarget
+from dyngs.human.motion.floor import place_on_floor
+from dyngs.human.motion.motion import Motion
+from dyngs.human.motion.retarget import least_rotation, retarget
+from dyngs.human.motion.skeleton_motion import SkeletonMotion
+from dyngs.human.template.joints import JOINT_NAMES
 
-MIDDLE = tuple(name for name in JOINTS if "_" not in name)
+MIDDLE = tuple(name for name in JOINT_NAMES if "_" not in name)
 AXES = [
     np.eye(3)[list(order)] * np.array(signs)[:, None]
     for order in permutations(range(3))
@@ -80,7 +82,7 @@ def test_a_bent_elbow_is_a_bent_elbow() -> None:
     """Forearm up by 90 degrees: about z, as the left arm points to +x."""
     own = skeleton()
     poses = np.zeros((1, 55, 3))
-    poses[0, JOINTS.index("left_elbow")] = (0, 0, np.pi / 2)
+    poses[0, JOINT_NAMES.index("left_elbow")] = (0, 0, np.pi / 2)
     motion = retarget(driven(own, poses, own.rest[:1]), tiny_body())
     np.testing.assert_allclose(motion.poses.numpy(), poses, atol=1e-6)
 
@@ -90,30 +92,30 @@ def test_arms_that_hang_at_rest_are_lowered() -> None:
     own = skeleton()
     lowered = own.rest.copy()
     for side, angle in (("left", -45), ("right", 45)):
-        shoulder = JOINTS.index(f"{side}_shoulder")
-        arm = [i for i, name in enumerate(JOINTS) if name.startswith(side) and abs(own.rest[i, 0]) > 0.2]
+        shoulder = JOINT_NAMES.index(f"{side}_shoulder")
+        arm = [i for i, name in enumerate(JOINT_NAMES) if name.startswith(side) and abs(own.rest[i, 0]) > 0.2]
         turn = Rotation.from_euler("z", angle, degrees=True)
         lowered[arm] = own.rest[shoulder] + turn.apply(own.rest[arm] - own.rest[shoulder])
     motion = retarget(at_rest(replace(own, rest=lowered)), tiny_body())
     expected = np.zeros((55, 3))
-    expected[JOINTS.index("left_shoulder")] = (0, 0, -np.pi / 4)
-    expected[JOINTS.index("right_shoulder")] = (0, 0, np.pi / 4)
+    expected[JOINT_NAMES.index("left_shoulder")] = (0, 0, -np.pi / 4)
+    expected[JOINT_NAMES.index("right_shoulder")] = (0, 0, np.pi / 4)
     np.testing.assert_allclose(motion.poses[0].numpy(), expected, atol=0.1)  # bones are not straight: some twist
     turned = world_rotations(motion.poses.double().numpy(), own.parents)[0]
     for start, end in (("left_shoulder", "left_elbow"), ("right_elbow", "right_wrist"), ("left_index1", "left_index2")):
-        i, j = JOINTS.index(start), JOINTS.index(end)
+        i, j = JOINT_NAMES.index(start), JOINT_NAMES.index(end)
         np.testing.assert_allclose(turned[i] @ (own.rest[j] - own.rest[i]), lowered[j] - lowered[i], atol=1e-6)
 
 
 def test_hands_without_fingers_go_with_their_arms_and_flat_feet_stay_flat() -> None:
-    own = skeleton([name for name in JOINTS[:22] if "foot" not in name])
+    own = skeleton([name for name in JOINT_NAMES[:22] if "foot" not in name])
     names = own.names
     splayed = own.rest.copy()
     for side, sign in (("left", 1), ("right", -1)):
         splayed[names.index(f"{side}_wrist")] += (-0.1 * sign, -0.2, 0)
         splayed[names.index(f"{side}_ankle"), 0] += 0.2 * sign
     motion = retarget(at_rest(replace(own, rest=splayed)), tiny_body())
-    pose = dict(zip(JOINTS, motion.poses[0].numpy(), strict=True))
+    pose = dict(zip(JOINT_NAMES, motion.poses[0].numpy(), strict=True))
     assert pose["left_elbow"][2] < -0.5
     assert abs(pose["left_wrist"]).max() < 1e-6
     assert pose["left_knee"][2] > 0.2
@@ -169,21 +171,21 @@ def test_a_crooked_rest_pose_does_not_turn_the_world() -> None:
     """One hip 1 cm before the other is no reason to walk askew."""
     own = skeleton()
     crooked = own.rest.copy()
-    crooked[JOINTS.index("left_hip"), 2] += 0.01
+    crooked[JOINT_NAMES.index("left_hip"), 2] += 0.01
     root = crooked[0] + np.array([[0, 0, 0], [0, 0, 1.0]])
     motion = retarget(driven(replace(own, rest=crooked), np.zeros((2, 55, 3)), root), tiny_body())
     np.testing.assert_allclose((motion.trans[1] - motion.trans[0])[:2], 0, atol=1e-6)
-    assert motion.poses[:, JOINTS.index("left_shoulder")].abs().max() < 1e-6
+    assert motion.poses[:, JOINT_NAMES.index("left_shoulder")].abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("missing", [("spine2",), ("left_collar", "spine1", "head"), JOINTS[22:]])
+@pytest.mark.parametrize("missing", [("spine2",), ("left_collar", "spine1", "head"), JOINT_NAMES[22:]])
 def test_joints_that_the_other_lacks_follow_their_parents(missing: tuple[str, ...]) -> None:
-    own = skeleton([name for name in JOINTS if name not in missing])
-    poses = random_motion(2).poses.double().numpy()[:, [JOINTS.index(name) for name in own.names]]
+    own = skeleton([name for name in JOINT_NAMES if name not in missing])
+    poses = random_motion(2).poses.double().numpy()[:, [JOINT_NAMES.index(name) for name in own.names]]
     source = driven(own, poses, np.zeros((2, 3)))
     motion = retarget(source, tiny_body())
     found = world_rotations(motion.poses.double().numpy(), skeleton().parents)
-    for i, name in enumerate(JOINTS):
+    for i, name in enumerate(JOINT_NAMES):
         if name in missing:
             assert motion.poses[:, i].abs().max() < 1e-6
         else:
@@ -193,7 +195,7 @@ def test_joints_that_the_other_lacks_follow_their_parents(missing: tuple[str, ..
 def test_joints_in_between_do_not_matter() -> None:
     """A bone of two parts, such as a twist bone."""
     source = of_motion(random_motion(), skeleton())
-    halfway = source.rest[[JOINTS.index("left_shoulder"), JOINTS.index("left_elbow")]].mean(0)
+    halfway = source.rest[[JOINT_NAMES.index("left_shoulder"), JOINT_NAMES.index("left_elbow")]].mean(0)
     longer = replace(
         source,
         names=("twist", *source.names),
@@ -214,17 +216,6 @@ def test_bodies_with_fewer_joints(count: int) -> None:
 
 
 # --- floor and small parts --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("count", [24, 52, 55])
-def test_the_lowest_vertex_comes_to_the_floor(count: int) -> None:
-    body = tiny_body(count)
-    motion = replace(random_motion(), scale=torch.tensor([0.5, 1.0, 1.5, 2.0]))
-    landed = place_on_floor(motion, body)
-    assert slow_vertices(body, landed)[..., 1].min() == pytest.approx(0, abs=1e-6)
-    assert torch.equal(landed.trans[:, ::2], motion.trans[:, ::2])
-    rise = pelvis_path(body, landed) - pelvis_path(body, motion)
-    assert np.ptp(rise[:, 1]) < 1e-6
 
 
 @settings(max_examples=60, deadline=None)

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from dyngs.errors import DyngsError
-from dyngs.human.motion.motion import JOINTS
 from dyngs.human.motion.rigs import RIGS, Rig, match_joints
+from dyngs.human.template.joints import JOINT_NAMES
 
 FILE = Path("walk.bvh")
 SIDED = ("collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot")
@@ -31,7 +31,7 @@ def names_of(rig: Rig) -> dict[str, str]:
 def test_each_kind_is_known(rig: Rig, prefix: str) -> None:
     """Whatever precedes the names, and in any case."""
     names = names_of(rig)
-    assert set(names) <= set(JOINTS)
+    assert set(names) <= set(JOINT_NAMES)
     found = match_joints(FILE, [prefix + name.upper() for name in names.values()])
     assert {ours: list(names.values())[i] for ours, i in found.items()} == names
 

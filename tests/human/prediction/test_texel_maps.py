@@ -19,12 +19,13 @@ from dyngs.data.geometry.poses import cam_from_opengl
 from dyngs.data.loader import Picture
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.human.avatar.posing import BodyPose
-from dyngs.human.motion.motion import JOINTS
 from dyngs.human.prediction.person import CapturedPerson, captured_person
 from dyngs.human.prediction.texel_maps import from_atlas, observe_texels, to_atlas
 from dyngs.human.synthetic.capture import PosedMesh, render_mesh
 from dyngs.human.synthetic.clothes import texel_coordinates, texture_coordinates
-from dyngs.human.template.body import BodyTemplate, default_template, posed_vertices
+from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.template.load import default_template
 from dyngs.human.template.mesh import interpolate, rasterize
 
 SIZE = 96
@@ -50,8 +51,8 @@ def arms_before_the_chest() -> Tensor:
     """(55, 3): forearms before the chest, across."""
     poses = torch.zeros(55, 3)
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        poses[JOINTS.index(f"{side}_shoulder")] = torch.tensor([0.0, -1.2 * sign, 0.0])
-        poses[JOINTS.index(f"{side}_elbow")] = torch.tensor([0.0, -1.5 * sign, 0.0])
+        poses[JOINT_NAMES.index(f"{side}_shoulder")] = torch.tensor([0.0, -1.2 * sign, 0.0])
+        poses[JOINT_NAMES.index(f"{side}_elbow")] = torch.tensor([0.0, -1.5 * sign, 0.0])
     return poses
 
 
@@ -80,7 +81,7 @@ def picture(poses: Tensor, texture: np.ndarray, pose: np.ndarray) -> Picture:
 
 
 def is_arm(joints: np.ndarray | Tensor) -> np.ndarray:
-    names = np.array(JOINTS)[np.asarray(joints)]
+    names = np.array(JOINT_NAMES)[np.asarray(joints)]
     arm = ("shoulder", "elbow", "wrist", "index", "middle", "pinky", "ring", "thumb")
     return np.array([any(part in name for part in arm) for name in names])
 

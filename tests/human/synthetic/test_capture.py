@@ -24,7 +24,8 @@ from dyngs.data.geometry.poses import cam_from_opengl
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.errors import DyngsError
-from dyngs.human.motion.motion import JOINTS, Motion, read_motion
+from dyngs.human.motion.motion import Motion
+from dyngs.human.motion.read import read_motion
 from dyngs.human.synthetic.capture import (
     HumanOptions,
     PosedMesh,
@@ -34,7 +35,9 @@ from dyngs.human.synthetic.capture import (
     write_human_capture,
 )
 from dyngs.human.synthetic.clothes import dress_body, paint_texture, random_outfit
-from dyngs.human.template.body import BodyTemplate, default_template, posed_vertices
+from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.template.load import default_template
 
 TINY = HumanOptions(size=24, num_frames=2, num_new=2, num_cameras=3, num_test=1, samples=1)
 LIGHT = np.array([0.35, 0.75, 0.56]) / np.linalg.norm([0.35, 0.75, 0.56])
@@ -192,7 +195,7 @@ def test_the_left_hand_is_on_the_left_of_the_person() -> None:
     """A picture from the front shows it on the right, one from behind on the left; it is painted by its vertices."""
     at_rest = body().vertices.double().numpy()
     mesh = mesh_of(at_rest + np.array([0.0, 0.83, 0.0]), np.ones((128, 128, 3)))
-    wrist = body().joints[JOINTS.index("left_wrist"), 0].item()
+    wrist = body().joints[JOINT_NAMES.index("left_wrist"), 0].item()
     for corners, corners_uv in zip(mesh.faces, mesh.uv_faces, strict=True):
         if at_rest[corners, 0].min() > wrist:
             u, v = mesh.uv[corners_uv].mean(0)
@@ -231,7 +234,7 @@ def test_the_clips_are_what_their_names_say() -> None:
     """Feet pass each other in a walk; in a squat the pelvis goes down and the hands go up."""
 
     def vertex(joint: str) -> int:
-        return int(torch.linalg.vector_norm(body().vertices - body().joints[JOINTS.index(joint)], dim=-1).argmin())
+        return int(torch.linalg.vector_norm(body().vertices - body().joints[JOINT_NAMES.index(joint)], dim=-1).argmin())
 
     left, right, wrist = (vertex(name) for name in ("left_ankle", "right_ankle", "left_wrist"))
     steps = [posed(walk(body(), 7), frame)[[left, right]] for frame in (1, 3)]

@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from dyngs.errors import DyngsError
-from dyngs.human.motion.motion import JOINTS
 from dyngs.human.synthetic.clothes import Outfit, dress_body, paint_texture, random_outfit
-from dyngs.human.template.body import BodyTemplate, default_template
+from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.template.load import default_template
 from dyngs.human.template.mesh import vertex_normals
 
 
@@ -92,7 +93,7 @@ def test_clothes_stand_away_from_the_skin_by_up_to_four_centimetres(seed: int) -
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.abs(height), atol=1e-6)  # float32 vertices
     assert height.min() > -1e-6
     assert 0.6 * max(outfit.shirt, outfit.trousers) < height.max() <= 0.04
-    hands = np.abs(skin[:, 0].numpy()) > body().joints[JOINTS.index("left_index1"), 0].item()
+    hands = np.abs(skin[:, 0].numpy()) > body().joints[JOINT_NAMES.index("left_index1"), 0].item()
     assert height[hands].max() < 1e-3
     assert clothed.joints is body().joints
     assert clothed.weights is body().weights

@@ -17,8 +17,9 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.human.template.atlas import Texels, atlas_texels, nearest_neighbours, scaffold_points
-from dyngs.human.template.body import BodyTemplate, default_template
+from dyngs.human.template.atlas import Texels, atlas_texels, scaffold_points
+from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.load import default_template
 
 NUM_JOINTS = 2
 
@@ -348,35 +349,3 @@ def test_heights_are_numbers(heights: tuple[float, ...]) -> None:
 
 
 # --- neighbours -------------------------------------------------------------------------------------------------------
-
-
-@settings(max_examples=40, deadline=None)
-@given(arrays(np.float64, st.tuples(st.integers(0, 12), st.just(3)), elements=st.integers(0, 3)), st.integers(1, 5))
-def test_neighbours_are_the_nearest_others(places: np.ndarray, count: int) -> None:
-    """By all distances; on a grid, so that many points coincide and are equally far."""
-    points = torch.from_numpy(places)
-    found = nearest_neighbours(points, count)
-    columns = max(0, min(count, len(points) - 1))
-    assert found.shape == (len(points), columns)
-    apart = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
-    for i, row in enumerate(found):
-        assert i not in row.tolist()
-        assert len(set(row.tolist())) == columns
-        others = torch.cat([apart[i, :i], apart[i, i + 1 :]]).sort().values
-        torch.testing.assert_close(apart[i, row], others[:columns])
-
-
-def test_neighbours_on_the_skin_are_next_texels() -> None:
-    texels = anny(64)
-    found = nearest_neighbours(texels.points)
-    assert found.shape == (len(texels), 5)
-    apart = (texels.points[found] - texels.points[:, None]).norm(dim=-1)
-    assert bool((apart.diff(dim=1) >= 0).all())
-    assert float((apart[:, 0] / texels.size).median()) == pytest.approx(1, abs=0.3)
-
-
-def test_neighbours_need_finite_points() -> None:
-    points = torch.rand(10, 3)
-    points[4, 1] = math.nan
-    with pytest.raises(DyngsError, match="not finite"):
-        nearest_neighbours(points)

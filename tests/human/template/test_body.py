@@ -14,7 +14,8 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.human.template.body import BodyTemplate, apply_shape, default_template, posed_vertices
+from dyngs.human.template.body import BodyTemplate, apply_shape, posed_vertices
+from dyngs.human.template.load import default_template
 
 LEFT_ELBOW, LEFT_WRIST, LEFT_FINGERS = 18, 20, range(25, 40)
 SIDES = {1: 2, 4: 5, 7: 8, 10: 11, 13: 14, 16: 17, 18: 19, 20: 21, 23: 24, **{i: i + 15 for i in range(25, 40)}}

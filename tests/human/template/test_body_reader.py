@@ -34,8 +34,9 @@ from synthetic_bodies import (
 )
 
 from dyngs.errors import DyngsError
-from dyngs.human.template.body import BodyTemplate, default_template, posed_vertices
+from dyngs.human.template.body import BodyTemplate, posed_vertices
 from dyngs.human.template.body_reader import read_body
+from dyngs.human.template.load import default_template
 
 TEMPLATE = Path(inspect.getfile(BodyTemplate)).parent / "files" / "anny_smplx55.npz"
 

@@ -11,8 +11,8 @@ from synthetic_bodies import model, write_npz
 
 from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
-from dyngs.human.template.body import apply_shape, default_template
-from dyngs.human.template.load import load_template, rest_shape
+from dyngs.human.template.body import apply_shape
+from dyngs.human.template.load import default_template, load_template, rest_shape
 
 
 def test_the_free_template_is_the_default() -> None:

@@ -1,0 +1,79 @@
+"""Gaussians on the texels of the template: where they lie, and which joints they follow.
+
+N Gaussians, J joints.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.anchors import Anchors, heaviest_joints, skinning_weights, texel_gaussians
+from dyngs.human.pose.covariance import rotations_of
+from dyngs.human.template.atlas import atlas_texels
+from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.load import default_template
+
+RESOLUTION = 48
+
+
+@cache
+def person(sh_degree: int = 0) -> tuple[BodyTemplate, Gaussians, Anchors, Tensor]:
+    """The free template with one scaffold, and its dense weights."""
+    body = default_template()
+    gaussians, anchors = texel_gaussians(atlas_texels(body, RESOLUTION), (0.0, 0.02), sh_degree)
+    generator = torch.Generator().manual_seed(0)
+    gaussians = gaussians.replace(sh=0.3 * torch.randn(gaussians.sh.shape, generator=generator))
+    return body, gaussians, anchors, skinning_weights(anchors, len(body.joints))
+
+
+def test_corrections_act_only_where_parts_meet() -> None:
+    _, _, anchors, weights = person()
+    generator = torch.Generator().manual_seed(3)
+    corrections = torch.randn(anchors.weights.shape, generator=generator)
+    found = skinning_weights(anchors, weights.shape[1], corrections)
+    torch.testing.assert_close(found.sum(1), torch.ones(len(found)))
+    alone = anchors.weights[:, 0] == 1
+    assert bool(alone.any())
+    torch.testing.assert_close(found[alone], weights[alone])
+    assert bool(((found > 0) <= (weights > 0)).all()), "no joint is followed that was not"
+    assert float((found - weights)[~alone].abs().max()) > 0.1
+
+
+def test_the_heaviest_joints_are_kept_and_normalised() -> None:
+    weights = torch.tensor([[0.05] * 8 + [0.3, 0.3], [0.0] * 9 + [1.0]])
+    joints, shares = heaviest_joints(weights)
+    assert joints.shape == (2, 8)
+    assert joints[0, :2].tolist() == [8, 9]
+    assert joints[1, 0] == 9
+    torch.testing.assert_close(shares.sum(1), torch.ones(2))
+    torch.testing.assert_close(shares[0, 0], torch.tensor(0.3 / 0.9))
+
+
+def test_first_gaussians_lie_flat_on_their_scaffolds() -> None:
+    texels = atlas_texels(default_template(), RESOLUTION)
+    gaussians, anchors = texel_gaussians(texels, (0.0, 0.03), 1)
+    assert len(gaussians) == len(anchors) == 2 * len(texels)
+    torch.testing.assert_close(gaussians.means[len(texels) :], texels.points + 0.03 * texels.normals)
+    thin = rotations_of(gaussians.quats)[:, :, 2]
+    torch.testing.assert_close(thin[: len(texels)], texels.normals, rtol=0, atol=1e-5)
+    assert gaussians.log_scales.argmin(1).eq(2).all()
+    assert gaussians.opacities[0] > 0.5 > gaussians.opacities[-1]
+    assert gaussians.sh.shape == (2 * len(texels), 4, 3)
+
+
+def test_anchors_know_their_place_on_the_template() -> None:
+    body = default_template()
+    _, anchors = texel_gaussians(atlas_texels(body, RESOLUTION), (0.0, 0.02), 0)
+    corners = (anchors.barycentric[..., None] * body.vertices[body.faces[anchors.face]]).sum(1)
+    skin = anchors.height == 0
+    torch.testing.assert_close(corners[skin], anchors.points[skin])
+    distances = (anchors.points - corners)[~skin].norm(dim=1)
+    torch.testing.assert_close(distances, anchors.height[~skin], rtol=1e-4, atol=0)
+    assert body.uv is not None
+    assert body.uv_faces is not None
+    uv = (anchors.barycentric[..., None] * body.uv[body.uv_faces[anchors.face]]).sum(1)
+    torch.testing.assert_close(anchors.uv, uv, rtol=0, atol=1e-5)
