@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError, reading
 from dyngs.files.numpy_files import read_arrays
-from dyngs.files.write import whole_file
+from dyngs.files.write import atomic_file
 from dyngs.human.motion.floor import place_on_floor
 from dyngs.human.motion.motion import (
     Motion,
@@ -21,7 +21,6 @@ from dyngs.human.motion.motion import (
     require_frame_count,
     require_frame_rate,
 )
-from dyngs.human.motion.retarget import place_on_floor
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import SMPLX_ROWS
 
@@ -64,7 +63,7 @@ def write_amass(motion: Motion, path: Path) -> None:
         raise DyngsError(f"cannot write {path}: a motion is written as .npz")
     if motion.poses.shape[1:] != (55, 3):
         raise ValueError(f"poses must be (F, 55, 3), got {tuple(motion.poses.shape)}")
-    with whole_file(path) as temporary, temporary.open("wb") as file:
+    with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
             poses=motion.poses.reshape(len(motion), -1).numpy(),

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.data.body_frames import BodyFrames, about_pelvis, rows_of
 from dyngs.data.capture import View
-from dyngs.data.readers.people import BodyFrames, about_pelvis, rows_of
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import SMPLX_ROWS
 

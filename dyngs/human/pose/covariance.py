@@ -1,7 +1,6 @@
-"""Gaussians moved by any linear maps: their axes and lengths afterwards, exactly, with gradients that stay finite.
+"""Covariances of Gaussians under linear maps, as rotation and log scales: exact, with finite gradients.
 
-Local letter: N Gaussians. Inside, components come first, (3, 3, N): long rows are what elementwise operations are fast
-on.
+Local letter: N Gaussians. Internally components come first, (3, 3, N): elementwise operations are fast on long rows.
 """
 
 from __future__ import annotations
@@ -16,28 +15,28 @@ from dyngs.human.pose.nearest_rotation import quats_of
 from dyngs.ops.quaternions import unit_quats
 
 _SWEEPS = 6
-"""Most sweeps of Jacobi's method, which converges quadratically: nearly rigid maps need 1 or 2."""
+"""Limit on the sweeps of Jacobi's method, which converges quadratically: nearly rigid maps need 1 or 2."""
 
 _BLOCK = 8192
-"""Gaussians that are worked on at a time, so that intermediate results stay in the cache."""
+"""Gaussians per block, so that intermediate results stay in the cache."""
 
 _THINNEST = -16.0
-"""Logarithm of the smallest ratio of a Gaussian's axes that is told from zero."""
+"""Natural logarithm of the smallest ratio of a Gaussian's axes that is distinguished from zero."""
 
 _CLOSEST = 1e-4
-"""Relative gap of two squared axes below which turning one into the other changes nothing that could be seen."""
+"""Relative gap of two squared axes below which rotating one into the other has no visible effect."""
 
 
 def transform_covariance(linear: Tensor, quats: Tensor, log_scales: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotations wxyz (N, 4) and log scales (N, 3) of covariances T S T^T with S that of ``quats`` and ``log_scales``.
+    """Return quaternions wxyz (N, 4) and log scales (N, 3) of the covariances T S T^T, with S of the given Gaussians.
 
     Exact for every T: with T R diag(s) = U diag(d) V^T the covariance is U diag(d^2) U^T. The gradient of U divides by
-    d_i^2 - d_j^2; where these are nearly equal, what it multiplies vanishes too, and the quotient is clipped.
+    d_i^2 - d_j^2; where these are nearly equal its numerator vanishes too, and the quotient is set to zero.
 
     Args:
         linear: (N, 3, 3) T.
-        quats: (N, 4) wxyz of any length; zero turns nothing.
-        log_scales: (N, 3).
+        quats: (N, 4) wxyz of S, of any length; zero counts as the identity.
+        log_scales: (N, 3) of S.
     """
     longest = log_scales.amax(-1, keepdim=True)
     lengths = (log_scales - longest).clamp_min(_THINNEST).exp()
@@ -46,7 +45,7 @@ def transform_covariance(linear: Tensor, quats: Tensor, log_scales: Tensor) -> t
 
 
 def rotations_of(quats: Tensor) -> Tensor:
-    """(N, 3, 3) rotations of quaternions wxyz (N, 4) of any length; of zero the identity."""
+    """Return the rotations (N, 3, 3) of quaternions wxyz (N, 4) of any length; the identity for zero."""
     w, x, y, z = unit_quats(quats).T
     xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
     xy, xz, yz, wx, wy, wz = 2 * x * y, 2 * x * z, 2 * y * z, 2 * w * x, 2 * w * y, 2 * w * z
@@ -55,7 +54,7 @@ def rotations_of(quats: Tensor) -> Tensor:
 
 
 class _Axes(torch.autograd.Function):
-    """U (a rotation) and log d of M = U diag(d) V^T, the d in no order."""
+    """Singular value decomposition M = U diag(d) V^T: U, a rotation, and log d, in no order."""
 
     @staticmethod
     def forward(ctx: Any, matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -78,25 +77,27 @@ class _Axes(torch.autograd.Function):
 
 
 def _gradients(axes: Tensor, lengths: Tensor, turned: Tensor, g_axes: Tensor, g_logs: Tensor) -> Tensor:
-    """(3, 3, N) gradients by M, U X V^T, from those by U and log d.
+    """Return the gradients by M (3, 3, N), U X V^T, from those by U and log d.
 
     X_ij = (S_ij - S_ji) d_j / (d_j^2 - d_i^2) with S = U^T g_U, and X_kk = g_k / d_k.
     """
-    spin = _product(axes.transpose(0, 1), g_axes)
-    spin = spin - spin.transpose(0, 1)
+    twist = _product(axes.transpose(0, 1), g_axes)
+    twist = twist - twist.transpose(0, 1)
     squares = lengths.square()
     gap = squares[None] - squares[:, None]
     least = _CLOSEST * torch.maximum(squares[None], squares[:, None])
-    inner = spin * lengths[None] * torch.where(gap.abs() < least, 0.0, 1 / gap)
+    inner = twist * lengths[None] * torch.where(gap.abs() < least, 0.0, 1 / gap)
     for k in range(3):
         inner[k, k] = g_logs[k] / lengths[k]
     return _product(_product(axes, inner), turned.transpose(0, 1))
 
 
 def _orthogonal_columns(columns: Tensor) -> Tensor:
-    """(6, 3, N): M V with orthogonal columns above the rotations V, by one-sided Jacobi rotations (Hestenes 1958)."""
+    """Return M V with orthogonal columns, stacked on the rotations V (6, 3, N): one-sided Jacobi (Hestenes 1958)."""
     tiny, small = torch.finfo(columns.dtype).tiny, 4 * torch.finfo(columns.dtype).eps
-    both = torch.cat([columns, torch.eye(3, dtype=columns.dtype)[..., None].repeat(1, 1, columns.shape[-1])])
+    both = torch.cat(
+        [columns, torch.eye(3, dtype=columns.dtype, device=columns.device)[..., None].repeat(1, 1, columns.shape[-1])]
+    )
     for _ in range(_SWEEPS if columns.shape[-1] else 0):
         largest = columns.new_zeros(())
         for p, q in ((0, 1), (0, 2), (1, 2)):
@@ -109,11 +110,11 @@ def _orthogonal_columns(columns: Tensor) -> Tensor:
             cosine = (1 + tangent * tangent).rsqrt()
             sine = tangent * cosine
             both[:, p], both[:, q] = cosine * first - sine * second, sine * first + cosine * second
-        if not bool(largest > small):  # c^2 / (a b) shrinks as its own square: the rest is rounding
+        if not bool(largest > small):  # c^2 / (a b) converges quadratically: the rest is rounding
             break
     return both
 
 
 def _product(a: Tensor, b: Tensor) -> Tensor:
-    """(3, 3, N) products of matrices (3, 3, N)."""
+    """Return the products (3, 3, N) of matrices (3, 3, N)."""
     return (a[:, :, None] * b[None]).sum(1)

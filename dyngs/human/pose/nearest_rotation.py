@@ -1,6 +1,6 @@
-"""Rotations out of blended matrices, and quaternions out of rotations; both with gradients that stay finite.
+"""The rotation nearest to a matrix (polar decomposition), and the quaternion of a rotation, with finite gradients.
 
-Local letter: L matrices. Inside, components come first, (9, L): long rows are what elementwise operations are fast on.
+Local letter: L matrices. Internally components come first, (9, L): elementwise operations are fast on long rows.
 """
 
 from __future__ import annotations
@@ -12,42 +12,42 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 _ROOT_STEPS = 20
-"""Most steps of Laguerre's method: 2 to 4 do for nearly rigid blends, multiple roots need the others."""
+"""Limit on the steps of Laguerre's method: 2 to 4 suffice for nearly rigid blends, multiple roots need more."""
 
 _BLOCK = 8192
-"""Matrices that are worked on at a time, so that intermediate results stay in the cache."""
+"""Matrices per block, so that intermediate results stay in the cache."""
 
 _AMBIGUOUS = 1e-6
-"""Trace of the adjugate, of a matrix of unit size, below which the nearest rotation counts as not unique."""
+"""Trace of the adjugate, for a matrix of unit size, below which the nearest rotation counts as ambiguous."""
 
 _STEEPEST = 1e4
-"""Gradients by matrices are clipped to this many times those by rotations, over 2 (s1 + s2 + s3)."""
+"""Limit on the gradient by the matrix, in multiples of that by the rotation over 2 (s1 + s2 + s3)."""
 
 _TIE_BREAK = (1e-4, 0.7e-4, 0.4e-4)
-"""Diagonal that is added where it is not unique, so that a small turn is taken; unequal, to break all ties."""
+"""Diagonal that is added where it is ambiguous, in favour of small rotations; unequal, to break all ties."""
 
 
 def nearest_rotations(matrices: Tensor) -> Tensor:
-    """The rotation R nearest to each matrix A (..., 3, 3) in the Frobenius norm, same shape; its determinant is +1.
+    """Return the rotations R (..., 3, 3), det R = +1, nearest to matrices A (..., 3, 3) in the Frobenius norm.
 
     Let A = U diag(s1, s2, s3) V^T with rotations U, V and s1 >= s2 >= |s3|: R = U V^T, unique where s2 + s3 > 0. Where
-    that is zero or nearly so (a blend of opposite turns, a reflection) one is taken that is nearest to 1e-4 |A|, with a
-    small turn if there is a choice; of zero the identity. NaN or infinity give NaN. Computed in float64 as the dominant
+    that is zero or nearly so (a blend of opposite rotations, a reflection), R is nearest to within 1e-4 |A|, and small
+    if there is a choice; the identity for zero. NaN or infinity give NaN. Computed in float64 as the dominant
     eigenvector, a unit quaternion, of Horn's 4x4 matrix, with the largest root of its quartic (Horn 1987; Higham and
     Noferini 2016).
 
     Differentiable, once: R^T dR = [w]x with (tr(P) I - P) w = axial(R^T dA), P = R^T A. This divides by s_i + s_j, not
     by s_i - s_j as the derivative of an SVD: equal singular values are harmless. Where s2 + s3 is below 2e-4 of
-    s1 + s2 + s3 it is clipped, and for A = 0 it is zero: never NaN or infinite.
+    s1 + s2 + s3 the gradient is clipped, and for A = 0 it is zero: never NaN or infinite.
     """
     return _NearestRotation.apply(matrices)  # pyright: ignore[reportReturnType]
 
 
 def quats_of(matrices: Tensor) -> Tensor:
-    """Unit quaternions wxyz (..., 4) of the rotations (..., 3, 3); the largest component of each is positive.
+    """Return the unit quaternions wxyz (..., 4) of rotations (..., 3, 3), with their largest component positive.
 
-    Differentiable, at half turns as well: that column of 4 q q^T is normalised that has the largest diagonal (Shepperd
-    1978). Matrices that are slightly off give unit quaternions all the same.
+    Differentiable, at half turns too: the column of 4 q q^T with the largest diagonal entry, normalised (Shepperd
+    1978). Matrices that are not quite rotations still give unit quaternions.
     """
     columns = _horn(_components(matrices), diagonal=1.0)
     return _largest(columns).T.reshape(*matrices.shape[:-2], 4)
@@ -70,7 +70,7 @@ class _NearestRotation(torch.autograd.Function):
 
 
 def _gradients(a: Tensor, r: Tensor, grad: Tensor) -> Tensor:
-    """(9, L) gradients by the matrices ``a``, R [h]x with h = (tr(P) I - P)^-1 axial(R^T grad), from those by ``r``."""
+    """Return gradients (9, L) by the matrices: R [h]x with h = (tr(P) I - P)^-1 axial(R^T grad)."""
     a, r, grad = (x.reshape(3, 3, -1) for x in (a, r, grad))
     info = torch.finfo(a.dtype)
     stretch = (r[:, :, None] * a[:, None]).sum(0)
@@ -90,12 +90,12 @@ def _gradients(a: Tensor, r: Tensor, grad: Tensor) -> Tensor:
 
 
 def _components(matrices: Tensor) -> Tensor:
-    """(9, L) of (..., 3, 3), row by row."""
+    """Return matrices (..., 3, 3) as (9, L), row by row."""
     return matrices.reshape(-1, 9).T.contiguous()
 
 
 def _dominant_quats(a: Tensor) -> Tensor:
-    """Quaternions (4, L) of the nearest rotations to the matrices ``a`` (9, L)."""
+    """Return the quaternions (4, L) of the rotations nearest to the matrices ``a`` (9, L)."""
     size = a.abs().amax(0)
     a = a / torch.where(size > 0, size, 1.0)
     quats, trace = _eigenvector(a)
@@ -107,16 +107,16 @@ def _dominant_quats(a: Tensor) -> Tensor:
 
 
 def _eigenvector(a: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit eigenvectors (4, L) of Horn's matrices to their largest eigenvalues, and the product (L,) of the gaps."""
+    """Return unit eigenvectors (4, L) of the largest eigenvalues of Horn's matrices, and products of gaps (L,)."""
     adjugate = _adjugate(_horn(-a, diagonal=_largest_root(a)))
     return _largest(adjugate), (adjugate[0, 0] + adjugate[1, 1]) + (adjugate[2, 2] + adjugate[3, 3])
 
 
 def _largest_root(a: Tensor) -> Tensor:
-    """(L,) largest eigenvalue of Horn's matrices, s1 + s2 + s3.
+    """Return the largest eigenvalues (L,) of Horn's matrices, s1 + s2 + s3.
 
-    It is a root of (x^2 - |A|^2)^2 - 8 det(A) x - 4 |cof A|^2, all of whose roots are real: Laguerre's method descends
-    to it from the bound sqrt(3) |A|, which is exact for rotations; cubically, unless the root is multiple.
+    Each is a root of (x^2 - |A|^2)^2 - 8 det(A) x - 4 |cof A|^2, all of whose roots are real: Laguerre's method
+    descends to it from the bound sqrt(3) |A|, which is exact for rotations; cubically, unless the root is multiple.
     """
     rows = a.reshape(3, 3, -1)
     cofactors = torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0), dim=1)
@@ -139,7 +139,7 @@ def _largest_root(a: Tensor) -> Tensor:
 
 
 def _horn(a: Tensor, diagonal: Tensor | float) -> Tensor:
-    """(4, 4, L) symmetric matrices K + ``diagonal`` I with q^T K q = tr(R(q)^T A) for every unit q (Horn 1987)."""
+    """Return matrices (4, 4, L) K + ``diagonal`` I with q^T K q = tr(R(q)^T A) for every unit q (Horn 1987)."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz = a.unbind()
     wx, wy, wz = zy - yz, xz - zx, yx - xy
     sxy, sxz, syz = xy + yx, xz + zx, yz + zy
@@ -150,7 +150,7 @@ def _horn(a: Tensor, diagonal: Tensor | float) -> Tensor:
 
 
 def _adjugate(k: Tensor) -> Tensor:
-    """(4, 4, L) adjugates of symmetric matrices, by Laplace expansion along pairs of rows."""
+    """Return the adjugates (4, 4, L) of symmetric matrices, by Laplace expansion along pairs of rows."""
     pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
     s0, s1, s2, s3, s4, s5 = (k[0, i] * k[1, j] - k[0, j] * k[1, i] for i, j in pairs)
     c1, c2, c3, c4, c5 = (k[2, i] * k[3, j] - k[2, j] * k[3, i] for i, j in pairs[1:])
@@ -168,7 +168,7 @@ def _adjugate(k: Tensor) -> Tensor:
 
 
 def _largest(columns: Tensor) -> Tensor:
-    """(4, L) columns with the largest diagonal entry of matrices (4, 4, L) of rank one, normalised."""
+    """Return the columns (4, L) with the largest diagonal entry of rank-one matrices (4, 4, L), normalised."""
     diagonal = columns.detach().diagonal().unbind(1)
     chosen, *others = columns.unbind()
     largest = diagonal[0]
@@ -178,7 +178,7 @@ def _largest(columns: Tensor) -> Tensor:
 
 
 def _rotations(quats: Tensor) -> Tensor:
-    """(9, L) matrices, row by row, of unit quaternions (4, L)."""
+    """Return the matrices (9, L), row by row, of unit quaternions (4, L)."""
     w, x, y, z = quats.unbind()
     xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
     xy, xz, yz, wx, wy, wz = 2 * x * y, 2 * x * z, 2 * y * z, 2 * w * x, 2 * w * y, 2 * w * z

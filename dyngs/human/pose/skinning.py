@@ -1,7 +1,7 @@
-"""Posing by a skeleton: rotations of joints, transforms along the kinematic tree, linear blend skinning.
+"""Linear blend skinning: axis-angle to rotations, joint transforms along the kinematic tree, blended transforms.
 
-Pure functions of tensors, differentiable in all of them. Local letters: P points that follow J joints. ``...`` are any
-leading sizes, such as F frames; those of different arguments broadcast.
+Pure functions of tensors, differentiable in all of them. Local letters: P points, J joints. ``...`` stands for any
+leading dimensions, such as F frames; they broadcast.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 def axis_angle_to_matrix(poses: Tensor) -> Tensor:
-    """(..., 3, 3) rotation matrices of axis-angle vectors ``poses`` (..., 3), rad; exact at zero, as is the gradient.
+    """Return the rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), rad; exact at zero, as is the gradient.
 
     Rodrigues: R = cos(t) 1 + sin(t)/t [p]x + (1 - cos(t))/t^2 p p^T with t = |p|; (1 - cos(t))/t^2 = sinc(t/2)^2 / 2.
     """
@@ -27,19 +27,19 @@ def axis_angle_to_matrix(poses: Tensor) -> Tensor:
 
 
 def joint_transforms(joints: Tensor, parents: tuple[int, ...], rotations: Tensor) -> Tensor:
-    """(..., J, 3, 4) transforms ``posed_from_rest`` of what follows each joint; the identity where nothing is turned.
+    """Return the transforms ``posed_from_rest`` (..., J, 3, 4) of the joints; the identity in the rest pose.
 
-    A joint turns what hangs on it about its own place at rest: A_j = A_parent(j) [R_j | J_j - R_j J_j], which is
-    [G_R | G_t - G_R J_j] of SMPL (Loper et al. 2015). In every round each joint takes in as many ancestors as it has
-    already, so that a chain of n joints takes log2(n) rounds instead of n.
+    A joint rotates its descendants about its rest position: A_j = A_parent(j) [R_j | J_j - R_j J_j], which is
+    [G_R | G_t - G_R J_j] of SMPL (Loper et al. 2015). Every round doubles the number of ancestors included
+    (pointer jumping), so that a chain of n joints takes log2(n) rounds instead of n.
 
     Args:
         joints: (..., J, 3) at rest.
-        parents: (J,) parent of each joint, -1 for a root; smaller than the joint's own number.
-        rotations: (..., J, 3, 3) of the joints relative to their parents.
+        parents: (J,) parent of each joint, -1 for a root; parents come before their children.
+        rotations: (..., J, 3, 3) of the joints, relative to their parents.
 
     Raises:
-        ValueError: a parent that does not come before its joint.
+        ValueError: a parent that does not come before its child.
     """
     check_tree(parents)
     shifts = joints[..., None] - rotations @ joints[..., None]
@@ -48,19 +48,19 @@ def joint_transforms(joints: Tensor, parents: tuple[int, ...], rotations: Tensor
     own = torch.cat([own, bottom], dim=-2)
     world = torch.eye(4, dtype=own.dtype, device=own.device).expand(*own.shape[:-3], 1, 4, 4)
     chains = torch.cat([world, own], dim=-3)
-    above = torch.tensor((-1, *parents), device=own.device).add(1)
+    above = torch.tensor((-1, *parents), device="cpu").add(1)  # on the CPU: the loop must not wait for the device
     above[0] = 0
     while above.any():
-        chains = chains.index_select(-3, above) @ chains
+        chains = chains.index_select(-3, above.to(own.device)) @ chains
         above = above[above]
     return chains[..., 1:, :3, :]
 
 
 def check_tree(parents: tuple[int, ...]) -> None:
-    """Nothing, if every parent comes before its joint, so that there is no cycle.
+    """Check that every parent comes before its child, which excludes cycles.
 
     Raises:
-        ValueError: names the first joint for which that is not so.
+        ValueError: names the first joint for which this does not hold.
     """
     for joint, parent in enumerate(parents):
         if not -1 <= parent < joint:
@@ -68,13 +68,13 @@ def check_tree(parents: tuple[int, ...]) -> None:
 
 
 def blend_transforms(weights: Tensor, transforms: Tensor) -> Tensor:
-    """(..., P, 3, 4) transforms of points: those of the joints (..., J, 3, 4) in the shares ``weights`` (P, J).
+    """Return transforms of points (..., P, 3, 4): those of joints (..., J, 3, 4) blended by ``weights`` (P, J).
 
-    T_i = sum_j w_ij A_j: no rigid motion in general. Rows of the weights sum to 1.
+    T_i = sum_j w_ij A_j, in general not rigid. Rows of the weights sum to 1.
     """
     return (weights @ transforms.flatten(-2)).unflatten(-1, (3, 4))
 
 
 def apply_transforms(transforms: Tensor, points: Tensor) -> Tensor:
-    """(..., P, 3) points, each moved by its own of the ``transforms`` (..., P, 3, 4)."""
+    """Return the points (..., P, 3), each transformed by its own matrix of ``transforms`` (..., P, 3, 4)."""
     return (transforms[..., :3] * points[..., None, :]).sum(-1) + transforms[..., 3]

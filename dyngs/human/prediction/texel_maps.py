@@ -124,10 +124,10 @@ def _nearest(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at: Tenso
     places, depth = (x.double().numpy() for x in _projected(torch.from_numpy(vertices), camera))
     corners = np.concatenate([places - 0.5, 1.0 / depth[:, None]], axis=1)[faces]
     corners[(depth[faces] <= 0).any(axis=1)] = 0.0  # behind the camera: without area, so that nothing is covered
-    hits = rasterize(corners, camera.width, camera.height)
+    fragments = rasterize(corners, camera.width, camera.height)
     buffer = np.full((camera.height + 2, camera.width + 2), np.inf)
-    buffer[hits.index // camera.width + 1, hits.index % camera.width + 1] = interpolate(
-        hits.shares, depth[faces[hits.faces]][..., None]
+    buffer[fragments.index // camera.width + 1, fragments.index % camera.width + 1] = interpolate(
+        fragments.barycentric, depth[faces[fragments.faces]][..., None]
     )[:, 0]
     least = np.minimum.reduce([buffer[:-1, :-1], buffer[1:, :-1], buffer[:-1, 1:], buffer[1:, 1:]])
     column, row = (

@@ -3,7 +3,7 @@
 Pictures come from a z-buffer of triangles in numpy. It shares no formula with the rasterizer of Gaussians, so that they
 are an independent ground truth.
 
-Local letters: J joints, M vertices, T triangles, U vertices of the atlas, F frames, H hits, S texels per side.
+Local letters: J joints, M vertices, T triangles, U vertices of the atlas, F frames, H fragments, S texels per side.
 """
 
 from __future__ import annotations
@@ -179,9 +179,9 @@ def render_mesh(mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples:
     sums = np.zeros((size * size, 4))
     for k in range(samples * samples):
         place = np.array([(k % samples + 0.5) / samples, (k // samples + 0.5) / samples, 0.0])
-        hits = rasterize((image - place)[mesh.faces], size, size)
-        sums[hits.index, :3] += _lit(mesh, normals, hits)
-        sums[hits.index, 3] += 1.0
+        fragments = rasterize((image - place)[mesh.faces], size, size)
+        sums[fragments.index, :3] += _lit(mesh, normals, fragments)
+        sums[fragments.index, 3] += 1.0
     rgb = sums[:, :3] / np.maximum(sums[:, 3:], 1.0)
     return np.concatenate([rgb, sums[:, 3:] / samples**2], axis=1).reshape(size, size, 4)
 
@@ -207,7 +207,7 @@ def _write_split(
 def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> Iterator[PosedMesh]:
     """The mesh of each frame, posed in float64."""
     uv, uv_faces = texture_coordinates(body)
-    exact, faces = body.to(torch.float64), body.faces.numpy()
+    exact, faces = body.to(dtype=torch.float64), body.faces.numpy()
     for pose, trans, scale in zip(*(x.double() for x in (motion.poses, motion.trans, motion.scale)), strict=True):
         vertices = posed_vertices(exact, pose[None], trans[None], scale=scale[None])[0].numpy()
         yield PosedMesh(vertices, faces, uv, uv_faces, texture)
@@ -219,7 +219,7 @@ def _on_floor(body: BodyTemplate, turns: dict[str, np.ndarray], num_frames: int)
     for name, turn in turns.items():
         poses[:, JOINT_NAMES.index(name)] = torch.from_numpy(turn).float()
     trans = torch.zeros(num_frames, 3)
-    exact = body.to(torch.float64)
+    exact = body.to(dtype=torch.float64)
     for frame, pose in enumerate(poses.double()):
         trans[frame, 1] = -posed_vertices(exact, pose[None], torch.zeros(1, 3).double())[0, :, 1].min().float()
     return Motion(poses, trans, torch.zeros(10), _FPS, torch.ones(num_frames))
@@ -258,10 +258,10 @@ def _focal(size: int) -> float:
     return float(0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X))
 
 
-def _lit(mesh: PosedMesh, normals: np.ndarray, hits: Fragments) -> np.ndarray:
+def _lit(mesh: PosedMesh, normals: np.ndarray, fragments: Fragments) -> np.ndarray:
     """(H, 3) sRGB values of what is hit."""
-    uv = interpolate(hits.shares, mesh.uv[mesh.uv_faces[hits.faces]])
-    normal = normalized(interpolate(hits.shares, normals[mesh.faces[hits.faces]]))
+    uv = interpolate(fragments.barycentric, mesh.uv[mesh.uv_faces[fragments.faces]])
+    normal = normalized(interpolate(fragments.barycentric, normals[mesh.faces[fragments.faces]]))
     light = _AMBIENT + _DIFFUSE * np.maximum(normal @ normalized(_TO_LIGHT), 0.0)
     return np.minimum(_sampled(mesh.texture, uv) * light[:, None], 1.0)
 

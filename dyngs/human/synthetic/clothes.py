@@ -103,14 +103,14 @@ def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> 
     """
     uv, uv_faces = texture_coordinates(body)
     columns, rows = texel_coordinates(uv, resolution)
-    hits = rasterize(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], resolution, resolution)
-    around = body.faces.numpy()[hits.faces]
-    points = interpolate(hits.shares, body.vertices.double().numpy()[around])
-    parts = interpolate(hits.shares, _shares_of_parts(body)[around]).argmax(axis=1)
+    fragments = rasterize(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], resolution, resolution)
+    around = body.faces.numpy()[fragments.faces]
+    points = interpolate(fragments.barycentric, body.vertices.double().numpy()[around])
+    parts = interpolate(fragments.barycentric, _shares_of_parts(body)[around]).argmax(axis=1)
     texture = np.zeros((resolution * resolution, 3))
-    texture[hits.index] = _painted(points, np.array(list(_PARTS))[parts], _left_eye(body), outfit)
+    texture[fragments.index] = _painted(points, np.array(list(_PARTS))[parts], _left_eye(body), outfit)
     is_bare = np.ones(resolution * resolution, dtype=bool)
-    is_bare[hits.index] = False
+    is_bare[fragments.index] = False
     near = distance_transform_edt(is_bare.reshape(resolution, -1), return_distances=False, return_indices=True)
     row, column = np.asarray(near)
     return texture[row * resolution + column]

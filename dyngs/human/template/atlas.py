@@ -1,6 +1,6 @@
-"""Texels of a body template's texture atlas as places on its surface, and shells of such places above it.
+"""Texels of a body template's texture atlas as points of its surface, and scaffolds of points above it.
 
-Local letters: T triangles, U vertices of the atlas, P texels, Q places on shells.
+Local letters: T triangles, U vertices of the atlas, P texels, Q points of scaffolds.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ _THINNEST = 1e-9
 
 @dataclass(frozen=True)
 class Texels:
-    """What every covered texel of an atlas knows of the rest surface; P texels in row-major order of the atlas.
+    """Surface attributes at rest of the P covered texels of an atlas, in row-major order of the atlas.
 
     Attributes:
         resolution: S, texels per side. The centre of row r, column c lies at u = (c + 0.5) / S, v = 1 - (r + 0.5) / S.
         index: (P,) int64, r * S + c, ascending.
-        faces: (P,) int64, the triangle of the template that covers the texel's centre.
-        barycentric: (P, 3) of the centre in that triangle, in [0, 1], rows sum to 1.
-        points: (P, 3) rest surface points, m.
-        frames: (P, 3, 3) rotations; columns are the tangent (along growing u), the bitangent and the outward normal,
-            smooth over edges. In mirrored parts of an atlas the bitangent points along falling v.
+        faces: (P,) int64 triangle of the template that covers the texel's centre.
+        barycentric: (P, 3) coordinates of the centre in that triangle, in [0, 1], rows sum to 1.
+        points: (P, 3) on the surface at rest, m.
+        frames: (P, 3, 3) rotations; columns are the tangent (along increasing u), the bitangent and the outward normal,
+            smooth over edges. In mirrored parts of an atlas the bitangent points along decreasing v.
         weights: (P, J) skinning weights, rows sum to 1.
         size: (P,) side of the texel on the surface, m: sqrt(area of the triangle / its area in the atlas) / S.
     """
@@ -55,7 +55,7 @@ class Texels:
 
 @dataclass(frozen=True)
 class ScaffoldPoints:
-    """Places above the texels of an atlas, in any order and number: scaffolds for clothing and hair.
+    """Points above the texels of an atlas, in any order and number: scaffolds for clothing and hair (GHG).
 
     Attributes:
         texel: (Q,) int64 rows of a ``Texels``.
@@ -69,26 +69,26 @@ class ScaffoldPoints:
         return len(self.texel)
 
     def select(self, index: Tensor) -> ScaffoldPoints:
-        """The places at ``index`` (long or bool)."""
+        """Return the points at ``index`` (long or bool)."""
         return ScaffoldPoints(self.texel[index], self.height[index])
 
     def points(self, texels: Texels) -> Tensor:
-        """(Q, 3) rest positions, m, above the surface of ``texels``, x + height * normal."""
+        """Return the points (Q, 3) at rest, m: x + height * normal for the surface points x of ``texels``."""
         return texels.points[self.texel] + self.height[:, None] * texels.normals[self.texel]
 
 
 def atlas_texels(body: BodyTemplate, resolution: int, vertices: Tensor | None = None) -> Texels:
-    """The texels whose centres the atlas of ``body`` covers; where triangles touch or overlap, the first one has it.
+    """Return the texels whose centres the atlas of ``body`` covers; of overlapping triangles the first one wins.
 
-    Triangles that are degenerate, in the atlas or on the surface, cover nothing. Gradients do not flow through.
+    Triangles that are degenerate in the atlas or on the surface cover nothing. Not differentiable.
 
     Args:
         body: a template with texture coordinates.
         resolution: S, texels per side, at least 1.
-        vertices: (M, 3) another rest shape than the template's, m.
+        vertices: (M, 3) rest shape, m; None: that of the template.
 
     Raises:
-        DyngsError: no texture coordinates, a resolution below 1, or ``vertices`` of another shape or not finite.
+        DyngsError: no texture coordinates, a resolution below 1, or ``vertices`` of a wrong shape or not finite.
     """
     if body.uv is None or body.uv_faces is None:
         raise DyngsError(f"the body template '{body.name}' has no texture coordinates; give one with a texture atlas")
@@ -105,7 +105,7 @@ def atlas_texels(body: BodyTemplate, resolution: int, vertices: Tensor | None = 
     corners_uv = torch.nn.functional.pad(body.uv.detach().double()[body.uv_faces], (0, 1))
     area, area_uv = _areas(corners), _areas(corners_uv)
     usable = (area > 0) & (area_uv > 0)
-    index, faces, barycentric = _rasterized(corners_uv.numpy(), usable.numpy(), resolution)
+    index, faces, barycentric = _rasterized(corners_uv, usable, resolution)
     around, dtype = body.faces[faces], body.vertices.dtype
     smooth = _interpolated(barycentric, around, _vertex_normals(rest, body.faces))
     normals = _unit_or(smooth, _unit_or(_cross(corners), corners.new_zeros(3))[faces])
@@ -122,23 +122,29 @@ def atlas_texels(body: BodyTemplate, resolution: int, vertices: Tensor | None = 
 
 
 def scaffold_points(texels: Texels, heights: Sequence[float]) -> ScaffoldPoints:
-    """Places at all ``heights`` (m, along the normal) above all texels: those of the first height, then of the next.
+    """Return points at all ``heights`` (m, along the normal) above all texels, one height after the other.
 
     Raises:
         DyngsError: no height, or one that is not finite.
     """
     levels = texels.points.new_tensor(heights)
     if levels.numel() == 0 or not bool(levels.isfinite().all()):
-        raise DyngsError(f"the heights of shells must be one or more finite numbers of metres, got {list(heights)}")
-    return ScaffoldPoints(torch.arange(len(texels)).repeat(len(levels)), levels.repeat_interleave(len(texels)))
+        raise DyngsError(f"the heights of scaffolds must be one or more finite numbers of metres, got {list(heights)}")
+    rows = torch.arange(len(texels), device=levels.device)
+    return ScaffoldPoints(rows.repeat(len(levels)), levels.repeat_interleave(len(texels)))
 
 
-def _rasterized(corners: np.ndarray, usable: np.ndarray, resolution: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Texels (P,) covered by triangles (T, 3, 2 or 3) of the atlas, ascending, their triangles and barycentrics (P, 3).
+def _rasterized(corners_uv: Tensor, usable: Tensor, resolution: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the covered texels (P,), ascending, their triangles (P,) and barycentric coordinates (P, 3).
 
-    Exact along shared edges: an edge's sign is computed from its ends in an order that both triangles agree on.
+    Exact along shared edges: both triangles compute an edge's sign from its ends in the same order.
+
+    Args:
+        corners_uv: (T, 3, 2 or 3) corners of the triangles in the atlas.
+        usable: (T,) which triangles may cover texels.
+        resolution: S, texels per side.
     """
-    triangles = np.flatnonzero(usable)
+    corners, triangles = corners_uv.cpu().numpy(), np.flatnonzero(usable.cpu().numpy())
     x, y = corners[triangles, :, 0] * resolution - 0.5, (1 - corners[triangles, :, 1]) * resolution - 0.5
     left, width = _span(x, resolution)
     top, height = _span(y, resolution)
@@ -156,24 +162,22 @@ def _rasterized(corners: np.ndarray, usable: np.ndarray, resolution: int) -> tup
         sides[:, k] = sign[owner] * (dx[owner] * (row - ay[owner]) - dy[owner] * (column - ax[owner]))
     inside = (sides >= 0).all(1)
     texels, first = np.unique((row * resolution + column)[inside], return_index=True)
-    shares = sides[inside][first]
-    shares /= shares.sum(1, keepdims=True)
-    return (
-        torch.from_numpy(texels.astype(np.int64)),
-        torch.from_numpy(triangles[owner[inside][first]].astype(np.int64)),
-        torch.from_numpy(shares),
-    )
+    barycentric = sides[inside][first]
+    barycentric /= barycentric.sum(1, keepdims=True)
+    found = (texels.astype(np.int64), triangles[owner[inside][first]].astype(np.int64), barycentric)
+    index, faces, coordinates = (torch.from_numpy(x).to(corners_uv.device) for x in found)
+    return index, faces, coordinates
 
 
 def _span(ends: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """First texel and number of texels (T,) whose centres, whole numbers, lie between the ``ends`` (T, 3)."""
+    """Return the first and the number of texels (T,) whose centres, whole numbers, lie between ``ends`` (T, 3)."""
     first = np.ceil(ends.min(1)).clip(0, resolution).astype(np.int64)
     last = np.floor(ends.max(1)).clip(-1, resolution - 1).astype(np.int64)
     return first, np.maximum(last - first + 1, 0)
 
 
 def _interpolated(barycentric: Tensor, around: Tensor, values: Tensor) -> Tensor:
-    """(P, D) values at places between the vertices ``around`` (P, 3) of values (M, D) at the vertices."""
+    """Return values (P, D) interpolated between the vertices ``around`` (P, 3) of ``values`` (M, D)."""
     total = barycentric[:, :1] * values[around[:, 0]]
     for k in (1, 2):
         total.addcmul_(barycentric[:, k, None], values[around[:, k]])
@@ -181,19 +185,19 @@ def _interpolated(barycentric: Tensor, around: Tensor, values: Tensor) -> Tensor
 
 
 def _cross(corners: Tensor) -> Tensor:
-    """(T, 3) normals of triangles (T, 3, 3), twice their area long."""
+    """Return the normals (T, 3) of triangles (T, 3, 3), with twice their area as length."""
     return torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], dim=-1)
 
 
 def _areas(corners: Tensor) -> Tensor:
-    """(T,) areas of triangles (T, 3, 3); zero where degenerate or not finite."""
+    """Return the areas (T,) of triangles (T, 3, 3); zero where degenerate or not finite."""
     double = _cross(corners).norm(dim=-1)
     longest = (corners.roll(-1, 1) - corners).square().sum(-1).amax(-1)
     return torch.where(double > _THINNEST * longest, 0.5 * double, 0.0)
 
 
 def _vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """(M, 3) unit normals: of the faces around, weighted by their angles (Thürmer and Wüthrich 1998); 0 without any."""
+    """Return unit normals (M, 3): of adjacent faces, weighted by angle (Thürmer and Wüthrich 1998); 0 without."""
     corners = vertices[faces]
     flat = _unit_or(_cross(corners), corners.new_zeros(3))
     ahead = _unit_or(corners.roll(-1, 1) - corners, corners.new_zeros(3))
@@ -205,23 +209,23 @@ def _vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def _along_u(corners: Tensor, corners_uv: Tensor) -> Tensor:
-    """(T, 3) directions on triangles (T, 3, 3) in which u grows and v stays; NaN where degenerate in the atlas."""
+    """Return directions (T, 3) of increasing u at constant v on triangles (T, 3, 3); NaN where degenerate."""
     (first, second), (uv1, uv2) = ((x[:, 1:] - x[:, :1]).unbind(1) for x in (corners, corners_uv))
     determinant = _cross(corners_uv)[:, 2:]
     return (first * uv2[:, 1:2] - second * uv1[:, 1:2]) / determinant
 
 
 def _frames(normals: Tensor, tangents: Tensor) -> Tensor:
-    """(P, 3, 3) right-handed rotations with the columns tangent, bitangent and normal; the unit normals stay."""
+    """Return right-handed rotations (P, 3, 3) with columns tangent, bitangent and normal; the unit normals are kept."""
     along = tangents - normals * (normals * tangents).sum(-1, keepdim=True)
     least = torch.nn.functional.one_hot(normals.abs().argmin(-1), 3).to(normals)
-    across = torch.linalg.cross(normals, least, dim=-1)  # where the tangent is along the normal, at folds
+    across = torch.linalg.cross(normals, least, dim=-1)  # for folds, where the tangent is parallel to the normal
     tangents = _unit_or(along, _unit_or(across, across))
     return torch.stack([tangents, torch.linalg.cross(normals, tangents, dim=-1), normals], dim=-1)
 
 
 def _unit_or(vectors: Tensor, otherwise: Tensor) -> Tensor:
-    """(..., 3) ``vectors`` normalised; ``otherwise`` where they are too short to have a direction."""
+    """Return ``vectors`` (..., 3) normalised; ``otherwise`` where they are too short to have a direction."""
     length = vectors.norm(dim=-1, keepdim=True)
     is_short = length <= 1e-12
     return torch.where(is_short, otherwise, vectors / torch.where(is_short, 1.0, length))

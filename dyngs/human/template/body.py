@@ -1,11 +1,11 @@
-"""A body template: rest mesh, shape space, joints and skinning weights, and its vertices in any pose.
+"""Body templates of the SMPL family: rest mesh, shape space, joints, skinning weights, and posed vertices.
 
 Local letters: J joints, M vertices, T triangles, U UV vertices, F frames, B shape and E expression parameters.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -18,27 +18,29 @@ from dyngs.human.pose.skinning import (
     check_tree,
     joint_transforms,
 )
+from dyngs.human.pose.tensor_fields import tensors_to
 
 
 @dataclass(frozen=True)
 class BodyTemplate:
-    """A body template: rest mesh, shape space, joints and skinning weights; float32 tensors, metres, y up, facing +z,
-    +x the person's left.
+    """A body template: rest mesh, shape space, joints and skinning weights.
+
+    Metres, y up, facing +z, +x to the person's left; float32 unless converted.
 
     Attributes:
-        name: "anny", "smpl", "smplh" or "smplx": whose joints these are.
+        name: the family of the joints: "anny", "smpl", "smplh" or "smplx".
         vertices: (M, 3) at rest.
         faces: (T, 3) long, counter-clockwise from outside.
-        uv: (U, 2) in [0, 1], image row = (1 - v) * H; or None.
-        uv_faces: (T, 3) long into ``uv``, same order and corners as ``faces``; None together with ``uv``.
-        weights: (M, J), rows sum to 1.
-        parents: (J,) parent of each joint, -1 for the root; smaller than the joint's own number.
-        joints: (J, 3) at rest, of the mean shape.
+        uv: (U, 2) texture coordinates in [0, 1], row of the image = (1 - v) * H; or None.
+        uv_faces: (T, 3) long indices into ``uv``, triangles and corners in the order of ``faces``; None with ``uv``.
+        weights: (M, J) skinning weights, rows sum to 1.
+        parents: (J,) parent of each joint, -1 for the root; parents come before their children.
+        joints: (J, 3) at rest, mean shape.
         shape_dirs: (M, 3, B) metres per unit of the shape parameters, or None.
-        expression_dirs: (M, 3, E) likewise, or None.
-        joint_shape_dirs: (J, 3, B) what they do to the joints; None together with ``shape_dirs``.
-        joint_expression_dirs: (J, 3, E) likewise; None together with ``expression_dirs``.
-        pose_dirs: (9 (J - 1), 3 M) metres per unit of the rotations' difference from the identity, or None.
+        expression_dirs: (M, 3, E) metres per unit of the expression parameters, or None.
+        joint_shape_dirs: (J, 3, B) the same for the joints; None with ``shape_dirs``.
+        joint_expression_dirs: (J, 3, E) the same for the joints; None with ``expression_dirs``.
+        pose_dirs: (9 (J - 1), 3 M) pose blend shapes, metres per unit of the rotations minus the identity, or None.
     """
 
     name: str
@@ -56,7 +58,7 @@ class BodyTemplate:
     pose_dirs: Tensor | None = None
 
     def __post_init__(self) -> None:
-        """Raises ValueError where shapes do not fit each other or a parent does not come before its joint."""
+        """Raises ValueError for shapes that contradict each other, or a parent that does not come before its child."""
         check_tree(self.parents)
         m, j = len(self.vertices), len(self.parents)
         b, e = self.num_shapes, self.num_expressions
@@ -75,33 +77,31 @@ class BodyTemplate:
 
     @property
     def num_shapes(self) -> int:
-        """B, 0 without a shape space."""
+        """Number of shape parameters B; 0 without a shape space."""
         return 0 if self.shape_dirs is None else self.shape_dirs.shape[-1]
 
     @property
     def num_expressions(self) -> int:
-        """E, 0 without expressions."""
+        """Number of expression parameters E; 0 without expressions."""
         return 0 if self.expression_dirs is None else self.expression_dirs.shape[-1]
 
-    def to(self, dtype: torch.dtype) -> BodyTemplate:
-        """The same body with its floating-point numbers in ``dtype``."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        floats = {k: x.to(dtype) for k, x in values.items() if isinstance(x, Tensor) and x.is_floating_point()}
-        return replace(self, **floats)
+    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> BodyTemplate:
+        """Return the template on ``device``, its floating-point tensors in ``dtype``; None leaves either as it is."""
+        return tensors_to(self, device, dtype)
 
 
 def apply_shape(body: BodyTemplate, betas: Tensor | None, expression: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Vertices (..., M, 3) and joints (..., J, 3) at rest of a person of this shape; differentiable.
+    """Return vertices (..., M, 3) and joints (..., J, 3) at rest for shape and expression parameters; differentiable.
 
-    v = v_mean + S beta + E psi, and the joints alike, as they are linear in the vertices.
+    v = v_mean + S beta + E psi; the joints are linear in the vertices and follow the same formula.
 
     Args:
         body: the template.
-        betas: (..., B) shape parameters; fewer leave the others at 0. None is the mean shape.
-        expression: (..., E) likewise.
+        betas: (..., B) shape parameters; missing ones are 0. None: the mean shape.
+        expression: (..., E) expression parameters, in the same way.
 
     Raises:
-        DyngsError: a parameter that is not 0 and that the body does not have.
+        DyngsError: a non-zero parameter that the template does not have.
     """
     vertices, joints = body.vertices, body.joints
     for name, given, dirs, joint_dirs in (
@@ -114,12 +114,12 @@ def apply_shape(body: BodyTemplate, betas: Tensor | None, expression: Tensor | N
         if given[..., known:].any():
             raise DyngsError(
                 f"{name}: {given.shape[-1]} numbers given, but the {body.name} body has {known or 'none'}; "
-                "leave out the others or set them to 0"
+                "leave out the rest or set them to 0"
             )
         if dirs is not None and joint_dirs is not None:
             used = given[..., :known]
-            vertices = vertices + _combined(dirs, used)
-            joints = joints + _combined(joint_dirs, used)
+            vertices = vertices + _blend_shape_offsets(dirs, used)
+            joints = joints + _blend_shape_offsets(joint_dirs, used)
     return vertices, joints
 
 
@@ -131,37 +131,39 @@ def posed_vertices(
     expression: Tensor | None = None,
     scale: Tensor | None = None,
 ) -> Tensor:
-    """(F, M, 3) vertices of F frames, m; differentiable in all that is given (SMPL: Loper et al. 2015).
+    """Return the vertices (F, M, 3) of F frames, m; differentiable in all arguments (SMPL, Loper et al. 2015).
 
-    v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. The root turns about the pelvis joint.
+    v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. The root rotates about the pelvis joint.
 
     Args:
-        body: the template, of the same floating-point type as all the rest.
+        body: the template, in the same floating-point type as the other arguments.
         poses: (F, J, 3) axis-angle relative to the parent joint, rad.
         trans: (F, 3) m, added last.
         betas: (B,) or (F, B) shape parameters, see ``shaped``.
-        expression: (E,) or (F, E) likewise.
-        scale: (F,) uniform scale of the template; None is 1.
+        expression: (E,) or (F, E) expression parameters.
+        scale: (F,) uniform scale of the template; None: 1.
 
     Raises:
-        DyngsError: poses of another number of joints, or parameters that the body does not have.
+        DyngsError: poses for another number of joints, or parameters that the template does not have.
     """
     if poses.ndim != 3 or tuple(poses.shape[1:]) != tuple(body.joints.shape):
         raise DyngsError(
             f"poses must be (frames, {len(body.joints)}, 3) for the {body.name} body, got {tuple(poses.shape)}"
         )
     vertices, joints = apply_shape(body, betas, expression)
-    turned = axis_angle_to_matrix(poses)
+    rotations = axis_angle_to_matrix(poses)
     if body.pose_dirs is not None:
-        features = (turned[:, 1:] - torch.eye(3, dtype=poses.dtype, device=poses.device)).flatten(1)
+        features = (rotations[:, 1:] - torch.eye(3, dtype=poses.dtype, device=poses.device)).flatten(1)
         vertices = vertices + (features @ body.pose_dirs).unflatten(-1, (-1, 3))
-    posed = apply_transforms(blend_transforms(body.weights, joint_transforms(joints, body.parents, turned)), vertices)
+    posed = apply_transforms(
+        blend_transforms(body.weights, joint_transforms(joints, body.parents, rotations)), vertices
+    )
     if scale is not None:
         posed = scale[:, None, None] * posed
     return posed + trans[:, None]
 
 
-def _combined(directions: Tensor, parameters: Tensor) -> Tensor:
-    """(..., X, 3) the sum of ``directions`` (X, 3, B), of which the first n are used, in amounts (..., n)."""
+def _blend_shape_offsets(directions: Tensor, parameters: Tensor) -> Tensor:
+    """Return offsets (..., X, 3): the first n ``directions`` (X, 3, B), weighted by ``parameters`` (..., n)."""
     used = directions[..., : parameters.shape[-1]].flatten(0, 1)
     return (parameters @ used.T).unflatten(-1, (-1, 3))

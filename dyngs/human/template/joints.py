@@ -4,7 +4,6 @@ from __future__ import annotations
 
 _FINGERS = tuple(f"{finger}{i}" for finger in ("index", "middle", "pinky", "ring", "thumb") for i in (1, 2, 3))
 
-
 JOINT_NAMES = (
     *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle"),
     *("spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder"),
@@ -12,15 +11,17 @@ JOINT_NAMES = (
     *(f"left_{name}" for name in _FINGERS),
     *(f"right_{name}" for name in _FINGERS),
 )
-"""The 55 joints of SMPL-X in their order."""
-
+"""The 55 joints of SMPL-X, in its order."""
 
 SMPLX_ROWS = {55: tuple(range(55)), 52: (*range(22), *range(25, 55)), 24: tuple(range(22))}
-"""By number of joints of a body: which of the 55 its first joints are. SMPL's last two, the hands, are none of them."""
+"""By number of joints of a body (SMPL-X, SMPL-H, SMPL): the rows of ``JOINT_NAMES`` of its first joints.
 
+SMPL's last two joints, the hands, have no counterpart.
+"""
 
 JOINT_PARENTS = (
     *(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 15, 15, 15),
     *(20, 25, 26, 20, 28, 29, 20, 31, 32, 20, 34, 35, 20, 37, 38),
     *(21, 40, 41, 21, 43, 44, 21, 46, 47, 21, 49, 50, 21, 52, 53),
 )
+"""(55,) the parent of each joint, -1 for the root."""

@@ -1,4 +1,4 @@
-"""The body template that a person is built on, in that person's shape."""
+"""The body template that a config names, in a person's shape."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from dyngs.human.template.body import BodyTemplate, apply_shape
 from dyngs.human.template.body_reader import read_body
 
 DEFAULT_TEMPLATE = Path(__file__).parent / "files" / "anny_smplx55.npz"
-"""The free template that comes with the package."""
+"""The file of the free template that comes with the package."""
 
 
 def default_template() -> BodyTemplate:
-    """The free template that comes with the package: an adult of 1.76 m in T-pose, 55 joints in the order of SMPL-X."""
+    """Read the free template of the package: an adult of 1.76 m in T-pose, 55 joints in the order of SMPL-X."""
     return read_body(DEFAULT_TEMPLATE)
 
 
 def template_path(model: HumanModel) -> Path:
-    """The body file that ``model`` names, or that of the free template."""
+    """Return the path of the body file that ``model`` names, or of the free template."""
     return DEFAULT_TEMPLATE if model.body is None else model.body
 
 
 def load_template(model: HumanModel) -> BodyTemplate:
-    """The body file that ``model`` names, or the free template.
+    """Read the template that ``model`` names, or the free one.
 
     Raises:
         DyngsError: the file cannot be read.
@@ -35,14 +35,14 @@ def load_template(model: HumanModel) -> BodyTemplate:
     if model.body is None and model.uv is None:
         return default_template()
     if model.body is None:
-        raise DyngsError(f"model.uv={model.uv} goes with model.body; the free template has texture coordinates")
+        raise DyngsError(f"model.uv={model.uv} goes with model.body; the free template has its own texture coordinates")
     return read_body(model.body, model.uv)
 
 
 def rest_shape(body: BodyTemplate, betas: Tensor) -> tuple[Tensor, Tensor]:
-    """Vertices (M, 3) and joints (J, 3) at rest in the shape ``betas`` (B,), of which those count that ``body`` has.
+    """Return vertices (M, 3) and joints (J, 3) at rest for ``betas`` (B,); those that ``body`` lacks are ignored.
 
-    A body without a shape space is as it is: bone lengths are learned.
+    A template without a shape space stays as it is: bone lengths are learned in training.
     """
     with torch.no_grad():
         return apply_shape(body, betas[: body.num_shapes])

@@ -1,6 +1,7 @@
-"""Triangles as a grid of pixels or texels sees them, in numpy: the nearest one at every point, normals, attributes.
+"""Triangle meshes in numpy: rasterization with a depth buffer, vertex normals, interpolation.
 
-It shares no formula with the rasterizer of Gaussians. Local letters: M vertices, T triangles, H hits.
+Independent of the rasterizer of Gaussians, so that it can give ground truth. Local letters: M vertices, T triangles,
+H fragments.
 """
 
 from __future__ import annotations
@@ -12,25 +13,25 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Fragments:
-    """Which triangle is seen where; H grid points that see one, none of them twice.
+    """The visible triangle of H covered grid points, each point at most once.
 
     Attributes:
         index: (H,) row * width + column.
-        faces: (H,) int64.
-        shares: (H, 3) of the triangle's corners on the surface: barycentric coordinates, sum 1.
+        faces: (H,) int64 triangle.
+        barycentric: (H, 3) coordinates on the triangle in space (perspective-correct), rows sum to 1.
     """
 
     index: np.ndarray
     faces: np.ndarray
-    shares: np.ndarray
+    barycentric: np.ndarray
 
 
 def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
-    """The nearest triangle at every grid point, whole numbers of column and row, that sees one.
+    """Return the nearest triangle at every covered grid point (whole numbers of column and row).
 
     Args:
-        corners: (T, 3, 3) column, row and nearness of the corners; nearness is 1 / depth, linear in the picture, or 1
-            where there is no perspective. Triangles without area cover nothing; edges belong to both sides.
+        corners: (T, 3, 3) column, row and inverse depth of the corners; inverse depth is linear in the picture, and 1
+            without perspective. Triangles without area cover nothing; edges belong to both sides.
         width: of the grid.
         height: of the grid.
     """
@@ -46,39 +47,39 @@ def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
     right, below = column - x0[owner], row - y0[owner]
     second = (right * (y2 - y0)[owner] - below * (x2 - x0)[owner]) / area[owner]
     third = ((x1 - x0)[owner] * below - (y1 - y0)[owner] * right) / area[owner]
-    shares = np.stack([1.0 - second - third, second, third])
-    inside = shares.min(axis=0) >= -1e-9  # a little more than the triangle: no gaps between neighbours
-    shares, owner, index = shares[:, inside], owner[inside], (row * width + column)[inside]
-    shares = shares * near[:, owner]
-    nearness = shares.sum(axis=0)
+    barycentric = np.stack([1.0 - second - third, second, third])
+    inside = barycentric.min(axis=0) >= -1e-9  # with a margin, so that no gaps open between neighbours
+    barycentric, owner, index = barycentric[:, inside], owner[inside], (row * width + column)[inside]
+    barycentric = barycentric * near[:, owner]
+    inverse = barycentric.sum(axis=0)
     nearest = np.zeros(width * height)
-    np.maximum.at(nearest, index, nearness)
-    first = np.flatnonzero(nearness == nearest[index])
+    np.maximum.at(nearest, index, inverse)
+    first = np.flatnonzero(inverse == nearest[index])
     index, chosen = np.unique(index[first], return_index=True)
     first = first[chosen]
-    return Fragments(index, owner[first], (shares[:, first] / nearness[first]).T)
+    return Fragments(index, owner[first], (barycentric[:, first] / inverse[first]).T)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(M, 3) unit normals: of the triangles around, weighted by their areas."""
+    """Return unit normals (M, 3) at the vertices: of the adjacent triangles, weighted by area."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     flat = np.repeat(np.cross(b - a, c - a), 3, axis=0)
     total = [np.bincount(faces.ravel(), weights=flat[:, k], minlength=len(vertices)) for k in range(3)]
     return normalized(np.stack(total, axis=-1))
 
 
-def interpolate(shares: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(H, D) values at hits between their corners' (H, 3, D)."""
-    return np.einsum("hk,hkd->hd", shares, values)
+def interpolate(barycentric: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values (H, D) at barycentric coordinates (H, 3) between those of the corners (H, 3, D)."""
+    return np.einsum("hk,hkd->hd", barycentric, values)
 
 
 def normalized(vectors: np.ndarray) -> np.ndarray:
-    """(..., 3) of length 1; zero stays zero."""
+    """Return the vectors (..., 3) at length 1; zero stays zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 def _span(ends: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """First whole number in [0, size) between the ``ends`` (3, T) of each triangle, and how many there are (T,)."""
+    """Return the first and the number of whole numbers in [0, size) between the ``ends`` (3, T) of triangles."""
     first = np.ceil(ends.min(axis=0) - 1e-6).clip(0, size).astype(np.int64)
     last = np.floor(ends.max(axis=0) + 1e-6).clip(-1, size - 1).astype(np.int64)
     return first, np.maximum(last - first + 1, 0)

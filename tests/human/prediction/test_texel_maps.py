@@ -60,17 +60,17 @@ def painted(colour_of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.nda
     """(256, 256, 3) texture by places (P, 3) of the T-pose and the joint (P,) that moves each."""
     uv, uv_faces = texture_coordinates(body())
     columns, rows = texel_coordinates(uv, 256)
-    hits = rasterize(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], 256, 256)
-    around = body().faces.numpy()[hits.faces]
-    places = interpolate(hits.shares, body().vertices.double().numpy()[around])
-    joints = interpolate(hits.shares, body().weights.double().numpy()[around]).argmax(1)
+    fragments = rasterize(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], 256, 256)
+    around = body().faces.numpy()[fragments.faces]
+    places = interpolate(fragments.barycentric, body().vertices.double().numpy()[around])
+    joints = interpolate(fragments.barycentric, body().weights.double().numpy()[around]).argmax(1)
     texture = np.full((256 * 256, 3), 0.5)
-    texture[hits.index] = colour_of(places, joints)
+    texture[fragments.index] = colour_of(places, joints)
     return texture.reshape(256, 256, 3)
 
 
 def picture(poses: Tensor, texture: np.ndarray, pose: np.ndarray) -> Picture:
-    exact, (uv, uv_faces) = body().to(torch.float64), texture_coordinates(body())
+    exact, (uv, uv_faces) = body().to(dtype=torch.float64), texture_coordinates(body())
     vertices = posed_vertices(exact, poses[None].double(), torch.zeros(1, 3).double())[0].numpy()
     pixels = render_mesh(PosedMesh(vertices, body().faces.numpy(), uv, uv_faces, texture), pose, SIZE, 2)
     rgba = torch.from_numpy(pixels).float()

@@ -59,7 +59,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def posed(motion: Motion, frame: int) -> np.ndarray:
-    exact = body().to(torch.float64)
+    exact = body().to(dtype=torch.float64)
     return posed_vertices(exact, motion.poses[[frame]].double(), motion.trans[[frame]].double())[0].numpy()
 
 
@@ -280,7 +280,7 @@ def test_another_seed_is_another_person_of_another_size(root: Path, tmp_path: Pa
     motion = read_motion(other / "body_train.npz", body())
     torch.testing.assert_close(motion.scale, torch.full((2,), outfit.size))
     torch.testing.assert_close(motion.trans, outfit.size * walk(body(), 2).trans)
-    exact = dress_body(body(), outfit).to(torch.float64)
+    exact = dress_body(body(), outfit).to(dtype=torch.float64)
     vertices = posed_vertices(exact, motion.poses.double(), motion.trans.double(), scale=motion.scale.double())
     for view in captured(other).splits["train"][:3]:
         is_person = pixels(view.image_path)[..., 3] == 255
@@ -310,7 +310,7 @@ def test_the_parameters_pose_the_template_as_the_pictures_show_it(root: Path) ->
     """Through the readers: the pelvis lies inside the silhouette, and the silhouette just fills the posed vertices'."""
     capture = captured(root)
     assert capture.body is not None
-    exact = body().to(torch.float64)
+    exact = body().to(dtype=torch.float64)
     for split, views in capture.splits.items():
         if not views:
             continue

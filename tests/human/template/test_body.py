@@ -218,7 +218,7 @@ def test_no_frames_are_no_vertices(template: BodyTemplate) -> None:
 
 
 def test_in_float64_nothing_is_left_in_float32(template: BodyTemplate) -> None:
-    body = template.to(torch.float64)
+    body = template.to(dtype=torch.float64)
     poses = 0.3 * normal(1, 55, 3)
     found = posed_vertices(body, poses, normal(1, 3))
     assert found.dtype == torch.float64

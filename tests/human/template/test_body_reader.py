@@ -51,7 +51,7 @@ def assert_same(body: BodyTemplate, arrays: Arrays) -> None:
     assert shapes + body.num_expressions == count
     for dtype in (torch.float32, torch.float64):
         given = (torch.from_numpy(x).to(dtype) for x in (poses, trans, beta[:shapes], beta[shapes:]))
-        found = posed_vertices(body.to(dtype), *given)
+        found = posed_vertices(body.to(dtype=dtype), *given)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
@@ -242,7 +242,7 @@ def test_numbers_from_the_end_in_an_obj(tmp_path: Path) -> None:
         ("f ", "f 99/1 1/1 2/2\n# ", "does not exist"),
         ("f ", "f 1/99 2/1 3/1\n# ", "does not exist"),
         ("f ", "f -99/1 2/1 3/1\n# ", "does not exist"),
-        ("f ", "f 1/1 1/1 1/1\n# ", "the triangle of vertices 1 1 1 is not one of the body"),
+        ("f ", "f 1/1 1/1 1/1\n# ", "the body has no triangle of the vertices 1 1 1"),
         ("vt 0.", "vt 7.", r"texture coordinate 0 is 7\.\d+ 0\.\d+; they must lie in \[0, 1\]"),
         ("vt 0.", "vt nan#", r"line \d+: 'vt nan#"),
         ("vt 0.", "vt nan 0.", "texture coordinate 0 is nan"),
@@ -306,7 +306,7 @@ WRONG: dict[str, tuple[Arrays, str]] = {
     "own parent": (with_parents({3: 3}), "joint 3 is its own ancestor"),
     "no root": (with_parents({0: 23}), "is its own ancestor"),
     "two roots": (with_parents({5: -1}), "joint 5 has no parent; only joint 0"),
-    "order": (with_parents({4: 5}), "parents before their children, but 5 is that of 4"),
+    "order": (with_parents({4: 5}), "parents before their children, but joint 4 has the parent 5"),
     "stray parent": (with_parents({4: 99}), "joint 4 the parent 99, which does not exist"),
     "numbering": (changed("kintree_table", lambda x: with_entry(x, (1, 4), 5)), "must number the joints 0 to 23"),
     "joints": (changed("kintree_table", lambda x: x[:, :23]), "has 23 joints; SMPL has 24"),
@@ -363,7 +363,7 @@ def test_files_that_are_no_body_files(tmp_path: Path) -> None:
     for name, words in (("empty.npz", "damaged"), ("empty.pkl", "cannot be read as a pickle")):
         (tmp_path / name).touch()
         assert words in refusal(tmp_path / name)
-    assert "no dictionary" in refusal(write_pickle(tmp_path / "list.pkl", [1, 2]))
+    assert "not hold a dictionary" in refusal(write_pickle(tmp_path / "list.pkl", [1, 2]))
     np.save(tmp_path / "one.npy", np.zeros(3))
     assert "not a .npz" in refusal((tmp_path / "one.npy").rename(tmp_path / "one.npz"))
 

@@ -11,16 +11,16 @@ def test_the_nearer_triangle_is_seen() -> None:
     """Two that overlap: attributes at a grid point are those of the one with the larger nearness."""
     far = [[0.0, 0.0, 0.5], [8.0, 0.0, 0.5], [0.0, 8.0, 0.5]]
     near = [[0.0, 0.0, 1.0], [3.0, 0.0, 1.0], [0.0, 3.0, 1.0]]
-    hits = rasterize(np.array([far, near]), 8, 8)
+    fragments = rasterize(np.array([far, near]), 8, 8)
     owner = np.full(64, -1)
-    owner[hits.index] = hits.faces
+    owner[fragments.index] = fragments.faces
     assert owner[0] == 1
     assert owner[9] == 1
     assert owner[4] == 0
     assert owner[63] == -1
-    columns = interpolate(hits.shares, np.array([far, near])[hits.faces][..., :1])[:, 0]
-    np.testing.assert_allclose(columns, hits.index % 8, atol=1e-12)  # sums of a few float64
-    assert len(np.unique(hits.index)) == len(hits.index)
+    columns = interpolate(fragments.barycentric, np.array([far, near])[fragments.faces][..., :1])[:, 0]
+    np.testing.assert_allclose(columns, fragments.index % 8, atol=1e-12)  # sums of a few float64
+    assert len(np.unique(fragments.index)) == len(fragments.index)
 
 
 def test_triangles_without_area_or_outside_cover_nothing() -> None:
