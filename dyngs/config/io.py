@@ -28,7 +28,7 @@ from dyngs.config.schema import (
     section_class,
     section_classes,
 )
-from dyngs.config.yaml import Leaf, read_file, read_override, require_usable
+from dyngs.config.yaml_reader import Leaf, read_file, read_override, require_usable
 from dyngs.errors import DyngsError, printable
 from dyngs.files.write import write_text
 

@@ -55,8 +55,7 @@ def _keys_below(section: type[BaseModel], prefix: str) -> Iterator[ConfigKey]:
         elif len(variants) == 1:
             yield from _keys_below(variants[0], f"{name}.")
         else:
-            kinds = ", ".join(kinds_of(info))
-            yield ConfigKey(f"{name}.kind", (), f"one of {kinds}", info.get_default().kind, "")
+            yield _kind_key(name, info, variants)
             tables = [[k for k in _keys_below(v, f"{name}.") if k.name != f"{name}.kind"] for v in variants]
             shared = [k for k in tables[0] if all(k in table for table in tables)]
             yield from shared
@@ -65,9 +64,17 @@ def _keys_below(section: type[BaseModel], prefix: str) -> Iterator[ConfigKey]:
                 yield from (replace(k, kinds=(kind, *k.kinds)) for k in table if k not in shared)
 
 
+def _kind_key(name: str, info: FieldInfo, variants: list[type[BaseModel]]) -> ConfigKey:
+    """The ``kind`` of the section ``name``, described by what it decides and what each variant is."""
+    kinds = [variant.model_fields["kind"] for variant in variants]
+    meanings = "; ".join(f"{', '.join(choices_of(kind.annotation))}: {kind.description}" for kind in kinds)
+    description = f"{info.description}. {meanings}"
+    return ConfigKey(f"{name}.kind", (), f"one of {', '.join(kinds_of(info))}", info.get_default().kind, description)
+
+
 def keys_table() -> str:
     """All keys as a table in Markdown, for docs/cli.md."""
-    lines = ["| key | allowed | default | |", "|---|---|---|---|"]
+    lines = ["| key | allowed | default | meaning |", "|---|---|---|---|"]
     for key in config_keys():
         variant = f" ({', '.join(key.kinds)})" if key.kinds else ""
         default = f"`{key.default}`" if key.default else "required"

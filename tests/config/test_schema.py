@@ -43,6 +43,13 @@ def test_every_key_of_every_section_is_there() -> None:
         assert any(name == f"strategy.{key}" for name, _ in names)
 
 
+def test_every_key_is_described() -> None:
+    assert [key.name for key in config_keys() if not key.description] == []
+    kind = next(key for key in config_keys() if key.name == "strategy.kind")
+    assert "default: clone, split" in kind.description
+    assert "mcmc: a fixed cap" in kind.description
+
+
 def test_nested_keys_name_the_kinds_that_have_them() -> None:
     names = [(key.name, key.kinds) for key in config_keys()]
     assert len(set(names)) == len(names)

@@ -1,0 +1,60 @@
+"""Section ``colour``: what the colour of a Gaussian is made of."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from dyngs.config.keys.section import Positive, Section
+
+
+class ColourSection(Section):
+    """What all kinds of colour have in common."""
+
+    opacity_entropy: float = Field(
+        default=0.0,
+        ge=0,
+        description="weight of the mean of -o ln o over opacities o, which removes faint Gaussians; MEGA: 5e-4",
+    )
+
+
+class ShColour(ColourSection):
+    """Spherical harmonics of degree ``model.sh_degree`` for every Gaussian."""
+
+    kind: Literal["sh"] = Field(
+        default="sh", description="spherical harmonics of degree model.sh_degree for every Gaussian"
+    )
+
+
+class DcacColour(ColourSection):
+    """Three base values per Gaussian and one small network for all (MEGA, Zhang et al. 2024); no harmonics."""
+
+    kind: Literal["dcac"] = Field(
+        default="dcac",
+        description="a base colour (DC) per Gaussian, to which one small network for all adds what depends on "
+        "direction and time (AC; MEGA, Zhang et al. 2024); no harmonics",
+    )
+    width: int = Field(default=32, ge=1, description="neurons per hidden layer; MEGA: 64")
+    depth: int = Field(default=2, ge=1, le=8, description="hidden layers")
+    normals: bool = Field(
+        default=True,
+        description="the network also sees the angle to each Gaussian's shortest axis and the direction mirrored there",
+    )
+    lr: Positive = Field(
+        default=0.01, description="learning rate of the network; divided by 3 after 1/6, 1/2 and 5/6 of the run"
+    )
+    warm_up: int = Field(default=100, ge=1, description="steps in which that rate is reached")
+
+
+class AutoColour(ColourSection):
+    """Harmonics only for the Gaussians whose dependence on the view pays on held-out training views."""
+
+    kind: Literal["auto"] = Field(
+        default="auto",
+        description="harmonics only for the Gaussians where dependence on the view pays on held-out training views",
+    )
+    measure_at: Annotated[float, Field(gt=0, lt=1)] = Field(
+        default=0.6, description="share of the run after which that is measured; until then every 8th view is held out"
+    )
+    tolerance: float = Field(default=0.05, ge=0, description="PSNR that may be lost by it, dB")

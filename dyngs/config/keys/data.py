@@ -1,0 +1,51 @@
+"""Section ``data``: where the pictures are and how they are read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from dyngs.config.keys.section import Positive, Section
+from dyngs.files.containment import MAX_MEGAPIXELS
+
+
+class DataConfig(Section):
+    """Where the pictures are and how they are read."""
+
+    root: Path = Field(description="folder of the capture")
+    format: Literal[
+        "auto",
+        "body_json",
+        "zju_mocap",
+        "people_snapshot",
+        "neuman",
+        "blender",
+        "nerfstudio",
+        "colmap",
+        "nerfies",
+        "llff",
+        "camera_folders",
+    ] = Field(default="auto", description="layout of the capture's files (docs/formats.md); auto: detected")
+    frames: str | None = Field(
+        default=None, description="start:stop:step over the capture's times, as a Python slice; null: all"
+    )
+    downscale: float = Field(default=1.0, ge=1.0, description="divide width and height of the pictures by this")
+    longest_side: int | None = Field(
+        default=None, ge=1, description="shrink pictures so that the longer side has at most this many px; null: do not"
+    )
+    test_every: int = Field(
+        default=8, ge=0, description="hold out every n-th picture by name where the capture has no split; 0: none"
+    )
+    background: Literal["auto", "white", "black", "random"] = Field(
+        default="auto",
+        description="colour behind the Gaussians; auto: white where the pictures have alpha, black otherwise; "
+        "random: another one in each step",
+    )
+    cache_mb: float = Field(default=4096, ge=0, description="memory for decoded pictures, MB")
+    frame_cache_mb: float = Field(default=4096, ge=0, description="disk space for decoded video frames, MB")
+    follow_links: bool = Field(default=False, description="allow files of the capture that lie outside its folder")
+    max_megapixels: Positive = Field(
+        default=MAX_MEGAPIXELS, description="pictures and videos with more megapixels are refused, not decoded"
+    )

@@ -1,0 +1,156 @@
+"""Section ``model``, part 2: moving scenes, and the deformation fields of ``model.deform``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from dyngs.config.keys.model import SceneModel
+from dyngs.config.keys.section import Fraction, Positive, Section
+
+
+class FieldSection(Section):
+    """What all deformation fields have in common: which attributes change over time. Positions always do."""
+
+    move_rotations: bool = Field(default=True, description="rotations change over time")
+    move_scales: bool = Field(default=True, description="scales change over time")
+    move_opacities: bool = Field(
+        default=False, description="opacities change over time: things may appear and disappear"
+    )
+    move_colors: bool = Field(default=False, description="base colours change over time")
+
+
+class HexplaneField(FieldSection):
+    """Planes over pairs of space and time axes and a small decoder (4DGS, Wu et al. 2024)."""
+
+    kind: Literal["hexplane"] = Field(
+        default="hexplane", description="feature planes over pairs of x, y, z, t and a small decoder (4DGS)"
+    )
+    channels: int = Field(default=32, ge=1, description="features per plane and level")
+    resolution: int = Field(default=64, ge=2, description="cells of the first level's planes along x, y and z")
+    levels: tuple[Annotated[int, Field(ge=1)], ...] = Field(
+        default=(1, 2), min_length=1, description="one set of planes for each, with so many times that resolution"
+    )
+    time_resolution: int = Field(
+        default=0, ge=0, description="cells of the planes along t; 0: half the number of training times"
+    )
+    width: int = Field(default=64, ge=1, description="neurons per hidden layer of the decoder")
+    depth: int = Field(default=1, ge=1, description="hidden layers of the decoder before the heads")
+    lr_planes: Positive = Field(default=1.6e-3, description="learning rate of the planes, times the scene extent")
+    lr_decoder: Positive = Field(default=1.6e-4, description="learning rate of the decoder, times the scene extent")
+    lr_decay: Fraction = Field(default=0.01, description="last over first learning rate")
+    space_smoothness: float = Field(
+        default=1e-4, ge=0, description="weight of the mean squared second difference of the space planes"
+    )
+    time_smoothness: float = Field(
+        default=0.01, ge=0, description="weight of the mean squared second difference along t of the planes with time"
+    )
+    time_sparsity: float = Field(
+        default=1e-4, ge=0, description="weight of the mean of |1 - value| over the planes with time"
+    )
+
+
+class MlpField(FieldSection):
+    """A multilayer perceptron on encoded position and time (Deformable-3DGS, Yang et al. 2024)."""
+
+    kind: Literal["mlp"] = Field(
+        default="mlp", description="a perceptron on encoded position and time (Deformable-3DGS); slow on a CPU"
+    )
+    depth: int = Field(default=8, ge=2, description="hidden layers")
+    width: int = Field(default=256, ge=1, description="neurons per hidden layer")
+    space_frequencies: int = Field(default=10, ge=0, le=16, description="octaves of the positional encoding of places")
+    time_frequencies: int = Field(default=6, ge=0, le=16, description="octaves of the positional encoding of time")
+    lr: Positive = Field(default=8e-4, description="learning rate")
+    lr_decay: Fraction = Field(default=0.002, description="last over first learning rate")
+
+
+class SkeletonField(FieldSection):
+    """Control nodes that move along splines, which Gaussians around them follow (after SC-GS, Huang et al. 2024)."""
+
+    kind: Literal["skeleton"] = Field(
+        default="skeleton",
+        description="sparse control nodes on cubic splines, which Gaussians follow (after SC-GS); no network",
+    )
+    nodes: int = Field(default=512, ge=1, description="number of control nodes")
+    pieces: int = Field(
+        default=0, ge=0, description="polynomial pieces of each spline; 0: 0.3 times the number of training times"
+    )
+    lr_means: Positive = Field(default=6e-4, description="learning rate of the nodes' places, times the scene extent")
+    lr_quats: Positive = Field(default=6e-3, description="learning rate of their rotations")
+    lr_scales: Positive = Field(default=1e-3, description="learning rate of the changes of log-scales")
+    lr_opacities: Positive = Field(default=1e-2, description="learning rate of the changes of opacity")
+    lr_colors: Positive = Field(default=2e-3, description="learning rate of the changes of base colour")
+    lr_decay: Fraction = Field(default=0.2, description="last over first learning rate")
+    rigidity: float = Field(
+        default=0.5,
+        ge=0,
+        description="weight of the as-rigid-as-possible term: squared strain between neighbouring nodes, in node "
+        "spacings; lower where things bend",
+    )
+    smoothness: float = Field(default=0.01, ge=0, description="weight of the nodes' squared acceleration")
+
+
+class TrajectoryField(FieldSection):
+    """A polynomial and a Fourier series per Gaussian, no network: for small motion and long clips."""
+
+    kind: Literal["trajectory"] = Field(
+        default="trajectory", description="a polynomial and a Fourier series per Gaussian; no network"
+    )
+    polynomial: int = Field(default=3, ge=0, le=8, description="highest power of time")
+    fourier: int = Field(default=4, ge=0, le=32, description="number of frequencies")
+    lr_means: Positive = Field(
+        default=1.6e-4, description="learning rate of the coefficients of positions, times the scene extent"
+    )
+    lr_quats: Positive = Field(default=1e-3, description="learning rate of the other coefficients")
+    lr_decay: Fraction = Field(default=0.01, description="last over first learning rate")
+
+
+DeformField = HexplaneField | MlpField | TrajectoryField | SkeletonField
+
+
+class DynamicModel(SceneModel):
+    """Canonical Gaussians and a deformation field over time (docs/dynamic.md)."""
+
+    kind: Literal["dynamic"] = Field(
+        default="dynamic", description="canonical Gaussians and a deformation field over time (docs/dynamic.md)"
+    )
+    deform: Annotated[
+        DeformField, Field(discriminator="kind", description="how the canonical Gaussians are moved over time")
+    ] = HexplaneField()
+    coarse: Fraction = Field(
+        default=0.13,
+        description="share of the run before motion is learned; a static model is trained on all views until then, "
+        "for 1000 steps or a third of the run at least (coarse stage of 4DGS)",
+    )
+    moving_error: float = Field(
+        default=0.04,
+        ge=0,
+        description="colour error (0 to 1) of the static model from which Gaussians are taken to move",
+    )
+    seeds: int = Field(
+        default=4000, ge=0, description="random Gaussians that are added among the moving ones when motion begins"
+    )
+    first_views: Fraction = Field(
+        default=1.0,
+        description="share of the training views, around the middle of the clip, that motion is first learned on; "
+        "1: all at once",
+    )
+    first_views_until: Fraction = Field(
+        default=0.0, description="share of the run after which more views are added to these"
+    )
+    all_views_at: Fraction = Field(default=0.5, description="share of the run after which all views are trained on")
+    still_below: float = Field(
+        default=0.3,
+        ge=0,
+        description="Gaussians that move by less than this many px in the nearest training view are frozen; 0: none",
+    )
+    motion_sparsity: float = Field(
+        default=0.01, ge=0, description="weight of the mean displacement of the moving Gaussians, in scene extents"
+    )
+    time_jitter: float = Field(
+        default=0.0,
+        ge=0,
+        description="noise on the time of a training view, in intervals between times, falling to 0 over the run "
+        "(Deformable-3DGS); 0.1 suits videos with inexact times",
+    )

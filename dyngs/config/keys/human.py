@@ -1,0 +1,98 @@
+"""Section ``model``, part 3: people, and networks that predict them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from dyngs.config.keys.model import SceneModel
+from dyngs.config.keys.section import Fraction, Positive
+
+
+class _OnTemplate(SceneModel):
+    """What models of people have in common: a body template, and scaffolds of Gaussians around it."""
+
+    body: Path | None = Field(default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template")
+    uv: Path | None = Field(default=None, description=".obj with the texture coordinates of body; null: its own")
+    resolution: int = Field(default=128, ge=8, le=1024, description="texels per side of the template's texture atlas")
+    heights: tuple[float, ...] = Field(
+        default=(0.0, 0.02),
+        min_length=1,
+        description="heights above the skin, m, at which copies of its surface carry one Gaussian per texel (the "
+        "multi-scaffold of GHG)",
+    )
+    carve: Fraction = Field(
+        default=0.9,
+        description="Gaussians above the lowest scaffold must lie inside at least this share of the silhouettes "
+        "(visual hull); 0: all are kept",
+    )
+
+
+class HumanModel(_OnTemplate):
+    """A person: Gaussians on the texels of a body template, moved by its skeleton (docs/human.md)."""
+
+    kind: Literal["human"] = Field(
+        default="human", description="one person: Gaussians on a body template, moved by its skeleton (docs/human.md)"
+    )
+    refine: bool = Field(
+        default=True, description="learn corrections of poses, skeleton and skinning weights with the Gaussians"
+    )
+    refine_from: Fraction = Field(default=0.1, description="share of the run after which these are learned")
+    lr_poses: Positive = Field(default=1e-3, description="of the poses of single frames, rad")
+    lr_trans: Positive = Field(default=5e-4, description="of the places of single frames, m")
+    lr_turns: Positive = Field(default=1e-3, description="of what is added to the poses of all frames, rad")
+    lr_joints: Positive = Field(default=5e-4, description="of the joints at rest, m")
+    lr_log_scale: Positive = Field(default=2e-4, description="of the logarithm of the body's size")
+    lr_weights: Positive = Field(default=5e-3, description="of the logarithms of skinning weights")
+    lr_decay: Fraction = Field(default=0.1, description="last over first rate of all these")
+    pose_offsets: bool = Field(
+        default=False,
+        description="learn offsets at rest that are linear in the rotations of nearby joints (pose blend shapes)",
+    )
+    lr_pose_offsets: Positive = Field(default=1e-4, description="m per unit of a rotation matrix")
+    pose_weight: float = Field(default=1e-4, ge=0, description="of the squared corrections of the fit")
+    weights_weight: float = Field(default=1e-3, ge=0, description="of the squared corrections of skinning weights")
+    offset_weight: float = Field(
+        default=2e-4, ge=0, description="weight of the squared distances from the scaffold, cm^2"
+    )
+    scale_weight: float = Field(
+        default=1e-2, ge=0, description="weight of the squared excess of log-scales over the texel's size"
+    )
+    rigidity: float = Field(
+        default=1e-2, ge=0, description="weight of the squared change, by posing, of distances between neighbours, cm^2"
+    )
+    smoothness: float = Field(
+        default=1e-3, ge=0, description="weight of the squared difference between neighbours' offsets, cm^2"
+    )
+
+
+class HumanNetModel(_OnTemplate):
+    """A network that predicts people from a few pictures, trained on others (docs/people_network.md)."""
+
+    kind: Literal["human_net"] = Field(
+        default="human_net",
+        description="a network that predicts people from a few pictures, after GHG (docs/people_network.md)",
+    )
+    heights: tuple[float, ...] = Field(
+        default=(0.0, 0.02, 0.04),
+        min_length=1,
+        description=str(_OnTemplate.model_fields["heights"].description),
+    )
+    views: int = Field(default=3, ge=1, description="source views: pictures of a person that it is predicted from")
+    inputs: int = Field(
+        default=6, ge=1, description="different sets of source views per person in training; their maps are cached"
+    )
+    targets: int = Field(
+        default=2, ge=1, description="target views: pictures of one moment that a prediction is compared with per step"
+    )
+    widths: tuple[Annotated[int, Field(ge=8)], ...] = Field(
+        default=(24, 32, 48, 64),
+        min_length=1,
+        description="channels of the U-Net at 1/2, 1/4, ... of the atlas's resolution",
+    )
+    lr: Positive = Field(default=2e-3, description="highest learning rate of AdamW (one cycle)")
+    warm_up: Fraction = Field(default=0.05, description="share of the run in which it is reached; then it falls to 0")
+    weight_decay: float = Field(default=1e-5, ge=0, description="of AdamW")
+    clip: Positive = Field(default=1.0, description="gradients longer than this are shortened to it")

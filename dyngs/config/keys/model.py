@@ -1,0 +1,39 @@
+"""Section ``model``, part 1: what all kinds have in common, and still scenes."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from dyngs.config.keys.section import CutOff, Positive, Section
+from dyngs.conventions import RasterizeMode
+
+
+class SceneModel(Section):
+    """What all models have in common: how Gaussians are coloured and drawn."""
+
+    sh_degree: int = Field(
+        default=3, ge=0, le=4, description="degree of the spherical harmonics of a colour; 0: the same from all sides"
+    )
+    rasterize_mode: RasterizeMode = Field(
+        default=RasterizeMode.CLASSIC,
+        description="classic: 3DGS; antialiased: opacity makes up for the low-pass filter (2D filter of Mip-Splatting)",
+    )
+    eps2d: float = Field(
+        default=0.3, ge=0, description="variance of the 2D low-pass filter, px^2; Mip-Splatting: 0.1 with antialiased"
+    )
+    filter_3d: bool = Field(default=False, description="3D smoothing filter of Mip-Splatting (Yu et al. 2024)")
+    near: Positive = Field(default=0.2, description="near plane, world units")
+    alpha_min: CutOff = Field(
+        default=1 / 255, description="a pixel skips Gaussians with an alpha below this there; 1/255 in 3DGS"
+    )
+    transmittance_min: CutOff = Field(
+        default=1e-4, description="blending of a pixel ends when its transmittance falls below this; 1e-4 in 3DGS"
+    )
+
+
+class StaticModel(SceneModel):
+    """3D Gaussian splatting, Mip-Splatting's filters as options."""
+
+    kind: Literal["static"] = Field(default="static", description="3D Gaussians of a still scene (3DGS)")

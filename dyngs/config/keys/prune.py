@@ -1,0 +1,41 @@
+"""Section ``compact``: a last stage of a run, with fewer Gaussians."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from dyngs.config.keys.section import Fraction, Section
+
+
+class CompactConfig(Section):
+    """A last stage with fewer Gaussians, after ``train.steps`` (docs/compact.md). Off where nothing is asked for."""
+
+    prune: float = Field(default=0.0, ge=0, lt=1, description="share of the Gaussians to remove; 0: none")
+    score: Literal["variation", "sensitivity", "contribution", "temporal"] = Field(
+        default="sensitivity", description="importance of a Gaussian (docs/compact.md); the lowest are removed"
+    )
+    max_loss: float = Field(
+        default=10.0,
+        ge=0,
+        description="largest loss of PSNR on training pictures before fine-tuning, dB; fewer are removed where it is "
+        "exceeded",
+    )
+    masks: int = Field(
+        default=0, ge=0, description="key times of visibility masks over time (4DGS-1K); 0 or 1: no masks"
+    )
+    mask_below: float = Field(
+        default=0.0,
+        ge=0,
+        description="at a key time, Gaussians that contribute no more than so many px to all views together are masked",
+    )
+    steps: int = Field(default=2000, ge=1, description="steps of fine-tuning after pruning")
+    rewind: Fraction = Field(
+        default=0.3, description="share of training whose learning rates fine-tuning goes back to (Renda et al. 2020)"
+    )
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether Gaussians are to be pruned or masked."""
+        return self.prune > 0 or self.masks > 1

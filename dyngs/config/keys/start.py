@@ -1,0 +1,34 @@
+"""Section ``init``: the first Gaussians."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from dyngs.config.keys.section import Positive, Section
+
+
+class PointsInit(Section):
+    """Start from the capture's sparse points, else from triangulated ones, else from random ones."""
+
+    kind: Literal["auto", "points"] = Field(
+        default="auto", description="the capture's points, else triangulated, else random ones"
+    )
+    triangulate: int = Field(
+        default=24,
+        ge=0,
+        description="pictures of one moment to triangulate points from where the capture has none; 0: do not",
+    )
+    num_random: int = Field(default=100_000, ge=1, description="random points where there are no others")
+    half_extent: Positive = Field(
+        default=1.3, description="half the side of their cube around the origin, world units (Blender scenes)"
+    )
+
+
+class RandomInit(Section):
+    """Start from uniformly random points in a cube around the origin (Blender scenes of 3DGS)."""
+
+    kind: Literal["random"] = Field(default="random", description="points drawn uniformly in a cube around the origin")
+    num_random: int = Field(default=100_000, ge=1, description="number of random points")
+    half_extent: Positive = Field(default=1.3, description="half the cube's side, world units")

@@ -1,0 +1,81 @@
+"""Sections ``strategy`` and ``optim``: how the set of Gaussians grows and shrinks, and how fast they learn."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from dyngs.config.keys.section import Fraction, Positive, Section
+
+_OF_30000 = "of a 30,000-step run, scaled with train.steps"
+
+
+class DefaultStrategy(Section):
+    """Clone, split and prune by the gradient of the 2D means (3DGS, AbsGS as an option)."""
+
+    kind: Literal["default"] = Field(
+        default="default", description="clone, split and prune by the gradient of the 2D means (3DGS)"
+    )
+    absgrad: bool = Field(
+        default=False, description="sum absolute gradients of pixels (AbsGS, Ye et al. 2024); grad_threshold=8e-4 suits"
+    )
+    grad_threshold: Positive = Field(
+        default=2e-4,
+        description="Gaussians with a larger mean gradient of their 2D mean, NDC units, are cloned or split; lowered "
+        "in runs shorter than 30,000 steps",
+    )
+    dense_fraction: Positive = Field(
+        default=0.01, description="of the extent: smaller ones are cloned, larger ones split"
+    )
+    start: int = Field(default=500, description=f"step {_OF_30000}, after which Gaussians are added and removed")
+    stop: int = Field(default=15_000, description=f"step {_OF_30000}, from which their number is fixed")
+    every: int = Field(default=100, ge=1, description="steps between these changes; not scaled")
+    prune_opacity: Fraction = Field(default=0.005, description="Gaussians with a lower opacity are removed")
+    prune_scale: Positive = Field(default=0.1, description="of the extent, after the first opacity reset")
+    reset_every: int = Field(
+        default=3000,
+        ge=1,
+        description=f"steps, {_OF_30000}, between resets of opacity to 0.01 at most; 400 steps of this run at least",
+    )
+    max_gaussians: int = Field(default=3_000_000, ge=1, description="no Gaussians are added beyond so many")
+
+
+class McmcStrategy(Section):
+    """3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024): a cap, relocation, noise."""
+
+    kind: Literal["mcmc"] = Field(
+        default="mcmc",
+        description="a fixed cap, relocation of transparent Gaussians, noise (3DGS-MCMC, Kheradmand et al. 2024)",
+    )
+    max_gaussians: int = Field(default=300_000, ge=1, description="cap that the number of Gaussians grows to")
+    start: int = Field(default=500, description=f"step {_OF_30000}, after which Gaussians are added and removed")
+    stop: int = Field(default=25_000, description=f"step {_OF_30000}, from which their number is fixed")
+    every: int = Field(default=100, ge=1, description="steps between these changes; not scaled")
+    growth: Positive = Field(default=0.05, description="share of Gaussians that is added each time")
+    min_opacity: Fraction = Field(default=0.005, description="Gaussians with a lower opacity are relocated")
+    noise: float = Field(
+        default=5e5, ge=0, description="strength of the noise on positions, times their learning rate; 0: none"
+    )
+    opacity_reg: float = Field(default=0.01, ge=0, description="weight of the mean opacity")
+    scale_reg: float = Field(default=0.01, ge=0, description="weight of the mean scale, world units")
+    init_opacity: Fraction = Field(default=0.5, description="opacity of the first Gaussians")
+    init_scale: Positive = Field(default=0.1, description="scale of the first Gaussians, in distances to neighbours")
+
+
+class OptimConfig(Section):
+    """Adam and the learning rates of Gaussians; defaults of 3DGS."""
+
+    lr_means: Positive = Field(default=1.6e-4, description="learning rate of positions, times the scene extent")
+    lr_means_final: Positive = Field(
+        default=1.6e-6, description="the same at the end of the run, reached exponentially"
+    )
+    lr_sh_dc: Positive = Field(default=2.5e-3, description="learning rate of base colours")
+    lr_sh_rest: Positive = Field(default=1.25e-4, description="learning rate of the other harmonics")
+    lr_opacities: Positive = Field(default=0.05, description="learning rate of the logits of opacities")
+    lr_scales: Positive = Field(default=5e-3, description="learning rate of log-scales")
+    lr_quats: Positive = Field(default=1e-3, description="learning rate of rotations (quaternions)")
+    eps: Positive = Field(default=1e-15, description="epsilon of Adam")
+    sparse: bool = Field(
+        default=False, description="update only Gaussians that received a gradient in the step; faster, not the same"
+    )

@@ -1,0 +1,35 @@
+"""Section ``train``: length, loss and logging of a run."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from dyngs.config.keys.section import Fraction, Section
+
+
+class TrainConfig(Section):
+    """Length, loss and logging of a run."""
+
+    steps: int = Field(default=7000, ge=1, description="optimisation steps; all schedules follow this number")
+    coarsest: Literal[1, 2, 4, 8, 16] = Field(
+        default=1, description="sides of the training pictures are divided by this at first; 1: full resolution"
+    )
+    sharpen_from: Fraction = Field(default=0.4, description="share of the run after which that is halved first")
+    sharpen_to: Fraction = Field(default=0.7, description="share of the run after which pictures have their full size")
+    ssim_weight: Fraction = Field(
+        default=0.2, description="weight w of 1 - SSIM; the loss is (1 - w) L1 + w (1 - SSIM)"
+    )
+    alpha_weight: float = Field(
+        default=0.0, ge=0, description="weight of the mean error of alpha, where pictures have alpha"
+    )
+    sh_every: int = Field(
+        default=1000,
+        ge=1,
+        description="steps, of a 30,000-step run, after which one more degree of harmonics is trained each time",
+    )
+    log_every: int = Field(default=10, ge=1, description="steps between lines of log.jsonl")
+    save_every: int = Field(default=0, ge=0, description="steps between checkpoints; 0: only the last")
+    eval_every: int = Field(default=0, ge=0, description="steps between evaluations; 0: only by `dyngs eval`")
+    tensorboard: bool = Field(default=False, description="also log to RUN/tensorboard (pip install dyngs[tensorboard])")
