@@ -4,8 +4,8 @@
 
 FOLDER keeps the compacted runs, which are used again. `stages` goes the whole way: pruned, fine-tuned, stored by
 `dyngs export --format compact`. `parts` compares pruning alone, masks alone and both, with and without fine-tuning (one
-step); `scores` compares the scores. Pruning does not back off here. Overrides (compact.prune=0.8, compact.masks=6, ...)
-hold for all rows. Printed as a table in Markdown: Gaussians, PSNR of 20 training views and of the whole test split, how
+step); `scores` compares the scores. Pruning does not back off here. Overrides (prune.share=0.8, ...) hold for all
+rows. Printed as a table in Markdown: Gaussians, PSNR of 20 training views and of the whole test split, how
 many times as fast it draws as RUN, MB as float32 and as stored.
 """
 
@@ -19,8 +19,8 @@ from dyngs.prune.run import Cost, compact_run, compared
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.storage.run import write_compact
 
-ONCE = "compact.steps=1"
-NO_MASKS, NO_PRUNING = "compact.masks=0", "compact.prune=0"
+ONCE = "prune.steps=1"
+NO_MASKS, NO_PRUNING = "prune.mask_times=0", "prune.share=0"
 ROWS = {
     "stages": {"pruned": (ONCE,), "fine-tuned": ()},
     "parts": {
@@ -31,7 +31,7 @@ ROWS = {
         "both": (),
         "both, not fine-tuned": (ONCE,),
     },
-    "scores": {name: (f"compact.score={name}",) for name in ("sensitivity", "contribution", "variation", "temporal")},
+    "scores": {name: (f"prune.score={name}",) for name in ("sensitivity", "contribution", "variation", "temporal")},
 }
 
 
@@ -61,7 +61,7 @@ def main() -> None:
     for name, asked in ROWS[given.rows].items():
         out = given.folder / name.replace(", ", "_").replace(" ", "_")
         if not checkpoint_paths(out):
-            common = ("compact.prune=0.8", "compact.max_loss=1000", f"run.threads={given.threads}")
+            common = ("prune.share=0.8", "prune.max_loss=1000", f"run.threads={given.threads}")
             compact_run(given.run_dir, out, (*common, *given.overrides, *asked))
         before, after = compared(given.run_dir, out, given.threads)
         print(line(name, out, after, before, given.threads), end="", flush=True)

@@ -55,8 +55,8 @@ COMMON = (
 )
 STATIC = f"train static {COMMON} data.root=still init.num_random=150 train.steps=14 train.save_every=2"
 DYNAMIC = (
-    f"train dynamic {COMMON} data.root=moving init.num_random=150 model.seeds=40 train.steps=18 train.save_every=3 "
-    "train.coarsest=1"
+    f"train dynamic {COMMON} data.root=moving init.num_random=150 model.num_random_moving=40 train.steps=18 "
+    "train.save_every=3 train.initial_downscale=1"
 )
 JOBS = {
     "static": f"{STATIC} run.dir=OUT",

@@ -13,7 +13,18 @@ from dyngs.camera import Cameras
 from dyngs.colour.colours import Colours, NetworkColours
 from dyngs.colour.network import box_around
 from dyngs.colour.thrift import ThriftyColours
-from dyngs.config import AutoColour, Config, DataConfig, DcacColour, DynamicModel, HumanModel, McmcStrategy, PointsInit
+from dyngs.config import (
+    AutoColour,
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    DynamicModel,
+    FixedStrategy,
+    HumanModel,
+    McmcStrategy,
+    NetworkColour,
+    PointsInit,
+)
 from dyngs.data.capture import Capture, View
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.geometry.intrinsics import scaled_intrinsics
@@ -34,6 +45,7 @@ from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.load import load_template, rest_shape
 from dyngs.rendering import RenderOptions
 from dyngs.static.densify import DefaultDensifier, Densifier
+from dyngs.static.fixed import FixedDensifier
 from dyngs.static.init import StartValues, Surroundings, initial_gaussians
 from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.model import StaticScene
@@ -115,16 +127,16 @@ def human_model(config: Config, capture: Capture, pictures: PictureLoader) -> tu
     given, body = capture.body["train"], load_template(model)
     vertices, joints = rest_shape(body, torch.from_numpy(given.betas).float())
     texels = atlas_texels(body, model.resolution, vertices)
-    gaussians, anchors = texel_gaussians(texels, sorted(set(model.heights)), sh_degree)
+    gaussians, anchors = texel_gaussians(texels, sorted(set(model.scaffold_heights)), sh_degree)
     filmed = captured_motion(capture.root, given, capture.splits["train"], joints)
     subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body))
-    gaussians, subject = first_look(gaussians, texels, subject, _first_pictures(pictures), model.carve)
+    gaussians, subject = first_look(gaussians, texels, subject, _first_pictures(pictures), model.min_silhouette_share)
     return gaussians, HumanScene(model, subject, rates_of(config))
 
 
 def stored_sh_degree(config: Config) -> int:
     """Degree of the harmonics that training begins with: 0 where a network gives the colours."""
-    return 0 if isinstance(config.colour, DcacColour) else config.model.sh_degree
+    return 0 if isinstance(config.colour, NetworkColour) else config.model.sh_degree
 
 
 def with_points(capture: Capture, config: Config) -> Capture:
@@ -205,7 +217,7 @@ def _model(
 def _colours(config: Config, capture: Capture, gaussians: Gaussians, generator: torch.Generator) -> Colours:
     """The kind of colours asked for. A person's do not depend on time, which would mean nothing in another motion."""
     colour = config.colour
-    if isinstance(colour, DcacColour):
+    if isinstance(colour, NetworkColour):
         sees_time = isinstance(config.model, DynamicModel) and len(set(training_times(capture))) > 1
         box = box_around(gaussians.means)
         return NetworkColours(colour, config.train.steps, box, generator, sees_time=sees_time)
@@ -221,6 +233,8 @@ def _first_pictures(pictures: PictureLoader) -> Iterator[Picture]:
 
 def _densifier(config: Config, background: str, extent: float) -> Densifier:
     strategy, steps = config.strategy, config.train.steps
+    if isinstance(strategy, FixedStrategy):
+        return FixedDensifier()
     schedule = densify_schedule(strategy, steps, background == "white")
     if isinstance(strategy, McmcStrategy):
         return McmcDensifier(strategy, schedule, growth_per_change(strategy, steps))
@@ -230,5 +244,5 @@ def _densifier(config: Config, background: str, extent: float) -> Densifier:
 
 def _render_options(config: Config) -> RenderOptions:
     strategy = config.strategy
-    absgrad = not isinstance(strategy, McmcStrategy) and strategy.absgrad
+    absgrad = isinstance(strategy, DefaultStrategy) and strategy.absgrad
     return replace(render_options(config.model), absgrad=absgrad, nonfinite="trust")

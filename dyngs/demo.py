@@ -105,9 +105,9 @@ def demo_config(capture: Path, run_dir: Path, options: DemoOptions) -> Config:
     overrides = (
         "data.root=capture",
         f"init.num_random={options.num_points}",
-        f"model.seeds={options.num_points // 3}",
+        f"model.num_random_moving={options.num_points // 3}",
         f"train.steps={options.steps}",
-        "train.coarsest=2",  # the pictures are small
+        "train.initial_downscale=2",  # the pictures are small
         "run.name=demo",
         f"run.threads={options.threads}",
     )

@@ -287,7 +287,7 @@ CAPTURES: dict[str, dict[str, Seed]] = {
 """Seeds of each capture format, by its name in ``dyngs.data.read.FORMATS``."""
 _NEEDS = {"people_snapshot": "h5py"}
 _RUNS: dict[str, Seed] = {
-    kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "skeleton", "trajectory")
+    kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "control_nodes", "trajectory")
 }
 _PICTURES: dict[str, Seed] = {"png": files.write_png, "png16": files.write_png16, "jpeg": files.write_jpeg}
 _PICTURES |= {"exr": files.write_exr, "tiff": files.write_tiff}

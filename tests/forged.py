@@ -14,7 +14,7 @@ from tiny_fields import KINDS, cloud, stirred_field, tiny_options, tiny_setup
 from torch import Tensor
 
 from dyngs.colour.colours import NetworkColours
-from dyngs.config import DcacColour, DynamicModel, SceneModel, StaticModel
+from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.deform.fields import field_state
 from dyngs.deform.masks import KeyMasks
 from dyngs.rendering import RenderOptions
@@ -25,7 +25,7 @@ from dyngs.storage.tensors import Coding, Kind
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]
-CONTENTS = ("static", "dcac", "masked", *KINDS)
+CONTENTS = ("static", "network", "masked", *KINDS)
 _ROWS = (0, 2, 3, 6)
 
 _VALUES = (torch.nan, torch.inf, -torch.inf, 3e38, -3e38, 1e20, 1e-45, -1.0, 0.0, 1e9, 255.0)
@@ -127,12 +127,12 @@ def one_line(error: Exception, path: Path) -> None:
 
 
 def contents(kind: str) -> tuple[Tensors, SceneModel]:
-    """Of a checkpoint of nine Gaussians: "static", "dcac", "masked", or a field's kind; and its model."""
+    """Of a checkpoint of nine Gaussians: "static", "network", "masked", or a field's kind; and its model."""
     gaussians, model = cloud(9), StaticModel()
     state: Tensors = {"filter_std": torch.rand(9, generator=torch.Generator().manual_seed(1))}
-    if kind == "dcac":
+    if kind == "network":
         gaussians = gaussians.replace(sh=gaussians.sh[:, :1].contiguous())
-        box, options = torch.stack([torch.zeros(3), torch.ones(3)]), DcacColour(width=8, depth=2)
+        box, options = torch.stack([torch.zeros(3), torch.ones(3)]), NetworkColour(width=8, depth=2)
         colours = NetworkColours(options, 10, box, torch.Generator().manual_seed(0), sees_time=True)
         state |= {f"colour.{name}": x for name, x in colours.state().items()}
     elif kind != "static":

@@ -19,10 +19,12 @@ from dyngs.build import (
     with_points,
 )
 from dyngs.config import (
+    BudgetConfig,
     Config,
     DataConfig,
     DefaultStrategy,
     DynamicModel,
+    FixedStrategy,
     McmcStrategy,
     PointsInit,
     RandomInit,
@@ -36,6 +38,7 @@ from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dy
 from dyngs.deform.model import DynamicScene
 from dyngs.deform.residual import residuals_of
 from dyngs.static.densify import DefaultDensifier
+from dyngs.static.fixed import FixedDensifier
 from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.model import StaticScene
 
@@ -82,6 +85,20 @@ def test_parts_follow_the_config(capture: Path) -> None:
     assert isinstance(mcmc.densifier, McmcDensifier)
     assert len(mcmc.optimizer.parameters) == 30
     assert not mcmc.options.absgrad
+
+
+def test_a_fixed_set_of_gaussians_stays(capture: Path) -> None:
+    config = Config(
+        data=DataConfig(root=capture),
+        model=StaticModel(filter_3d=True),
+        init=RandomInit(num_random=30, half_extent=1.0),
+        strategy=FixedStrategy(),
+        budget=BudgetConfig(max_gaussians=20),
+    )
+    trainer = assemble(config)
+    assert isinstance(trainer.densifier, FixedDensifier)
+    trainer.step()
+    assert len(trainer.optimizer.parameters) == 30, "a limit on their number removes some later on, none are added"
 
 
 def test_auto_background_is_white_only_behind_alpha(capture: Path) -> None:
@@ -199,7 +216,7 @@ def test_a_still_blender_scene_begins_with_random_points(capture: Path) -> None:
 def test_the_coarse_phase_is_static_training(capture: Path, tmp_path: Path) -> None:
     """Until something moves, a dynamic run is a static one, byte by byte, on all views."""
     root = _with_times(capture, tmp_path / "timed", [0.0, 0.25, 0.5, 0.75, 1.0])
-    static, dynamic = (assemble(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(coarse=1.0)))
+    static, dynamic = (assemble(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(motion_from=1.0)))
     for _ in range(8):
         assert static.step().loss == dynamic.step().loss
     mine, others = static.optimizer.state(), dynamic.optimizer.state()

@@ -255,16 +255,16 @@ def test_a_full_disk_gets_no_traceback() -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        ["compact", "RUN", "model.alpha_min=0.02", "compact.masks=6", "--out", "RUN2"],
-        ["compact", "RUN", "--out", "RUN2", "model.alpha_min=0.02", "compact.masks=6"],
-        ["compact", "--out", "RUN2", "RUN", "model.alpha_min=0.02", "--prune", "0.5", "compact.masks=6"],
+        ["compact", "RUN", "model.alpha_min=0.02", "prune.mask_times=6", "--out", "RUN2"],
+        ["compact", "RUN", "--out", "RUN2", "model.alpha_min=0.02", "prune.mask_times=6"],
+        ["compact", "--out", "RUN2", "RUN", "model.alpha_min=0.02", "--prune", "0.5", "prune.mask_times=6"],
     ],
 )
 def test_overrides_may_stand_anywhere(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     found: list[argparse.Namespace] = []
     monkeypatch.setattr("dyngs.cli.compact.run", lambda arguments: found.append(arguments) or 0)
     assert main(words) == 0
-    assert found[0].overrides == ["model.alpha_min=0.02", "compact.masks=6"]
+    assert found[0].overrides == ["model.alpha_min=0.02", "prune.mask_times=6"]
     assert (found[0].run_dir, found[0].out) == (Path("RUN"), Path("RUN2"))
 
 

@@ -9,6 +9,7 @@ from scenes import random_scene
 
 from dyngs.config import (
     Config,
+    ControlNodesField,
     DataConfig,
     DefaultStrategy,
     DeformField,
@@ -17,7 +18,6 @@ from dyngs.config import (
     MlpField,
     RandomInit,
     RunConfig,
-    SkeletonField,
     TrainConfig,
     TrajectoryField,
 )
@@ -26,7 +26,7 @@ from dyngs.deform.field import DeformationField, FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.gaussians import Gaussians
 
-KINDS = ("hexplane", "mlp", "skeleton", "trajectory")
+KINDS = ("hexplane", "mlp", "control_nodes", "trajectory")
 HEADS = ("move_rotations", "move_scales", "move_opacities", "move_colors")
 TIMES = (0.0, 0.37, 1.0)
 
@@ -38,8 +38,8 @@ def tiny_options(kind: str, *, everything: bool = True) -> DeformField:
         return HexplaneField(channels=3, resolution=5, levels=(1, 2), width=8, **heads)
     if kind == "trajectory":
         return TrajectoryField(polynomial=2, fourier=1, **heads)
-    if kind == "skeleton":
-        return SkeletonField(nodes=5, pieces=3, **heads)
+    if kind == "control_nodes":
+        return ControlNodesField(nodes=5, pieces=3, **heads)
     return MlpField(depth=2, width=8, space_frequencies=2, time_frequencies=2, **heads)
 
 
@@ -93,13 +93,26 @@ def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Con
     rates = {
         "hexplane": {"lr_planes": 1e-1, "lr_decoder": 5e-2},
         "mlp": {"lr": 1e-2},
-        "skeleton": {"lr_means": 1e-2},
+        "control_nodes": {"lr_means": 1e-2},
         "trajectory": {"lr_means": 1e-2},
     }
     field = tiny_options(kind).model_copy(update=rates[kind])
-    still_below = 1.0 if kind in ("skeleton", "trajectory") else 0.3
-    phases = {"coarse": 8 / 24, "first_views": 0.4, "all_views_at": 14 / 24, "moving_error": 0.1, "seeds": 12}
-    options = {"sh_degree": 1, "deform": field, "still_below": still_below, "time_jitter": 0.1, **phases, **model}
+    freeze_below_px = 1.0 if kind in ("control_nodes", "trajectory") else 0.3
+    phases = {
+        "motion_from": 8 / 24,
+        "time_window": 0.4,
+        "time_window_full_at": 14 / 24,
+        "motion_threshold": 0.1,
+        "num_random_moving": 12,
+    }
+    options = {
+        "sh_degree": 1,
+        "deform": field,
+        "freeze_below_px": freeze_below_px,
+        "time_jitter": 0.1,
+        **phases,
+        **model,
+    }
     return Config(
         data=DataConfig(root=capture),
         model=DynamicModel.model_validate(options),

@@ -6,14 +6,22 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from dyngs.config import DataConfig, HumanNetModel
+from dyngs.config import DataConfig, HumanPredictorModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.load import default_template
 from dyngs.train.predictor import Filmed, filmed
 
 TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)
-NET = HumanNetModel(sh_degree=0, resolution=32, heights=(0.0, 0.02), views=3, inputs=1, targets=1, widths=(8, 8))
+NET = HumanPredictorModel(
+    sh_degree=0,
+    resolution=32,
+    scaffold_heights=(0.0, 0.02),
+    source_views=3,
+    source_sets=1,
+    target_views=1,
+    widths=(8, 8),
+)
 
 
 @cache
@@ -28,6 +36,6 @@ def people(folder: Path, seeds: tuple[int, ...], options: HumanOptions = TINY) -
     return folder
 
 
-def person(capture: Path, model: HumanNetModel = NET) -> Filmed:
+def person(capture: Path, model: HumanPredictorModel = NET) -> Filmed:
     """The person of one capture."""
     return filmed(DataConfig.model_validate({"root": capture}), model, body())

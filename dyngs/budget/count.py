@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.budget.limits import CLOSE, most_gaussians
-from dyngs.config import CompactConfig, Config
+from dyngs.config import Config, PruneConfig
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.deform.trained import TrainedScene
 from dyngs.prune.score import worth
@@ -76,7 +76,7 @@ class CountLimit:
         count, name = len(trainer.optimizer.parameters), self._name(trainer.config)
         if self.before:
             cost = f"{self.before:,} before, {-self.lost:+.2f} dB on training views when they were removed"
-        elif CLOSE * self.most <= count and trainer.config.strategy.max_gaussians <= self.most:
+        elif CLOSE * self.most <= count and 0 < trainer.config.strategy.growth_limit <= self.most:
             cost = "it held growth back; what more would bring is not known"
         else:
             cost = "it cost nothing"
@@ -100,7 +100,7 @@ def count_limit_of(trainer: Trainer, stored: Mapping[str, Tensor]) -> CountLimit
 def stage(config: Config, step: int, share: float = 0.0) -> int:
     """How many stages of removal a run has come to after ``step``; the last is its end.
 
-    Where ``compact.*`` follows training, its beginning is the first stage, and the others are shares of it.
+    Where ``prune.*`` follows training, its beginning is the first stage, and the others are shares of it.
 
     Args:
         config: of the run.
@@ -125,7 +125,7 @@ def scores_now(trainer: Trainer) -> Tensor:
     """(N,) how much each Gaussian matters: the first score of docs/compact.md."""
     scene = scene_now(trainer)
     unmasked = scene.unmasked() if isinstance(scene, TrainedScene) else scene
-    return scores_of(worth(survey_of(trainer, unmasked), slopes=True), CompactConfig())
+    return scores_of(worth(survey_of(trainer, unmasked), slopes=True), PruneConfig())
 
 
 @torch.no_grad()

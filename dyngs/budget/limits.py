@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.config import Config, DcacColour, DeformField, DynamicModel, HumanModel, HumanNetModel
+from dyngs.config import Config, DeformField, DynamicModel, HumanModel, HumanPredictorModel, NetworkColour
 from dyngs.conventions import num_sh_terms
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
@@ -28,11 +28,11 @@ def require_possible(config: Config) -> None:
     """Raise DyngsError where limits of ``config`` contradict it or each other."""
     budget = config.budget
     given = [name for name, value in budget.model_dump().items() if value is not None]
-    if given and isinstance(config.model, HumanNetModel):
+    if given and isinstance(config.model, HumanPredictorModel):
         raise DyngsError(f"budget.{given[0]}: a network has no budget; leave it out")
-    if budget.max_minutes is not None and config.compact.is_wanted:
+    if budget.max_minutes is not None and config.prune.is_wanted:
         raise DyngsError(
-            "budget.max_minutes: how long the stage of compact.* takes cannot be foreseen; leave that out and run "
+            "budget.max_minutes: how long the stage of prune.* takes cannot be foreseen; leave that out and run "
             "`dyngs compact` afterwards"
         )
 
@@ -51,10 +51,9 @@ def within_cap(config: Config, num_times: int) -> Config:
     if cap is None:
         return config
     if isinstance(model, DynamicModel):
-        model = model.model_copy(update={"seeds": min(model.seeds, int(SEED_SHARE * cap))})
-        cap -= model.seeds
-    strategy = config.strategy.model_copy(update={"max_gaussians": min(config.strategy.max_gaussians, cap)})
-    return config.model_copy(update={"model": model, "strategy": strategy})
+        model = model.model_copy(update={"num_random_moving": min(model.num_random_moving, int(SEED_SHARE * cap))})
+        cap -= model.num_random_moving
+    return config.model_copy(update={"model": model, "strategy": config.strategy.limited(cap)})
 
 
 def most_gaussians(config: Config, num_times: int) -> int | None:
@@ -80,7 +79,7 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
         DyngsError: fewer than ``FEWEST``; says which size has room for them.
     """
     model, fixed = config.model, 0.0
-    degree = 0 if isinstance(config.colour, DcacColour) else model.sh_degree
+    degree = 0 if isinstance(config.colour, NetworkColour) else model.sh_degree
     each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(degree) - 1)
     if isinstance(model, DynamicModel) and num_times > 1:
         one, two = (_field_values(model.deform, num_times, count) for count in (1, 2))

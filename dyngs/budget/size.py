@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dyngs.config import CompactConfig
+from dyngs.config import PruneConfig
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.deform.trained import TrainedScene
@@ -113,7 +113,7 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
     chosen = stored(whole, tensors.get(COARSENESS), len(scene))
     if chosen is None or chosen.coarser > 1:
         unmasked = scene.unmasked() if isinstance(scene, TrainedScene) else scene
-        scores = scores_of(worth(survey_of(trainer, unmasked), slopes=True), CompactConfig())
+        scores = scores_of(worth(survey_of(trainer, unmasked), slopes=True), PruneConfig())
         share = KEPT
         while share * len(scene) >= 1:
             kept = best(scores, 1 - share)

@@ -142,7 +142,7 @@ class SpeedLimit:
         if now > self.passed:
             self.passed, last = now, step == config.total_steps
             return self._slimmed(trainer) if last or given - used > 2 * self.reserve() else None
-        grows = scaled(strategy.start, steps) <= step < scaled(strategy.stop, steps) and count < strategy.max_gaussians
+        grows = scaled(strategy.start, steps) <= step < scaled(strategy.stop, steps) and count < strategy.growth_limit
         if grows and (not self.cap or step % max(steps // CHECKS, 1) == 0):
             self.seconds = drawing_seconds(trainer, scene_now(trainer), GROWTH_VIEWS)
             self.cap = allowed(self, count, config)
@@ -168,7 +168,7 @@ class SpeedLimit:
                 f"{self.before:,} -> {count:,} Gaussians; {-self.lost:+.2f} dB on training views when that was done "
                 f"({self.quality:.2f} before, {now:.2f} at the end)"
             )
-        elif CLOSE * self.cap <= count and 0 < self.cap < trainer.config.strategy.max_gaussians:
+        elif CLOSE * self.cap <= count and 0 < self.cap < trainer.config.strategy.growth_limit:
             cost = f"{count:,} Gaussians; it held growth back; what more would bring is not known"
         return f"budget.min_fps: asked {self.fps:g}, got {got:.3g}; {cost}"
 
@@ -188,7 +188,7 @@ class SpeedLimit:
             self.before, self.quality = count, quality
         trainer.keep(kept)
         left = int(kept.sum())
-        self.cap = min(left, trainer.config.strategy.max_gaussians)
+        self.cap = min(left, trainer.config.strategy.growth_limit)
         self.hold(trainer)
         now = training_quality(trainer)
         self.lost += quality - now
@@ -226,12 +226,12 @@ class SpeedLimit:
 
 
 def allowed(limit: SpeedLimit, count: int, config: Config) -> int:
-    """How many Gaussians there may be before ``compact.prune``, if ``count`` are drawn in ``limit.seconds``."""
-    most, left = config.strategy.max_gaussians, GOAL / limit.fps - limit.base
+    """How many Gaussians there may be before ``prune.share``, if ``count`` are drawn in ``limit.seconds``."""
+    most, left = config.strategy.growth_limit, GOAL / limit.fps - limit.base
     each = (limit.seconds - limit.base) / max(count, 1)
     if each <= 0:
         return most
-    return max(1, min(most, int(left / each / (1 - config.compact.prune))))
+    return max(1, min(most, int(left / each / (1 - config.prune.share))))
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     deform = stages.add_parser("deform", help="the field's share of a training step, with and without the static split")
     deform.add_argument("run_dir", type=Path, nargs="?", metavar="RUN", help="a dynamic run; default: random Gaussians")
     deform.add_argument(
-        "--kind", choices=("hexplane", "mlp", "trajectory", "skeleton"), default="hexplane", help="without RUN"
+        "--kind", choices=("hexplane", "mlp", "trajectory", "control_nodes"), default="hexplane", help="without RUN"
     )
     deform.add_argument("--gaussians", type=int, default=50_000, metavar="N", help="without RUN (default 50000)")
     deform.add_argument("--moving", type=float, default=0.1, metavar="SHARE", help="without RUN (default 0.1)")

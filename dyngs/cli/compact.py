@@ -20,7 +20,7 @@ examples:
   dyngs compact runs/dance model.alpha_min=0.02 --out runs/fast    tuned for a higher cut-off of faint Gaussians
   dyngs train --resume runs/tiny                                   where it was interrupted
 
-As a part of training: dyngs train CONFIG ... compact.prune=0.8. What the options mean: docs/compact.md.
+As a part of training: dyngs train CONFIG ... prune.share=0.8. What the options mean: docs/compact.md.
 """
 
 
@@ -60,15 +60,16 @@ def run(arguments: argparse.Namespace) -> int:
     from dyngs.prune.run import compact_run, compared
     from dyngs.runs.checkpoint import load_run
 
-    asked = {key: getattr(arguments, key) for key in ("prune", "score", "max_loss", "masks", "steps")}
-    overrides = [f"compact.{key}={value}" for key, value in asked.items() if value is not None]
+    keys = {"prune": "share", "score": "score", "max_loss": "max_loss", "masks": "mask_times", "steps": "steps"}
+    asked = {key: getattr(arguments, option) for option, key in keys.items()}
+    overrides = [f"prune.{key}={value}" for key, value in asked.items() if value is not None]
     overrides += [f"run.threads={arguments.threads}", *arguments.overrides]
     folder = compact_run(arguments.run_dir, arguments.out, overrides)
     before, after = compared(arguments.run_dir, folder, arguments.threads)
     Console().print(cost_table(before, after))
     after_all = load_run(folder)
     has_masks = isinstance(after_all.scene, TrainedScene) and after_all.scene.masks is not None
-    if after_all.config.compact.masks > 1 and not has_masks:
+    if after_all.config.prune.mask_times > 1 and not has_masks:
         print("note: --masks was ignored; they are for scenes in which a deformation field moves something")
     print(f"written: {folder}\nnext:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/pictures")
     return 0

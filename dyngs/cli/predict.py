@@ -7,7 +7,7 @@ from pathlib import Path
 
 _EPILOG = """\
 examples:
-  dyngs train configs/human_net.yaml data.root=PEOPLE run.dir=runs/net     PEOPLE holds a capture in each folder
+  dyngs train configs/human_predictor.yaml data.root=PEOPLE run.dir=runs/net     PEOPLE holds a capture in each folder
   dyngs predict runs/net captures/ann --out runs/ann
   dyngs predict runs/net captures/ann --out runs/ann --views f000_c00.png,f000_c03.png,f000_c06.png
   dyngs eval runs/ann
@@ -25,7 +25,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("network", type=Path, metavar="NET_RUN", help="run folder of model.kind=human_net")
+    parser.add_argument("network", type=Path, metavar="NET_RUN", help="run folder of model.kind=human_predictor")
     parser.add_argument("capture", type=Path, metavar="CAPTURE", help="a capture of a person, with body parameters")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="a new run folder")
     parser.add_argument(

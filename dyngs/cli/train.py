@@ -19,7 +19,7 @@ examples:
   dyngs train --resume runs/bench
 
 CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip, dynamic,
-human, human_net.
+human, human_predictor.
 All keys are listed in docs/cli.md; a wrong one is answered with what is allowed.
 """
 
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _next(folder: Path, config: Config) -> str:
     """What to do with the run."""
-    if config.model.kind == "human_net":
+    if config.model.kind == "human_predictor":
         return f"next:    dyngs predict {folder} CAPTURE --out RUN"
     return f"next:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/pictures"
 
@@ -68,7 +68,7 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
     if not scene.times:
         return ["motion:  the capture has no times (or only one), so this is a static model"]
     if scene.is_still:
-        return [f"motion:  nothing moves by {config.model.still_below:g} px or more, so this became a static model"]
+        return [f"motion:  nothing moves by {config.model.freeze_below_px:g} px or more, so this became a static model"]
     return [f"motion:  {len(scene.rows):,} of {len(scene):,} Gaussians move ({scene.moving_share:.1%})"]
 
 

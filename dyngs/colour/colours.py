@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from dyngs.colour.network import ColourNetwork, Frame
-from dyngs.config import ColourSection, DcacColour
+from dyngs.config import ColourSection, NetworkColour
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.ops.adam import adam_step_
 from dyngs.ops.perceptron import Layer
@@ -76,7 +76,7 @@ class NetworkColours(Colours):
     """
 
     def __init__(
-        self, options: DcacColour, steps: int, box: Tensor, generator: torch.Generator, *, sees_time: bool
+        self, options: NetworkColour, steps: int, box: Tensor, generator: torch.Generator, *, sees_time: bool
     ) -> None:
         super().__init__(options)
         self.options, self.steps, self.box, self.sees_time = options, steps, box, sees_time

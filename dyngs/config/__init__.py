@@ -1,56 +1,58 @@
 """The configuration of a run: typed keys (``keys``), YAML files and overrides (``io``), keys in words (``schema``)."""
 
 from dyngs.config.keys.budget import BudgetConfig
-from dyngs.config.keys.colour import AutoColour, ColourSection, DcacColour, ShColour
+from dyngs.config.keys.colour import AutoColour, ColourSection, NetworkColour, ShColour
 from dyngs.config.keys.config import Config
 from dyngs.config.keys.data import DataConfig
 from dyngs.config.keys.dynamic import (
+    ControlNodesField,
     DeformField,
     DynamicModel,
     FieldSection,
     HexplaneField,
     MlpField,
-    SkeletonField,
     TrajectoryField,
 )
-from dyngs.config.keys.human import HumanModel, HumanNetModel
+from dyngs.config.keys.human import HumanModel, HumanPredictorModel
 from dyngs.config.keys.model import SceneModel, StaticModel
-from dyngs.config.keys.prune import CompactConfig
+from dyngs.config.keys.prune import PruneConfig
 from dyngs.config.keys.run import RunConfig
 from dyngs.config.keys.section import CutOff, Fraction, Positive, Section
 from dyngs.config.keys.start import PointsInit, RandomInit
-from dyngs.config.keys.strategy import DefaultStrategy, McmcStrategy, OptimConfig
+from dyngs.config.keys.strategy import DefaultStrategy, FixedStrategy, McmcStrategy, OptimConfig, Strategy
 from dyngs.config.keys.train import TrainConfig
 
 __all__ = [
     "AutoColour",
     "BudgetConfig",
     "ColourSection",
-    "CompactConfig",
     "Config",
+    "ControlNodesField",
     "CutOff",
     "DataConfig",
-    "DcacColour",
     "DefaultStrategy",
     "DeformField",
     "DynamicModel",
     "FieldSection",
+    "FixedStrategy",
     "Fraction",
     "HexplaneField",
     "HumanModel",
-    "HumanNetModel",
+    "HumanPredictorModel",
     "McmcStrategy",
     "MlpField",
+    "NetworkColour",
     "OptimConfig",
     "PointsInit",
     "Positive",
+    "PruneConfig",
     "RandomInit",
     "RunConfig",
     "SceneModel",
     "Section",
     "ShColour",
-    "SkeletonField",
     "StaticModel",
+    "Strategy",
     "TrainConfig",
     "TrajectoryField",
 ]

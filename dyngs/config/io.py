@@ -18,6 +18,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from dyngs.config import Config
+from dyngs.config.renamed import PRESETS, present, require_present
 from dyngs.config.schema import (
     allowed_values,
     choices_of,
@@ -60,7 +61,10 @@ def load_config(preset: Path | None, overrides: Iterable[str] = ()) -> Config:
     """
     layers = _Layers()
     if preset is not None:
-        layers.add_file(find_preset(preset))
+        leaves = read_file(find_preset(preset))
+        for leaf in leaves:
+            require_present(leaf)
+        layers.add(leaves)
     layers.add_overrides(overrides)
     config = _validate(layers)
     data = config.data.model_copy(update={"root": config.data.root.absolute()})
@@ -83,7 +87,7 @@ def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
             f"{path}: not a run folder (no {RESOLVED_NAME} there); give the folder that `dyngs train` wrote"
         )
     layers = _Layers()
-    layers.add_file(file)
+    layers.add(present(read_file(file)))
     if not layers.tree.get("data"):
         raise DyngsError(f"{file}: does not say which capture the run was trained on (data.root); restore the file")
     layers.add_overrides(overrides)
@@ -112,6 +116,8 @@ def find_preset(path: Path) -> Path:
         return packaged[path.stem]
     if path.exists() and not path.is_dir():
         raise DyngsError(f"{path}: not a regular file; give a YAML preset")
+    if path.stem in PRESETS:
+        raise DyngsError(f"{path}: this preset is called {PRESETS[path.stem]} now; write that")
     close = get_close_matches(path.stem, packaged, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
     raise DyngsError(f"{path}: no such preset{hint}; the packaged ones are {', '.join(sorted(packaged))}")
@@ -146,12 +152,14 @@ class _Layers:
     origins: dict[tuple[str, ...], str] = field(default_factory=dict)
     written: dict[tuple[str, ...], str] = field(default_factory=dict)
 
-    def add_file(self, path: Path) -> None:
-        for leaf in read_file(path):
+    def add(self, leaves: Iterable[Leaf]) -> None:
+        for leaf in leaves:
             self._set(leaf)
 
     def add_overrides(self, overrides: Iterable[str]) -> None:
         leaves = [leaf for text in overrides for leaf in read_override(text)]
+        for leaf in leaves:
+            require_present(leaf)
         # what empties a section goes first, outer sections before inner ones
         for leaf in sorted(leaves, key=lambda o: (o.keys[-1] != "kind" and o.value != {}, len(o.keys))):
             if leaf.keys[-1] == "kind":

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dyngs.config import DeformField, HexplaneField, MlpField, SkeletonField
+from dyngs.config import ControlNodesField, DeformField, HexplaneField, MlpField
 from dyngs.deform.field import DeformationField, FieldSetup
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
@@ -22,7 +22,7 @@ def new_field(options: DeformField, setup: FieldSetup, generator: torch.Generato
         return Hexplane(options, setup, generator)
     if isinstance(options, MlpField):
         return Mlp(options, setup, generator)
-    if isinstance(options, SkeletonField):
+    if isinstance(options, ControlNodesField):
         return Skeleton(options, setup, generator)
     return Trajectory(options, setup, generator)
 

@@ -31,9 +31,9 @@ from dyngs.static.rates import Rates
 
 NOBODY = torch.zeros(0, dtype=torch.long)
 SURELY_MOVING = 1.5
-"""Errors so many times ``moving_error`` are never taken for those of still things."""
+"""Errors so many times ``motion_threshold`` are never taken for those of still things."""
 SURELY_STILL = 0.25
-"""Where cameras stay in place, errors of so many times ``moving_error`` are those of still things."""
+"""Where cameras stay in place, errors of so many times ``motion_threshold`` are those of still things."""
 MIN_MOVING_SHARE = 0.02
 """If no larger share of the Gaussians surely moves, nothing does."""
 
@@ -99,7 +99,7 @@ class DynamicScene:
         self.options, self.schedule, self.capture = options, schedule, capture
         self.times = tuple(sorted(set(capture.times)))
         phases = schedule.fine, schedule.opens, schedule.full
-        self.window = TimeWindow.around_middle(capture.times, options.first_views, *phases)
+        self.window = TimeWindow.around_middle(capture.times, options.time_window, *phases)
         self.field: DeformationField | None = None
         self.masks: KeyMasks | None = None
         self.rows = NOBODY
@@ -152,13 +152,13 @@ class DynamicScene:
         if step != self.schedule.fine:
             return None
         found = self.capture.residuals(lambda _: parameters)
-        floor = self.options.moving_error
+        floor = self.options.motion_threshold
         if not bool((found.most > SURELY_MOVING * floor).float().mean() > MIN_MOVING_SHARE):
             return None
         threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(found.usual > threshold)[:, 0]
-        result = seeded(parameters.detach(), self.options.seeds, self.capture.extent, self._generator)
-        added = torch.arange(len(parameters), len(parameters) + self.options.seeds)
+        result = seeded(parameters.detach(), self.options.num_random_moving, self.capture.extent, self._generator)
+        added = torch.arange(len(parameters), len(parameters) + self.options.num_random_moving)
         self._begin_motion(parameters, torch.cat([rows, added]))
         self._still.after_step(Gaussians(**result.changes), step, result)
         return result
@@ -196,11 +196,11 @@ class DynamicScene:
         now = parameters.detach()
         px_size = filter_std(now.means, self.capture.cameras)[self.rows] / math.sqrt(FILTER_VARIANCE)
         motion = measure_motion(field, now.select(self.rows), self.times, px_size)
-        moves = motion.pixels >= self.options.still_below
+        moves = motion.pixels >= self.options.freeze_below_px
         if self.capture.cameras_stay:
             means = now.means[self.rows]
             seen = self.capture.residuals(lambda time: deformed(now, field.offsets(means, time), self.rows))
-            moves &= seen.usual[self.rows] > SURELY_STILL * self.options.moving_error
+            moves &= seen.usual[self.rows] > SURELY_STILL * self.options.motion_threshold
         still = torch.nonzero(~moves)[:, 0]
         bake_(parameters, self.rows[still], motion.mean.select(still))
         kept = torch.nonzero(moves)[:, 0]

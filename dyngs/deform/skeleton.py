@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dyngs.config import SkeletonField
+from dyngs.config import ControlNodesField
 from dyngs.deform.decoder import head_sizes
 from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, Offsets
 from dyngs.deform.learned import LearnedTensors
@@ -37,7 +37,7 @@ class Skeleton:
     dropped and new ones start, with the motion found there, where Gaussians are farthest from any.
     """
 
-    def __init__(self, options: SkeletonField, setup: FieldSetup, generator: torch.Generator) -> None:
+    def __init__(self, options: ControlNodesField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup
         self.num_pieces = options.pieces or min(max(1, round(PIECES_PER_TIME * setup.num_times)), MAX_KEY_TIMES)
         self.buffers: dict[str, Tensor] = {"positions": NOTHING}

@@ -11,7 +11,7 @@ from statistics import fmean, median
 
 import torch
 
-from dyngs.config import CompactConfig, HumanNetModel
+from dyngs.config import HumanPredictorModel, PruneConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.data.capture import Capture
 from dyngs.data.frame_selection import evenly_spaced
@@ -57,7 +57,7 @@ def compact_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
     Args:
         run_dir: a run with at least one checkpoint; an interrupted one counts as finished there.
         out: must not exist, or be empty.
-        overrides: ``compact.key=value`` and ``run.threads=N``; what they do not say of the stage has its default.
+        overrides: ``prune.key=value`` and ``run.threads=N``; what they do not say of the stage has its default.
 
     Raises:
         DyngsError: no such run, a folder that is taken, a wrong value, nothing to do.
@@ -66,12 +66,12 @@ def compact_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
     require_empty(out)
     start = latest_checkpoint(run_dir)
     step = start.info.step
-    defaults = [f"compact.{key}={value}" for key, value in CompactConfig().model_dump().items()]
+    defaults = [f"prune.{key}={value}" for key, value in PruneConfig().model_dump().items()]
     done = [f"train.steps={step}", "budget.max_minutes=null", f"run.dir={out}"]
     config = load_resolved(run_dir, [*done, *defaults, *overrides])
-    if isinstance(config.model, HumanNetModel):
+    if isinstance(config.model, HumanPredictorModel):
         raise DyngsError(f"{run_dir}: a network, not a scene; compact what it predicts")
-    if not config.compact.is_wanted:
+    if not config.prune.is_wanted:
         raise DyngsError("nothing to do: give a share to --prune, or key times to --masks")
     with new_folder(out) as started:
         _copy_start(run_dir, start, started)

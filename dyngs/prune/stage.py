@@ -1,6 +1,6 @@
 """The last stage of a run: few of its Gaussians are kept, masks say when they are seen, and training goes on with them.
 
-It begins where training ends, from that checkpoint, and lasts ``compact.steps``: a finished run that is compacted ends
+It begins where training ends, from that checkpoint, and lasts ``prune.steps``: a finished run that is compacted ends
 with the same bytes as one that had the stage in its configuration.
 """
 
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dyngs.build import training_cameras
 from dyngs.camera import Cameras
-from dyngs.config import CompactConfig
+from dyngs.config import PruneConfig
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture
 from dyngs.deform.masks import KeyMasks
@@ -27,7 +27,7 @@ from dyngs.prune.score import Survey, Worth, worth
 from dyngs.prune.selection import Pruning, prune
 from dyngs.runs.checkpoint import stored_scene
 from dyngs.scene import Scene, moment_of
-from dyngs.static.settled import Settled
+from dyngs.static.fixed import FixedDensifier
 from dyngs.train.background import background_colour
 
 if TYPE_CHECKING:
@@ -72,29 +72,29 @@ class Compaction:
 @torch.no_grad()
 def compact_(trainer: Trainer) -> Compaction:
     """What was done; prunes and masks the Gaussians of ``trainer``, which from here on leaves their number alone."""
-    options = trainer.config.compact
+    options = trainer.config.prune
     scene = stored_scene(trainer.checkpoint(), trainer.config.model)
     if isinstance(scene, TrainedScene):
         scene = scene.unmasked()
     pruning = Pruning(torch.ones(len(scene), dtype=torch.bool), 0.0, 0.0)
-    if options.prune > 0:
+    if options.share > 0:
         pruning = _pruning(trainer, scene)
         trainer.keep(pruning.kept)
-    trainer.densifier = Settled()
+    trainer.densifier = FixedDensifier()
     active = 1.0
     if isinstance(trainer.model, DynamicScene):
         trainer.model.masks = None
-        if options.masks > 1 and not scene.is_still:
+        if options.mask_times > 1 and not scene.is_still:
             trainer.model.masks = masks = _masks(trainer, scene, pruning.kept)
             intervals = range(len(masks.times) - 1)
             active = fmean(len(masks.active(k)) / max(masks.count, 1) for k in intervals)
     after = int(pruning.kept.sum())
-    return Compaction(len(pruning.kept), after, options.prune, pruning.share, pruning.loss, active)
+    return Compaction(len(pruning.kept), after, options.share, pruning.share, pruning.loss, active)
 
 
 def _pruning(trainer: Trainer, scene: Scene) -> Pruning:
     """What may go of ``scene``."""
-    options = trainer.config.compact
+    options = trainer.config.prune
     found = worth(survey_of(trainer, scene), slopes=options.score == "sensitivity")
     pictures = [trainer.pictures[i] for i in evenly_spaced(len(trainer.pictures), PROBED_VIEWS)]
     whole = quality_of(trainer, scene, pictures, None)
@@ -102,10 +102,10 @@ def _pruning(trainer: Trainer, scene: Scene) -> Pruning:
     def loss_of(kept: Tensor) -> float:
         return whole - quality_of(trainer, scene, pictures, kept)
 
-    return prune(scores_of(found, options), options.prune, loss_of, options.max_loss)
+    return prune(scores_of(found, options), options.share, loss_of, options.max_loss)
 
 
-def scores_of(found: Worth, options: CompactConfig) -> Tensor:
+def scores_of(found: Worth, options: PruneConfig) -> Tensor:
     """(N,) the score asked for."""
     if options.score == "variation":
         return found.variation
@@ -150,8 +150,8 @@ def quality_of(trainer: Trainer, scene: Scene, pictures: Sequence[Picture], kept
 
 def _masks(trainer: Trainer, scene: Scene, kept: Tensor) -> KeyMasks:
     """At which of evenly spaced key times each Gaussian kept is seen from any of the survey's cameras."""
-    options, last = trainer.config.compact, len(scene.times) - 1
-    count = min(options.masks, len(scene.times))
+    options, last = trainer.config.prune, len(scene.times) - 1
+    count = min(options.mask_times, len(scene.times))
     times = [scene.times[round(k * last / (count - 1))] for k in range(count)]
     shares = worth(survey_of(trainer, scene, times), slopes=False).shares
     return KeyMasks.pack(tuple(times), shares[:, kept] > options.mask_below)

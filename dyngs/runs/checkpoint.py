@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from dyngs.colour.network import network_of
-from dyngs.config import Config, HumanModel, HumanNetModel, SceneModel
+from dyngs.config import Config, HumanModel, HumanPredictorModel, SceneModel
 from dyngs.config.io import load_resolved
 from dyngs.conventions import RasterizeMode
 from dyngs.deform.trained import trained_scene
@@ -182,7 +182,7 @@ def load_run(run_dir: Path) -> LoadedRun:
         DyngsError: no run folder, no checkpoint, or a damaged one.
     """
     config = load_resolved(run_dir)
-    if isinstance(config.model, HumanNetModel):
+    if isinstance(config.model, HumanPredictorModel):
         raise DyngsError(f"{run_dir}: a network, not a scene; `dyngs predict {run_dir} CAPTURE --out RUN` makes one")
     checkpoint = _compact_checkpoint(run_dir) if is_compact(run_dir) else latest_checkpoint(run_dir)
     scene = stored_scene(checkpoint, config.model)

@@ -200,6 +200,7 @@ def plan_edit(
     survives = opaque & (scale <= max_scale)
     wanted = opaque & (score >= options.grad_threshold)
     large = scale > options.dense_fraction * extent
+    wanted = wanted if options.grow else torch.zeros_like(wanted)
     split = wanted & large & (scale / SPLIT_SHRINK <= max_scale)
     cloned = wanted & ~large & survives
     # A candidate adds one Gaussian; a split one that would otherwise have been removed adds two.

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.config import DefaultStrategy, McmcStrategy, PointsInit, RandomInit
+from dyngs.config import DefaultStrategy, FixedStrategy, McmcStrategy, PointsInit, RandomInit, Strategy
 from dyngs.conventions import SH_C0, num_sh_terms
 from dyngs.gaussians import Gaussians
 
@@ -35,12 +35,16 @@ class StartValues:
     max_gaussians: int = 3_000_000
 
     @staticmethod
-    def for_strategy(strategy: DefaultStrategy | McmcStrategy) -> StartValues:
+    def for_strategy(strategy: Strategy) -> StartValues:
         """The published start of ``strategy`` (3DGS-MCMC: more opaque and smaller)."""
-        if isinstance(strategy, McmcStrategy):
-            opacity = min(max(strategy.init_opacity, 1e-3), 1 - 1e-3)
-            return StartValues(opacity, strategy.init_scale, strategy.max_gaussians)
-        return StartValues(max_gaussians=strategy.max_gaussians)
+        match strategy:
+            case McmcStrategy():
+                opacity = min(max(strategy.init_opacity, 1e-3), 1 - 1e-3)
+                return StartValues(opacity, strategy.init_scale, strategy.max_gaussians)
+            case DefaultStrategy():
+                return StartValues(max_gaussians=strategy.max_gaussians)
+            case FixedStrategy():
+                return StartValues()
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ class Variant:
         field: ``model.deform.kind`` that it is trained anew with.
         field_size: how many times as many nodes, channels, neurons or frequencies the field has, trained anew.
         prune: share of the Gaussians removed, by ``sensitivity``.
-        masks: key times of the masks of what is seen.
+        mask_times: key times of the masks of what is seen.
         finetune: training steps after these two.
         sh_degree: harmonics above it are dropped.
         storage: how much pictures may change by rounding, grey levels of 255, or "auto"; None: exact, float32.
@@ -38,7 +38,7 @@ class Variant:
     field: str | None = None
     field_size: float = 1.0
     prune: float = 0.0
-    masks: int = 0
+    mask_times: int = 0
     finetune: int = 0
     sh_degree: int | None = None
     storage: float | str | None = None
@@ -147,10 +147,10 @@ class Knob:
         return value
 
 
-FIELDS = ("trajectory", "hexplane", "mlp", "skeleton")
+FIELDS = ("trajectory", "hexplane", "mlp", "control_nodes")
 KNOBS = (
     Knob("prune", (0.3, 0.5, 0.7, 0.85), low=0.01, high=0.99),
-    Knob("masks", (6, 16), low=2, high=1000, whole=True),
+    Knob("mask_times", (6, 16), low=2, high=1000, whole=True),
     Knob("sh_degree", (2, 1, 0), low=0, high=3, whole=True),
     Knob("storage", (AUTO, 1.0, 3.0), low=0.01, high=64, words=(AUTO,)),
     Knob("mode", ("classic", "antialiased"), words=("classic", "antialiased")),
@@ -158,7 +158,7 @@ KNOBS = (
     Knob("transmittance_min", (1e-3, 1e-2, 5e-2), low=1e-6, high=0.5),
     Knob("scale", (0.75, 0.5), low=0.05, high=1.0),
     Knob("field_step", (4.0, 16.0), low=1 / 64, high=1024),
-    Knob("colour", ("sh", "dcac", "auto"), words=("sh", "dcac", "auto"), trains=True),
+    Knob("colour", ("sh", "network", "auto"), words=("sh", "network", "auto"), trains=True),
     Knob("field", FIELDS, words=FIELDS, trains=True),
     Knob("field_size", (0.5, 0.25), low=1 / 64, high=64, trains=True),
 )
@@ -179,7 +179,7 @@ class Traits:
     Attributes:
         sh_degree: of its harmonics, 0 where a network colours it.
         mode, alpha_min, transmittance_min: it is drawn with.
-        masks: key times that it has.
+        mask_times: key times that it has.
         colour: kind.
         field: kind of what moves something; None: nothing moves.
     """
@@ -188,7 +188,7 @@ class Traits:
     mode: str
     alpha_min: float
     transmittance_min: float
-    masks: int
+    mask_times: int
     colour: str
     field: str | None
 
@@ -196,7 +196,7 @@ class Traits:
         """The value makes sense and is not the run's own."""
         if knob.name == "sh_degree":
             return value < self.sh_degree  # pyright: ignore[reportOperatorIssue]
-        if knob.name in ("masks", "field", "field_size", "field_step") and self.field is None:
+        if knob.name in ("mask_times", "field", "field_size", "field_step") and self.field is None:
             return False
         own = asdict(self) | {"scale": 1.0, "field_size": 1.0, "field_step": 1.0}
         return own.get(knob.name) != value
@@ -247,6 +247,6 @@ def single_changes(settings: Sequence[Setting], traits: Traits, finetune: int) -
                 if setting.knob.name == "field_step":
                     variant = replace(variant, storage=AUTO)
                 variants.append(variant)
-                if finetune and setting.knob.name in ("prune", "masks"):
+                if finetune and setting.knob.name in ("prune", "mask_times"):
                     variants.append(replace(variant, finetune=finetune))
     return variants

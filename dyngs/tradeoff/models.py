@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dyngs.build import assemble
-from dyngs.config import BudgetConfig, CompactConfig, Config, DynamicModel, FieldSection, HumanNetModel, SceneModel
+from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, HumanPredictorModel, PruneConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.config.schema import section_class
 from dyngs.conventions import num_sh_terms
@@ -32,7 +32,7 @@ from dyngs.tradeoff.knobs import Traits, Variant
 from dyngs.tradeoff.measure import drawn_so
 from dyngs.train.trainer import num_cores, train
 
-FIELD_SIZE = {"skeleton": "nodes", "hexplane": "channels", "mlp": "width", "trajectory": "fourier"}
+FIELD_SIZE = {"control_nodes": "nodes", "hexplane": "channels", "mlp": "width", "trajectory": "fourier"}
 """What the size of a field is, by its kind: a key of its section."""
 
 NO_BUDGET = tuple(f"budget.{name}=null" for name in BudgetConfig.model_fields)
@@ -79,7 +79,7 @@ class Models:
         elif wanted.finetune:
             trained = self._finetuned(wanted)
             _write(folder, latest_checkpoint(trained), load_resolved(trained), trained)
-        elif wanted.prune or wanted.masks:
+        elif wanted.prune or wanted.mask_times:
             source = self.folder(wanted.trained)
             _write(folder, *self._compacted(source, wanted), source)
         else:
@@ -99,14 +99,14 @@ class Models:
         source, out = self.folder(wanted.trained), self.out / "training" / wanted.slug
         if checkpoint_paths(out):
             return finished(load_resolved(out), out)
-        steps = [*NO_BUDGET, f"compact.steps={wanted.finetune}", f"run.threads={self.threads}"]
-        return compact_run(source, out, [*_compaction(wanted, load_resolved(source).compact), *steps])
+        steps = [*NO_BUDGET, f"prune.steps={wanted.finetune}", f"run.threads={self.threads}"]
+        return compact_run(source, out, [*_compaction(wanted, load_resolved(source).prune), *steps])
 
     def _compacted(self, source: Path, wanted: Variant) -> tuple[Checkpoint, Config]:
         """Pruned and masked, and nothing trained after it."""
         checkpoint = latest_checkpoint(source)
         changes = [f"train.steps={checkpoint.info.step}", *NO_BUDGET]
-        config = load_resolved(source, [*changes, *_compaction(wanted, load_resolved(source).compact)])
+        config = load_resolved(source, [*changes, *_compaction(wanted, load_resolved(source).prune)])
         with kernel_threads(self.threads or num_cores()):
             trainer = assemble(config, restored=True)
             trainer.restore(checkpoint)
@@ -128,7 +128,7 @@ def traits(run_dir: Path) -> Traits:
     if is_compact(run_dir):
         raise DyngsError(f"{run_dir}: only {COMPACT_NAME} is there; give the run that it was made from")
     config = load_resolved(run_dir)
-    if isinstance(config.model, HumanNetModel):
+    if isinstance(config.model, HumanPredictorModel):
         raise DyngsError(f"{run_dir}: a network, not a scene; vary what it predicts")
     scene = load_run(run_dir).scene
     model = config.model
@@ -137,7 +137,7 @@ def traits(run_dir: Path) -> Traits:
         mode=model.rasterize_mode.value,
         alpha_min=model.alpha_min,
         transmittance_min=model.transmittance_min,
-        masks=config.compact.masks,
+        mask_times=config.prune.mask_times,
         colour=config.colour.kind,
         field=model.deform.kind if isinstance(model, DynamicModel) and not scene.is_still else None,
     )
@@ -170,10 +170,10 @@ def write_chosen(models: Models, variant: Variant) -> Path:
     return out
 
 
-def _compaction(wanted: Variant, own: CompactConfig) -> Sequence[str]:
+def _compaction(wanted: Variant, own: PruneConfig) -> Sequence[str]:
     """Overrides of the last stage; masks are the run's ``own`` where no others are wanted."""
-    masks = (f"compact.masks={wanted.masks or own.masks}", f"compact.mask_below={own.mask_below}")
-    return (f"compact.prune={wanted.prune}", f"compact.max_loss={MAX_PSNR}", *masks)
+    masks = (f"prune.mask_times={wanted.mask_times or own.mask_times}", f"prune.mask_below={own.mask_below}")
+    return (f"prune.share={wanted.prune}", f"prune.max_loss={MAX_PSNR}", *masks)
 
 
 def field_changes(model: SceneModel, wanted: Variant) -> Iterator[str]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, HumanModel, HumanNetModel
+from dyngs.config import Config, DataConfig, HumanModel, HumanPredictorModel
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, reading
@@ -73,7 +73,7 @@ class NetworkTrainer:
     """
 
     config: Config
-    model: HumanNetModel
+    model: HumanPredictorModel
     people: list[Filmed]
     network: AtlasNetwork
     mean: Tensor
@@ -100,7 +100,9 @@ class NetworkTrainer:
             background_colour(self.background, self.generator),
             replace(render_options(self.model), nonfinite="trust"),
         )
-        avatar = predict_gaussians(person.sitter, person.maps(choice), self.mean, self.network, self.model.carve)
+        avatar = predict_gaussians(
+            person.sitter, person.maps(choice), self.mean, self.network, self.model.min_silhouette_share
+        )
         posed = _scene(self.model, avatar).gaussians_at(avatar.gaussians, targets[0], step).gaussians
         total = torch.zeros(())
         for picture in targets:
@@ -152,7 +154,7 @@ class NetworkTrainer:
         frame = views[others[self._draw(len(others))]].frame
         shown = [i for i in others if views[i].frame == frame]
         order = torch.randperm(len(shown), generator=self.generator).tolist()
-        return [person.pictures[shown[i]] for i in order[: self.model.targets]]
+        return [person.pictures[shown[i]] for i in order[: self.model.target_views]]
 
     def _update(self, loss: Tensor, step: int) -> None:
         self.optimizer.zero_grad(set_to_none=True)
@@ -170,13 +172,13 @@ class NetworkTrainer:
 
 
 def assemble_network(config: Config) -> NetworkTrainer:
-    """The trainer of ``model.kind: human_net``: captures read, nothing trained.
+    """The trainer of ``model.kind: human_predictor``: captures read, nothing trained.
 
     Raises:
         DyngsError: ``data.root`` has no captures of people, or settings that do not go together.
     """
     model = config.model
-    if not isinstance(model, HumanNetModel):
+    if not isinstance(model, HumanPredictorModel):
         raise ValueError(f"model.kind is {model.kind}")
     body, generator = load_template(human_options(model)), torch.Generator().manual_seed(config.run.seed)
     network = new_network(model, generator)
@@ -197,7 +199,7 @@ def assemble_network(config: Config) -> NetworkTrainer:
     )
 
 
-def new_network(model: HumanNetModel, generator: torch.Generator) -> AtlasNetwork:
+def new_network(model: HumanPredictorModel, generator: torch.Generator) -> AtlasNetwork:
     """The untrained network of ``model``.
 
     Raises:
@@ -208,7 +210,7 @@ def new_network(model: HumanNetModel, generator: torch.Generator) -> AtlasNetwor
         raise DyngsError(
             f"model.resolution={model.resolution} must be a multiple of {factor} for {len(model.widths)} model.widths"
         )
-    scaffolds = len(set(model.heights))
+    scaffolds = len(set(model.scaffold_heights))
     return AtlasNetwork(num_input_channels(scaffolds), scaffolds, model.widths, generator)
 
 
@@ -229,9 +231,9 @@ def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int)
         return require_tensor("mean", mean, (3, resolution, resolution))
 
 
-def human_options(model: HumanNetModel) -> HumanModel:
+def human_options(model: HumanPredictorModel) -> HumanModel:
     """The section of one person with the same template, texels and scaffolds; nothing of it is learned."""
-    shared = ("body", "uv", "resolution", "heights", "carve")
+    shared = ("body", "uv", "resolution", "scaffold_heights", "min_silhouette_share")
     drawn = ("near", "eps2d", "rasterize_mode", "alpha_min", "transmittance_min")
     none = {"refine": False, "offset_weight": 0, "scale_weight": 0, "rigidity": 0, "smoothness": 0}
     return HumanModel.model_validate({"sh_degree": 0, **none} | {name: getattr(model, name) for name in shared + drawn})
@@ -250,7 +252,7 @@ def captures_in(data: DataConfig) -> list[DataConfig]:
     return [data.model_copy(update={"root": folder}) for folder in folders]
 
 
-def filmed(data: DataConfig, model: HumanNetModel, body: BodyTemplate) -> Filmed:
+def filmed(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> Filmed:
     """The person of one capture, without choices of pictures.
 
     Raises:
@@ -278,18 +280,18 @@ def mean_colours(people: list[Filmed], resolution: int) -> Tensor:
     return torch.where(count > 0, total / count.clamp_min(1), overall[:, None, None])
 
 
-def rate_at(model: HumanNetModel, step: int, steps: int) -> float:
+def rate_at(model: HumanPredictorModel, step: int, steps: int) -> float:
     """Of AdamW: up along a line, then down along one (one cycle; Smith and Topin 2017)."""
     top = max(1, round(model.warm_up * steps))
     share = step / top if step <= top else (steps - step) / max(steps - top, 1)
     return model.lr * max(share, _LOWEST)
 
 
-def _choices(sitter: CapturedPerson, model: HumanNetModel, generator: torch.Generator) -> list[list[int]]:
+def _choices(sitter: CapturedPerson, model: HumanPredictorModel, generator: torch.Generator) -> list[list[int]]:
     """Views to predict from: of a random moment each, one of them random, the others such that much is seen."""
-    firsts = torch.randint(len(sitter.views), (model.inputs,), generator=generator).tolist()
-    return [spread_views(sitter, model.views, first) for first in firsts]
+    firsts = torch.randint(len(sitter.views), (model.source_sets,), generator=generator).tolist()
+    return [spread_views(sitter, model.source_views, first) for first in firsts]
 
 
-def _scene(model: HumanNetModel, avatar: PredictedAvatar) -> HumanScene:
+def _scene(model: HumanPredictorModel, avatar: PredictedAvatar) -> HumanScene:
     return HumanScene(human_options(model), avatar.subject, Rates(1))

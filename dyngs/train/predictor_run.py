@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from dyngs.build import assemble
-from dyngs.config import Config, DataConfig, HumanModel, HumanNetModel
+from dyngs.config import Config, DataConfig, HumanModel, HumanPredictorModel
 from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
 from dyngs.errors import DyngsError
 from dyngs.human.avatar.model import HumanScene
@@ -49,7 +49,7 @@ def predict_person(network_run: Path, capture: Path, out: Path, views: int | tup
     """The person of ``capture`` as a run folder ``out``, which all commands take; ``dyngs train --resume`` refines it.
 
     Args:
-        network_run: run folder of ``model.kind: human_net``.
+        network_run: run folder of ``model.kind: human_predictor``.
         capture: of a person, in any format that has body parameters and silhouettes.
         out: a new run folder.
         views: how many of the training views to predict from, well spread; or their names.
@@ -69,31 +69,43 @@ def predict_person(network_run: Path, capture: Path, out: Path, views: int | tup
     maps = person.look(chosen)
     middle = time.perf_counter()
     with torch.no_grad():
-        avatar = without_faint(predict_gaussians(person.sitter, maps, mean, network, model.carve))
+        avatar = without_faint(predict_gaussians(person.sitter, maps, mean, network, model.min_silhouette_share))
     end = time.perf_counter()
     write_run(out, avatar, data, model, end - start)
     names = tuple(person.sitter.views[i].name for i in chosen)
     return Prediction(out, names, len(avatar.gaussians), middle - start, end - middle)
 
 
-def network_config(run_dir: Path) -> tuple[Config, HumanNetModel]:
+def network_config(run_dir: Path) -> tuple[Config, HumanPredictorModel]:
     """The configuration of the run of a network, and its model section.
 
     Raises:
         DyngsError: the run is of something else.
     """
     config = load_resolved(run_dir)
-    if not isinstance(config.model, HumanNetModel):
-        raise DyngsError(f"{run_dir}: a run of model.kind={config.model.kind}; a prediction needs one of human_net")
+    if not isinstance(config.model, HumanPredictorModel):
+        raise DyngsError(
+            f"{run_dir}: a run of model.kind={config.model.kind}; a prediction needs one of human_predictor"
+        )
     return config, config.model
 
 
-def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: HumanNetModel, seconds: float) -> None:
+def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: HumanPredictorModel, seconds: float) -> None:
     """Write ``avatar`` as a run of the preset for one person after no step; ``seconds`` is what it took so far."""
     preset = load_config(packaged_preset("human"), ["data.root=."])
     if not isinstance(preset.model, HumanModel):
         raise ValueError(f"the preset of one person is of model.kind={preset.model.kind}")
-    same = ("body", "uv", "resolution", "heights", "carve", "near", "eps2d", "rasterize_mode", "sh_degree")
+    same = (
+        "body",
+        "uv",
+        "resolution",
+        "scaffold_heights",
+        "min_silhouette_share",
+        "near",
+        "eps2d",
+        "rasterize_mode",
+        "sh_degree",
+    )
     given = human_options(model)
     human = preset.model.model_copy(update={name: getattr(given, name) for name in same})
     config = preset.model_copy(

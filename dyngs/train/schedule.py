@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from dyngs.config import Config, DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, TrainConfig
+from dyngs.config import Config, DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, Strategy, TrainConfig
 from dyngs.deform.model import DeformSchedule
 from dyngs.static.densify import DensifySchedule
 from dyngs.static.rates import Rates
@@ -30,16 +30,16 @@ def scaled(step: int, steps: int) -> int:
 
 
 def picture_divisor(options: TrainConfig, step: int) -> int:
-    """What the sides of pictures are divided by at ``step``: ``coarsest``, halved at even distances until it is 1."""
-    halvings = options.coarsest.bit_length() - 1
-    first, last = options.sharpen_from, max(options.sharpen_from, options.sharpen_to)
+    """Divisor of the pictures' sides at ``step``: ``initial_downscale``, halved at even distances until it is 1."""
+    halvings = options.initial_downscale.bit_length() - 1
+    first, last = options.resolution_grows_from, max(options.resolution_grows_from, options.resolution_full_at)
     shares = [first + (last - first) * i / max(halvings - 1, 1) for i in range(halvings)]
-    return options.coarsest >> sum(step / options.steps >= share for share in shares)
+    return options.initial_downscale >> sum(step / options.steps >= share for share in shares)
 
 
 def rates_of(config: Config) -> Rates:
     """When the learning rates of a run fall."""
-    stage = config.compact
+    stage = config.prune
     return Rates(config.train.steps, stage.steps, stage.rewind) if stage.is_wanted else Rates(config.train.steps)
 
 
@@ -65,6 +65,8 @@ def densify_schedule(strategy: DefaultStrategy | McmcStrategy, steps: int, white
     stop = scaled(strategy.stop, steps)
     if isinstance(strategy, McmcStrategy):
         return DensifySchedule(start, stop, strategy.every)
+    if strategy.reset_every is None:
+        return DensifySchedule(start, stop, strategy.every, prune_scale_after=steps)
     recovery = max(MIN_RESET_GAP, round(RESET_SHARE * steps))
     period = max(scaled(strategy.reset_every, steps), min(strategy.reset_every, recovery))
     resets = tuple(range(period, stop - period + 1, period))
@@ -92,21 +94,21 @@ def growth_per_change(strategy: McmcStrategy, steps: int) -> float:
     return max(strategy.growth, math.expm1(min(rate, math.log1p(MAX_GROWTH))))
 
 
-def filter_steps(strategy: DefaultStrategy | McmcStrategy, steps: int) -> range:
+def filter_steps(strategy: Strategy, steps: int) -> range:
     """Steps after which Mip-Splatting's 3D filter is recomputed: each 100 from the end of densification on."""
     first = -(-scaled(strategy.stop, steps) // FILTER_EVERY) * FILTER_EVERY
     return range(first, steps - FILTER_EVERY + 1, FILTER_EVERY)
 
 
 def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
-    """The phases of a dynamic model in a run with ``rates``; where ``still_below`` is 0 nothing is ever frozen.
+    """The phases of a dynamic model in a run with ``rates``; where ``freeze_below_px`` is 0 nothing is ever frozen.
 
     While new times come in, the field learns at its first rate: what has slowed down follows nothing.
     """
     steps = rates.steps
-    fine = min(max(1, round(model.coarse * steps), min(MIN_COARSE_STEPS, steps // 3)), steps)
-    opens = max(fine, round(model.first_views_until * steps))
-    full = max(opens, round(model.all_views_at * steps))
-    decays = full if model.first_views < 1 else fine
-    splits = sorted({full + round(share * (steps - full)) for share in SPLITS}) if model.still_below > 0 else []
+    fine = min(max(1, round(model.motion_from * steps), min(MIN_COARSE_STEPS, steps // 3)), steps)
+    opens = max(fine, round(model.time_window_grows_from * steps))
+    full = max(opens, round(model.time_window_full_at * steps))
+    decays = full if model.time_window < 1 else fine
+    splits = sorted({full + round(share * (steps - full)) for share in SPLITS}) if model.freeze_below_px > 0 else []
     return DeformSchedule(fine, opens, full, decays, tuple(step for step in splits if step > full), rates)

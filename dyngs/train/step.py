@@ -21,9 +21,9 @@ from dyngs.ops.loss import l1_ssim_loss
 from dyngs.rendering import RenderOptions, render
 from dyngs.runs.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, stored_scene
 from dyngs.static.densify import Densifier, EditResult
+from dyngs.static.fixed import FixedDensifier
 from dyngs.static.model import Drawn
 from dyngs.static.optimizer import GaussianOptimizer
-from dyngs.static.settled import Settled
 from dyngs.tensor_checks import require_tensor
 from dyngs.train.background import background_colour
 from dyngs.train.sampler import ViewSampler
@@ -232,7 +232,7 @@ class Trainer:
                 self.colours.load_state(checkpoint.part("model.colour"))
                 _require_frozen(checkpoint.tensors, len(self.optimizer.parameters))
                 if checkpoint.info.step >= self.config.train.steps:
-                    self.densifier = Settled()
+                    self.densifier = FixedDensifier()
                 self.densifier.load_state(checkpoint.part("strategy"))
                 self.sampler.load_state(checkpoint.part("sampler"))
                 self.generator.set_state(checkpoint.tensors["rng"])

@@ -14,7 +14,7 @@ from dyngs.budget.size import has_file, write_within
 from dyngs.budget.speed import SpeedLimit
 from dyngs.budget.time import Deadline, deadline_of, first_fit, refitted, with_steps
 from dyngs.build import assemble
-from dyngs.config import Config, HumanNetModel
+from dyngs.config import Config, HumanPredictorModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.errors import DyngsError
 from dyngs.evaluate.metrics import psnr
@@ -107,7 +107,7 @@ def _train(config: Config, run_dir: Path, resume_from: Path | None) -> Path:
 
 
 def _assembled(config: Config, *, restored: bool) -> Trainer | NetworkTrainer:
-    if isinstance(config.model, HumanNetModel):
+    if isinstance(config.model, HumanPredictorModel):
         return assemble_network(config)
     return assemble(config, restored=restored)
 

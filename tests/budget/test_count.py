@@ -13,12 +13,12 @@ from dyngs.budget.count import STAGES, CountLimit, stage
 from dyngs.build import assemble
 from dyngs.config import (
     BudgetConfig,
-    CompactConfig,
     Config,
     DataConfig,
     DefaultStrategy,
     HumanModel,
     McmcStrategy,
+    PruneConfig,
     RandomInit,
     RunConfig,
     StaticModel,
@@ -56,14 +56,14 @@ def config_of(kind: str, captures: dict[str, Path], run_dir: Path, budget: Budge
     )
     if kind != "human":
         return config
-    model = HumanModel(resolution=24, heights=(0.0, 0.02), carve=0.0, sh_degree=0)
+    model = HumanModel(resolution=24, scaffold_heights=(0.0, 0.02), min_silhouette_share=0.0, sh_degree=0)
     return config.model_copy(update={"data": DataConfig(root=captures["person"]), "model": model})
 
 
 @given(steps=st.integers(1, 10**4), tuning=st.integers(0, 10**3), share=st.floats(0, 2))
 def test_stages_only_come_and_the_last_is_the_end(steps: int, tuning: int, share: float) -> None:
-    compact = CompactConfig(prune=0.5, steps=tuning) if tuning else CompactConfig()
-    config = PLAIN.model_copy(update={"train": TrainConfig(steps=steps), "compact": compact})
+    compact = PruneConfig(share=0.5, steps=tuning) if tuning else PruneConfig()
+    config = PLAIN.model_copy(update={"train": TrainConfig(steps=steps), "prune": compact})
     total = config.total_steps
     around = sorted({min(max(x, 0), total) for x in (0, steps // 2, steps - 1, steps, steps + 1, total - 1, total)})
     found = [stage(config, step) for step in around]
@@ -105,8 +105,8 @@ def test_room_in_a_file_is_a_limit(
     folder = train(config)
     assert len(load_run(folder).scene) == 1000 // (16 + 0.35 * 9)
     assert "budget.max_mb: asked for at most 52 Gaussians, got 52; 150 before" in capsys.readouterr().out
-    compact = CompactConfig(prune=0.7, steps=3)
-    other = config.model_copy(update={"compact": compact, "run": RunConfig(dir=tmp_path / "other", threads=1)})
+    compact = PruneConfig(share=0.7, steps=3)
+    other = config.model_copy(update={"prune": compact, "run": RunConfig(dir=tmp_path / "other", threads=1)})
     assert len(load_run(train(other)).scene) <= 45
     assert "removed" not in capsys.readouterr().out.split("asked for at most 52")[1]
 

@@ -13,13 +13,13 @@ from dyngs.budget.limits import most_gaussians, require_possible, room, within_c
 from dyngs.build import assemble
 from dyngs.config import (
     BudgetConfig,
-    CompactConfig,
     Config,
     DataConfig,
     DefaultStrategy,
     DynamicModel,
-    HumanNetModel,
+    HumanPredictorModel,
     McmcStrategy,
+    PruneConfig,
     RandomInit,
     RunConfig,
     StaticModel,
@@ -82,9 +82,9 @@ def test_a_cap_holds_where_motion_adds_some(tmp_path: Path) -> None:
     config = busy_config(write_tiny_capture(tmp_path / "capture"), tmp_path / "run", "trajectory")
     assert isinstance(config.model, DynamicModel)
     free = largest_count(assemble(config))
-    cap = free - config.model.seeds
+    cap = free - config.model.num_random_moving
     trainer = assemble(limited(config, max_gaussians=cap))
-    assert cap - config.model.seeds <= largest_count(trainer) <= cap
+    assert cap - config.model.num_random_moving <= largest_count(trainer) <= cap
     assert trainer.model.num_moving(cap) > 0
 
 
@@ -101,7 +101,9 @@ def test_limits_only_lower_and_are_settled_at_once(cap: int, own: int) -> None:
     base = NOTHING.model_copy(update={"strategy": DefaultStrategy(max_gaussians=own), "model": DynamicModel()})
     config = within_cap(limited(base, max_gaussians=cap), 5)
     assert isinstance(config.model, DynamicModel)
-    assert config.strategy.max_gaussians + config.model.seeds <= min(cap, own + DynamicModel().seeds)
+    assert config.strategy.max_gaussians + config.model.num_random_moving <= min(
+        cap, own + DynamicModel().num_random_moving
+    )
     assert 1 <= config.strategy.max_gaussians <= own
     assert within_cap(config, 5) == config
 
@@ -134,8 +136,8 @@ def test_a_size_without_room_is_refused_and_the_one_named_is_not(model: StaticMo
 def test_what_contradicts_is_refused(tmp_path: Path) -> None:
     require_possible(NOTHING)
     with pytest.raises(DyngsError, match=r"budget.max_mb: a network"):
-        require_possible(limited(NOTHING.model_copy(update={"model": HumanNetModel()}), max_mb=5.0))
-    both = NOTHING.model_copy(update={"compact": CompactConfig(prune=0.5), "run": RunConfig(dir=tmp_path / "run")})
+        require_possible(limited(NOTHING.model_copy(update={"model": HumanPredictorModel()}), max_mb=5.0))
+    both = NOTHING.model_copy(update={"prune": PruneConfig(share=0.5), "run": RunConfig(dir=tmp_path / "run")})
     with pytest.raises(DyngsError, match=r"budget.max_minutes: .*dyngs compact"):
         train(limited(both, max_minutes=5.0))
     assert not (tmp_path / "run").exists()

@@ -23,12 +23,12 @@ from dyngs.budget.speed import (
 from dyngs.build import assemble
 from dyngs.config import (
     BudgetConfig,
-    CompactConfig,
     Config,
     DataConfig,
     DefaultStrategy,
     HumanModel,
     McmcStrategy,
+    PruneConfig,
     RandomInit,
     RunConfig,
     StaticModel,
@@ -90,8 +90,10 @@ def still_config(capture: Path, run_dir: Path, strategy: DefaultStrategy | McmcS
 def human_config(capture: Path, run_dir: Path) -> Config:
     return Config(
         data=DataConfig(root=capture),
-        model=HumanModel(resolution=24, heights=(0.0, 0.02), carve=0.0, refine_from=0.2, sh_degree=0),
-        strategy=DefaultStrategy(start=1, stop=30_000, every=4, max_gaussians=1, prune_opacity=0.11),
+        model=HumanModel(
+            resolution=24, scaffold_heights=(0.0, 0.02), min_silhouette_share=0.0, refine_from=0.2, sh_degree=0
+        ),
+        strategy=DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.11),
         train=TrainConfig(steps=10, log_every=1),
         run=RunConfig(dir=run_dir, threads=1),
     )
@@ -126,7 +128,7 @@ def test_growth_ends_where_it_would_be_too_slow(
 
 
 @pytest.mark.usefixtures("machine")
-@pytest.mark.parametrize("kind", ["still", "hexplane", "mlp", "skeleton", "trajectory", "human"])
+@pytest.mark.parametrize("kind", ["still", "hexplane", "mlp", "control_nodes", "trajectory", "human"])
 def test_too_many_are_removed_and_resuming_is_exact(
     kind: str, still: Path, moving: Path, person: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -137,7 +139,7 @@ def test_too_many_are_removed_and_resuming_is_exact(
     elif kind == "human":
         config = human_config(person, tmp_path / "run")
     else:
-        config = busy_config(moving, tmp_path / "run", kind, still_below=0.0)
+        config = busy_config(moving, tmp_path / "run", kind, freeze_below_px=0.0)
     folder = train(with_saves(asked(config, fps_of(80)), config.train.steps - 2))
     scene = load_run(folder).scene
     assert simulated(scene) <= ACCEPTED / fps_of(80)
@@ -156,8 +158,8 @@ def test_too_many_are_removed_and_resuming_is_exact(
 
 @pytest.mark.usefixtures("machine")
 def test_a_last_stage_is_fast_enough_too(moving: Path, tmp_path: Path) -> None:
-    stage = CompactConfig(prune=0.3, steps=6, masks=3)
-    config = busy_config(moving, tmp_path / "run", "trajectory").model_copy(update={"compact": stage})
+    stage = PruneConfig(share=0.3, steps=6, mask_times=3)
+    config = busy_config(moving, tmp_path / "run", "trajectory").model_copy(update={"prune": stage})
     assert len(load_run(train(config)).scene) > 40
     config = config.model_copy(update={"run": RunConfig(dir=tmp_path / "fast", threads=1)})
     run = load_run(train(asked(config, fps_of(40))))
@@ -185,7 +187,7 @@ def test_what_never_grows_does_not_begin_to(person: Path, tmp_path: Path) -> Non
         trainer.step()
         limit.after_step(trainer)
     assert limit.before > len(trainer.optimizer.parameters)
-    assert limit.cap == config.strategy.max_gaussians == 1
+    assert limit.cap == config.strategy.growth_limit == 0
 
 
 @pytest.mark.usefixtures("machine")

@@ -33,7 +33,7 @@ from dyngs.train.step import StepReport, Trainer
 from dyngs.train.trainer import train
 
 PLAIN = Config(data=DataConfig(root=Path("nowhere")))
-SHRUNK = PLAIN.model_copy(update={"train": TrainConfig(steps=7000, coarsest=4)})
+SHRUNK = PLAIN.model_copy(update={"train": TrainConfig(steps=7000, initial_downscale=4)})
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_a_settled_number_of_steps_ends_only_with_the_time() -> None:
 
 
 def test_what_happens_once_is_neither_missed_nor_redone() -> None:
-    dynamic = PLAIN.model_copy(update={"model": DynamicModel(coarse=0.1)})
+    dynamic = PLAIN.model_copy(update={"model": DynamicModel(motion_from=0.1)})
     longer, shorter = with_steps(dynamic, 20_000), with_steps(dynamic, 16_000)
     assert [same_phase(longer, shorter, done) for done in (1500, 1800, 2100)] == [True, False, True]
     thrifty = PLAIN.model_copy(update={"colour": AutoColour(measure_at=0.5)})
@@ -111,7 +111,7 @@ def test_no_limit_no_deadline() -> None:
     assert not settled.fits
 
 
-@pytest.mark.parametrize("kind", ["skeleton", "trajectory"])
+@pytest.mark.parametrize("kind", ["control_nodes", "trajectory"])
 def test_refitted_is_where_it_was_on_other_schedules(kind: str, moving: Path, tmp_path: Path) -> None:
     config = busy_config(moving, tmp_path, kind)
     trainer = assemble(config)

@@ -35,7 +35,7 @@ def test_a_smaller_run_and_a_table(tmp_path: Path, capsys: pytest.CaptureFixture
     text = capsys.readouterr().out
     for word in ("Gaussians", "PSNR, training views", "PSNR, held-out views", "rendering", "model", "written"):
         assert word in text
-    assert load_resolved(out).compact.prune == 0.5
+    assert load_resolved(out).prune.share == 0.5
     assert "exists already" in error_line(capsys, *words)
-    assert "compact.prune" in error_line(capsys, *words[:3], str(tmp_path / "x"), "--prune", "1.5")
+    assert "prune.share" in error_line(capsys, *words[:3], str(tmp_path / "x"), "--prune", "1.5")
     assert "--out" in error_line(capsys, "compact", str(run))

@@ -10,7 +10,7 @@ from scenes import random_scene
 
 from dyngs.colour.colours import Colours, NetworkColours, opacity_entropy, rate_factor
 from dyngs.colour.network import network_of
-from dyngs.config import DcacColour, ShColour
+from dyngs.config import NetworkColour, ShColour
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import render
 
@@ -23,7 +23,7 @@ def gaussians() -> Gaussians:
 def colours(seed: int = 0, **options: object) -> NetworkColours:
     box = torch.tensor([[0.0] * 3, [2.0] * 3])
     generator = torch.Generator().manual_seed(seed)
-    return NetworkColours(DcacColour.model_validate(options), 60, box, generator, sees_time=True)
+    return NetworkColours(NetworkColour.model_validate(options), 60, box, generator, sees_time=True)
 
 
 def test_plain_colours_do_nothing() -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from dyngs.config import (
     Config,
+    ControlNodesField,
     DataConfig,
     DefaultStrategy,
     DynamicModel,
@@ -21,7 +22,6 @@ from dyngs.config import (
     OptimConfig,
     RandomInit,
     RunConfig,
-    SkeletonField,
     StaticModel,
     TrainConfig,
     TrajectoryField,
@@ -173,7 +173,7 @@ def test_home_is_expanded() -> None:
         ("optim.lr_means=.nan", ["optim.lr_means must be a number > 0"]),
         ("data.background=whit", ["one of auto, white, black, random", "did you mean 'white'"]),
         ("model.rasterize_mode=antialias", ["one of classic, antialiased", "did you mean 'antialiased'"]),
-        ("strategy.kind=mcm", ["strategy.kind must be one of default, mcmc", "did you mean 'mcmc'"]),
+        ("strategy.kind=mcm", ["strategy.kind must be one of default, mcmc, fixed", "did you mean 'mcmc'"]),
         ("strategy.noise=1", ["strategy.noise belongs to strategy.kind=mcmc, not to default"]),
         ("model.deform.width=64", ["model.deform belongs to model.kind=dynamic, not to static"]),
         ("model.width=64", ["unknown key 'model.width'", "did you mean 'model.deform.width'"]),
@@ -281,11 +281,11 @@ configs = st.builds(
     model=st.builds(StaticModel, rasterize_mode=st.sampled_from(RasterizeMode), filter_3d=st.booleans())
     | st.builds(
         DynamicModel,
-        coarse=fractions,
+        motion_from=fractions,
         deform=st.builds(HexplaneField, levels=st.lists(st.integers(1, 9), min_size=1).map(tuple), lr_planes=rates)
         | st.builds(MlpField, lr=rates, move_scales=st.booleans())
         | st.builds(TrajectoryField, lr_means=rates)
-        | st.builds(SkeletonField, rigidity=rates),
+        | st.builds(ControlNodesField, rigidity=rates),
     ),
     init=st.builds(RandomInit, half_extent=rates),
     strategy=st.builds(McmcStrategy, noise=rates) | st.builds(DefaultStrategy, prune_opacity=fractions),

@@ -54,7 +54,7 @@ def test_nested_keys_name_the_kinds_that_have_them() -> None:
     names = [(key.name, key.kinds) for key in config_keys()]
     assert len(set(names)) == len(names)
     assert ("model.sh_degree", ()) in names, "all models have it alike"
-    assert ("model.coarse", ("dynamic",)) in names
+    assert ("model.motion_from", ("dynamic",)) in names
     assert ("model.deform.kind", ("dynamic",)) in names
     assert ("model.deform.move_scales", ("dynamic",)) in names, "all fields have it alike"
     assert ("model.deform.width", ("dynamic", "hexplane")) in names
@@ -70,7 +70,7 @@ def test_known_rows() -> None:
     rows = {(key.name, *key.kinds): key for key in config_keys()}
     assert rows["data.root",].default == ""
     assert rows["data.root",].allowed == "a path"
-    assert rows["strategy.kind",].allowed == "one of default, mcmc"
+    assert rows["strategy.kind",].allowed == "one of default, mcmc, fixed"
     assert rows["train.ssim_weight",].allowed == "a number >= 0 and <= 1"
     assert rows["data.longest_side",].allowed == "an integer >= 1 or null"
     assert rows["train.tensorboard",].allowed == "true or false"

@@ -14,7 +14,7 @@ from dyngs.deform.trajectory import Trajectory
 
 
 def test_options_decide_the_kind() -> None:
-    kinds = {"hexplane": Hexplane, "mlp": Mlp, "skeleton": Skeleton, "trajectory": Trajectory}
+    kinds = {"hexplane": Hexplane, "mlp": Mlp, "control_nodes": Skeleton, "trajectory": Trajectory}
     for kind, expected in kinds.items():
         assert type(tiny_field(kind)) is expected
 
@@ -55,7 +55,9 @@ def test_the_generator_decides_everything() -> None:
         fields = [new_field(tiny_options(kind), tiny_setup(), torch.Generator().manual_seed(s)) for s in (1, 1, 2)]
         first, second, other = (f.learned.values() for f in fields)
         assert all(torch.equal(x, second[name]) for name, x in first.items())
-        assert kind in ("skeleton", "trajectory") or any(not torch.equal(x, other[name]) for name, x in first.items())
+        assert kind in ("control_nodes", "trajectory") or any(
+            not torch.equal(x, other[name]) for name, x in first.items()
+        )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -66,7 +68,7 @@ def test_some_rows_are_moved_as_among_all(kind: str) -> None:
     for name, x in vars(everything).items():
         assert x is not None
         torch.testing.assert_close(getattr(some, name), x[rows], rtol=0, atol=1e-6)
-    if kind == "skeleton":
+    if kind == "control_nodes":
         (slope,) = torch.autograd.grad(some.means.sum(), means)
         assert set(torch.nonzero(slope.any(1))[:, 0].tolist()) == {2, 3, 7}
     assert len(field.offsets(means, 0.37, rows[:0]).means) == 0

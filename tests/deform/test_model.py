@@ -68,7 +68,7 @@ def new_scene(
 ) -> DynamicScene:
     """A dynamic model; its field is a straight line per Gaussian unless told otherwise."""
     line = TrajectoryField(polynomial=1, fourier=0, move_rotations=False, move_scales=False)
-    defaults = {"deform": line, "seeds": 0, "motion_sparsity": 0.0, "still_below": THRESHOLD}
+    defaults = {"deform": line, "num_random_moving": 0, "motion_sparsity": 0.0, "freeze_below_px": THRESHOLD}
     capture = Surroundings4D(times, [camera()], 1.0, residuals, cameras_stay)
     schedule = DeformSchedule(FINE, FINE, FULL, FINE, (SPLIT,), Rates(STEPS))
     model = DynamicModel.model_validate(defaults | options)
@@ -151,7 +151,7 @@ def test_what_a_still_model_cannot_explain_moves() -> None:
 
 
 @pytest.mark.parametrize(
-    ("errors", "moving_error", "rows"),
+    ("errors", "motion_threshold", "rows"),
     [
         (ERRORS, 0.5, []),
         ((0.0, 0.0, 0.0, 0.06, 0.3, 0.3, 0.3, 0.3, 0.4), 0.1, [4, 5, 6, 7, 8]),  # the groups part at 0.06
@@ -163,9 +163,11 @@ def test_what_a_still_model_cannot_explain_moves() -> None:
         ((0.0,) * 8 + (0.01,), 0.0, [8]),
     ],
 )
-def test_small_errors_are_no_motion(errors: tuple[float, ...], moving_error: float, rows: list[int]) -> None:
+def test_small_errors_are_no_motion(errors: tuple[float, ...], motion_threshold: float, rows: list[int]) -> None:
     """Where nothing stands out the model stays static: the same Gaussians, nothing added, no field."""
-    scene = new_scene(residuals=lambda _: alike(torch.tensor(errors)), moving_error=moving_error, seeds=5)
+    scene = new_scene(
+        residuals=lambda _: alike(torch.tensor(errors)), motion_threshold=motion_threshold, num_random_moving=5
+    )
     gaussians = flat_cloud()
     result = scene.edit(gaussians, FINE)
     if rows:
@@ -178,7 +180,7 @@ def test_small_errors_are_no_motion(errors: tuple[float, ...], moving_error: flo
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_seeds_move_too(kind: str) -> None:
-    scene = new_scene(residuals=lambda _: alike(torch.tensor(ERRORS)), seeds=4, deform=tiny_options(kind))
+    scene = new_scene(residuals=lambda _: alike(torch.tensor(ERRORS)), num_random_moving=4, deform=tiny_options(kind))
     gaussians = flat_cloud()
     result = scene.edit(gaussians, FINE)
     assert result is not None
@@ -197,7 +199,7 @@ def test_seeds_move_too(kind: str) -> None:
 def test_the_filter_of_a_still_model_counts_the_seeds() -> None:
     """A checkpoint of that very step has as many values as Gaussians."""
     still = StaticScene([camera()])
-    scene = new_scene(residuals=lambda _: alike(torch.tensor(ERRORS)), still=still, seeds=4)
+    scene = new_scene(residuals=lambda _: alike(torch.tensor(ERRORS)), still=still, num_random_moving=4)
     gaussians = flat_cloud()
     scene.gaussians_at(gaussians, picture(0.3), FINE)
     assert len(scene.state()["filter_std"]) == 9
@@ -222,10 +224,10 @@ def test_the_field_learns_after_the_fine_phase(kind: str) -> None:
     assert (drawn_at(scene, gaussians, 0.7).means[:, 1] < gaussians.means[:, 1]).all()
     assert set(drawn.penalties) == {"motion sparsity"} | {
         "hexplane": {"plane smoothness"},
-        "skeleton": {"node acceleration", "node rigidity"},
+        "control_nodes": {"node acceleration", "node rigidity"},
     }.get(kind, set())
     assert gaussians.means.grad is not None
-    tolerance = 0.01 if kind == "skeleton" else 1e-6  # nodes turn what follows them
+    tolerance = 0.01 if kind == "control_nodes" else 1e-6  # nodes turn what follows them
     torch.testing.assert_close(gaussians.means.grad, torch.tensor([0.0, 2, 0]).expand(9, 3), rtol=0, atol=tolerance)
 
 
@@ -267,7 +269,7 @@ def test_bad_gradients_of_the_field_are_counted() -> None:
 
 def test_it_trains_on_the_window() -> None:
     """Which opens where motion begins: before, all views are trained on."""
-    scene = new_scene(times=tuple(i / 100 for i in range(101)), first_views=0.1)
+    scene = new_scene(times=tuple(i / 100 for i in range(101)), time_window=0.1)
     assert all(scene.trains_on(time, step) for time in (0.0, 0.5, 1.0, None) for step in (1, FINE, FULL))
     assert scene.trains_on(0.5, FINE + 1)
     assert not scene.trains_on(0.0, FINE + 1)
@@ -306,7 +308,7 @@ def test_time_jitter_shrinks_and_stays_in_the_clip() -> None:
 @pytest.mark.parametrize(("in_place", "kept"), [(True, [2, 3]), (False, [0, 2, 3])])
 def test_where_cameras_stay_nothing_moves_that_pictures_show_still(in_place: bool, kept: list[int]) -> None:
     """Four move by far, the fourth least; the pictures say of two that they are like the median."""
-    still, moving = 0.2 * DynamicModel().moving_error, 0.3 * DynamicModel().moving_error
+    still, moving = 0.2 * DynamicModel().motion_threshold, 0.3 * DynamicModel().motion_threshold
     errors = alike(torch.tensor([still, moving, moving, moving]))
     gaussians = flat_cloud(4)
     scene = begun(gaussians, residuals=lambda _: errors, cameras_stay=in_place)
@@ -372,13 +374,13 @@ def test_freezing_goes_on_at_the_next_split() -> None:
 def test_every_kind_can_be_frozen(kind: str) -> None:
     """Also where a network moves everything: what is left moves as before, except that nodes come and go."""
     gaussians = flat_cloud()
-    scene = begun(gaussians, deform=tiny_options(kind), still_below=1.0)
+    scene = begun(gaussians, deform=tiny_options(kind), freeze_below_px=1.0)
     assert scene.field is not None
     drawn_at(scene, gaussians, 0.4)
     stir(scene.field, 0.02)
     old = drawn_at(scene, gaussians, 0.4)
     scene.after_step(gaussians, SPLIT, None)
-    if kind != "skeleton":
+    if kind != "control_nodes":
         new = drawn_at(scene, gaussians, 0.4)
         torch.testing.assert_close(new.means[scene.rows], old.means[scene.rows], rtol=0, atol=1e-5)
     assert drawn_at(scene, gaussians, 0.4).means.isfinite().all()

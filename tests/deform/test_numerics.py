@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dyngs.build import assemble
 from dyngs.camera import Cameras
-from dyngs.config import DynamicModel, HexplaneField, SkeletonField, StaticModel, TrainConfig
+from dyngs.config import ControlNodesField, DynamicModel, HexplaneField, StaticModel, TrainConfig
 from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
 from dyngs.deform.hexplane import Hexplane, time_rows
@@ -107,7 +107,7 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     """Trained on together from the first step on; planes and keys have the least that there can be, two."""
     config = busy_config(timed(tmp_path / "capture", [0.0, 1.0, 0.0, 1.0, 1.0]), tmp_path, kind)
     assert isinstance(config.model, DynamicModel)
-    automatic = {"hexplane": {"time_resolution": 0}, "skeleton": {"pieces": 0}}.get(kind, {})
+    automatic = {"hexplane": {"time_resolution": 0}, "control_nodes": {"pieces": 0}}.get(kind, {})
     model = config.model.model_copy(update={"deform": config.model.deform.model_copy(update=automatic)})
     trainer = assemble(config.model_copy(update={"model": model}))
     seen = {trainer.step().picture.time for _ in range(12)}
@@ -125,7 +125,7 @@ def test_10000_training_times() -> None:
     assert time_rows(HexplaneField(), LONG) == MAX_KEY_TIMES
     assert time_rows(HexplaneField(time_resolution=LONG // 2), LONG) == LONG // 2
     setup = FieldSetup(torch.zeros(3), torch.ones(3), LONG, 3, 1.0)
-    skeleton = new_field(SkeletonField(nodes=2), setup, torch.Generator())
+    skeleton = new_field(ControlNodesField(nodes=2), setup, torch.Generator())
     assert isinstance(skeleton, Skeleton)
     assert skeleton.num_pieces == MAX_KEY_TIMES
     times = tuple(i / (LONG - 1) for i in range(LONG))
@@ -249,7 +249,7 @@ def test_gaussians_far_outside_the_box(distance: float) -> None:
     torch.testing.assert_close(values(planes.offsets(means, 0.4)), values(planes.offsets(border, 0.4)))
     if distance > 1e6:
         return
-    for kind in ("mlp", "skeleton", "trajectory"):
+    for kind in ("mlp", "control_nodes", "trajectory"):
         field = stirred_field(kind)
         field.select(torch.arange(9), torch.zeros(9, dtype=torch.bool))
         assert values(field.offsets(means, 0.4)).isfinite().all()
@@ -321,7 +321,7 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
 
 def test_a_picture_that_a_still_model_explains(capture: Path) -> None:
     """No error stands out: nothing moves, no seeds, no field; the run goes on static."""
-    trainer = fine_trainer(capture, "skeleton", moving_error=10.0)
+    trainer = fine_trainer(capture, "control_nodes", motion_threshold=10.0)
     assert isinstance(trainer.model, DynamicScene)
     assert trainer.model.field is None
     assert len(trainer.optimizer.parameters) == len(reference_set(capture))
@@ -332,7 +332,7 @@ def test_no_seeds(capture: Path) -> None:
     """Just the Gaussians that were there move."""
     sizes, moving = [], []
     for seeds in (12, 0):
-        trainer = assemble(busy_config(capture, capture, "trajectory", seeds=seeds))
+        trainer = assemble(busy_config(capture, capture, "trajectory", num_random_moving=seeds))
         for _ in range(8):
             trainer.step()
         sizes.append(len(trainer.optimizer.parameters))
@@ -344,7 +344,7 @@ def test_no_seeds(capture: Path) -> None:
 
 def reference_set(capture: Path) -> Gaussians:
     """What a static run of as many steps has."""
-    config = busy_config(capture, capture, "skeleton")
+    config = busy_config(capture, capture, "control_nodes")
     trainer = assemble(config.model_copy(update={"model": StaticModel(sh_degree=1)}))
     for _ in range(10):
         trainer.step()

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import HEADS, cloud, stirred_field, tiny_setup
 from torch import Tensor
 
-from dyngs.config import SkeletonField
+from dyngs.config import ControlNodesField
 from dyngs.deform.field import Offsets
 from dyngs.deform.skeleton import Skeleton
 
@@ -25,7 +25,7 @@ MEANS_ONLY = dict.fromkeys(HEADS, False)
 def skeleton(nodes: int = 5, pieces: int = 4, num_times: int = 10, **options: object) -> Skeleton:
     """An untrained one."""
     return Skeleton(
-        SkeletonField(nodes=nodes, pieces=pieces, **options),  # type: ignore[arg-type]
+        ControlNodesField(nodes=nodes, pieces=pieces, **options),  # type: ignore[arg-type]
         tiny_setup(num_times=num_times),
         torch.Generator(),
     )
@@ -253,7 +253,7 @@ def test_no_penalties_where_none_are_wanted_or_possible() -> None:
 
 
 def test_the_place_of_a_gaussian_matters() -> None:
-    field = stirred_field("skeleton")
+    field = stirred_field("control_nodes")
     found = outputs(field.offsets(cloud().means, 0.6))
     assert not torch.allclose(found[0], found[1])
     assert not torch.allclose(found, outputs(field.offsets(cloud().means, 0.1)))

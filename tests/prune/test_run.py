@@ -8,7 +8,7 @@ import pytest
 from moving_scene import write_moving_run
 from tiny_fields import busy_config, write_tiny_capture
 
-from dyngs.config import CompactConfig
+from dyngs.config import PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
@@ -17,20 +17,20 @@ from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.train.trainer import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-ASKED = ("compact.prune=0.5", "compact.max_loss=100", "compact.steps=6", "compact.masks=3", "run.threads=1")
+ASKED = ("prune.share=0.5", "prune.max_loss=100", "prune.steps=6", "prune.mask_times=3", "run.threads=1")
 
 
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
-    return train(busy_config(write_tiny_capture(folder / "capture"), folder / "run", "skeleton"))
+    return train(busy_config(write_tiny_capture(folder / "capture"), folder / "run", "control_nodes"))
 
 
 def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -> None:
     small = compact_run(run_dir, tmp_path / "small", ASKED)
-    config = busy_config(load_resolved(run_dir).data.root, tmp_path / "whole", "skeleton")
-    stage = CompactConfig(prune=0.5, max_loss=100, steps=6, masks=3)
-    whole = train(config.model_copy(update={"compact": stage}))
+    config = busy_config(load_resolved(run_dir).data.root, tmp_path / "whole", "control_nodes")
+    stage = PruneConfig(share=0.5, max_loss=100, steps=6, mask_times=3)
+    whole = train(config.model_copy(update={"prune": stage}))
     assert checkpoint_paths(small)[-1].read_bytes() == checkpoint_paths(whole)[-1].read_bytes()
     assert load_run(run_dir).step == 24, "the first run is as it was"
     assert (small / "log.jsonl").read_text().count("\n") >= 30
@@ -38,7 +38,7 @@ def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -
 
 def test_a_compacted_run_can_be_compacted(run_dir: Path, tmp_path: Path) -> None:
     once = compact_run(run_dir, tmp_path / "once", ASKED)
-    twice = compact_run(once, tmp_path / "twice", ("compact.prune=0.5", "compact.max_loss=100", "compact.steps=2"))
+    twice = compact_run(once, tmp_path / "twice", ("prune.share=0.5", "prune.max_loss=100", "prune.steps=2"))
     sizes = [len(load_run(folder).scene) for folder in (run_dir, once, twice)]
     assert sizes[0] > sizes[1] > sizes[2]
     assert load_run(twice).step == 32
@@ -76,17 +76,17 @@ def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:
     taken.mkdir()
     (taken / "file").write_text("mine")
     for out, overrides, message in (
-        (taken, ["compact.prune=0.5"], "exists already; give another --out"),
-        (taken / "file", ["compact.prune=0.5"], "exists already"),
-        (run_dir, ["compact.prune=0.5"], "exists already"),
-        (tmp_path / "new", ["compact.prune=1"], "compact.prune"),
-        (tmp_path / "new", ["compact.prune=-0.1"], "compact.prune"),
-        (tmp_path / "new", ["compact.prune=0"], "nothing to do"),
-        (tmp_path / "new", ["compact.score=beauty"], "compact.score"),
+        (taken, ["prune.share=0.5"], "exists already; give another --out"),
+        (taken / "file", ["prune.share=0.5"], "exists already"),
+        (run_dir, ["prune.share=0.5"], "exists already"),
+        (tmp_path / "new", ["prune.share=1"], "prune.share"),
+        (tmp_path / "new", ["prune.share=-0.1"], "prune.share"),
+        (tmp_path / "new", ["prune.share=0"], "nothing to do"),
+        (tmp_path / "new", ["prune.score=beauty"], "prune.score"),
     ):
         with pytest.raises(DyngsError, match=message):
             compact_run(run_dir, out, overrides)
     with pytest.raises(DyngsError, match="no checkpoints there"):
-        compact_run(tmp_path / "nowhere", tmp_path / "new", ["compact.prune=0.5"])
+        compact_run(tmp_path / "nowhere", tmp_path / "new", ["prune.share=0.5"])
     assert not (tmp_path / "new").exists()
     assert (taken / "file").read_text() == "mine"

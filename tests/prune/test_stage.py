@@ -13,10 +13,10 @@ from torch import Tensor
 from dyngs.build import assemble
 from dyngs.camera import Cameras
 from dyngs.config import (
-    CompactConfig,
     Config,
     DataConfig,
     McmcStrategy,
+    PruneConfig,
     RandomInit,
     RunConfig,
     StaticModel,
@@ -28,25 +28,25 @@ from dyngs.deform.model import DynamicScene
 from dyngs.deform.trained import TrainedScene
 from dyngs.prune.stage import Compaction, compact_, distinct_cameras
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
-from dyngs.static.settled import Settled
+from dyngs.static.fixed import FixedDensifier
 from dyngs.train.step import Trainer
 from dyngs.train.trainer import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-STAGE = CompactConfig(prune=0.5, max_loss=100.0, steps=6, masks=3, mask_below=1.0)
+STAGE = PruneConfig(share=0.5, max_loss=100.0, steps=6, mask_times=3, mask_below=1.0)
 
 
-def moving_config(capture: Path, run_dir: Path, kind: str = "skeleton", stage: CompactConfig = STAGE) -> Config:
-    return busy_config(capture, run_dir, kind).model_copy(update={"compact": stage})
+def moving_config(capture: Path, run_dir: Path, kind: str = "control_nodes", stage: PruneConfig = STAGE) -> Config:
+    return busy_config(capture, run_dir, kind).model_copy(update={"prune": stage})
 
 
-def still_config(capture: Path, run_dir: Path, stage: CompactConfig = STAGE, **changes: object) -> Config:
+def still_config(capture: Path, run_dir: Path, stage: PruneConfig = STAGE, **changes: object) -> Config:
     return Config(
         data=DataConfig(root=capture),
         model=StaticModel(sh_degree=1, filter_3d=True),
         init=RandomInit(num_random=60),
         train=TrainConfig(steps=8, log_every=1),
-        compact=stage,
+        prune=stage,
         run=RunConfig(dir=run_dir, threads=1),
     ).model_copy(update=changes)
 
@@ -103,14 +103,14 @@ def test_mcmc_stands_still_in_the_stage(still: Path, tmp_path: Path) -> None:
     before = len(trainer.optimizer.parameters)
     found = compact_(trainer)
     assert found.before == before
-    assert isinstance(trainer.densifier, Settled)
+    assert isinstance(trainer.densifier, FixedDensifier)
     for _ in range(4):
         trainer.step()
     assert len(trainer.optimizer.parameters) == found.after == before - before // 2
 
 
 def test_without_a_stage_nothing_changes(still: Path, tmp_path: Path) -> None:
-    config = still_config(still, tmp_path / "run", CompactConfig())
+    config = still_config(still, tmp_path / "run", PruneConfig())
     assert config.total_steps == 8
     assert load_run(train(config)).step == 8
 
@@ -134,7 +134,7 @@ def _all_rows_of(some: Tensor, everything: Tensor) -> bool:
 
 
 def test_a_dear_prune_backs_off(moving: Path, tmp_path: Path) -> None:
-    trainer = trained(moving_config(moving, tmp_path, stage=STAGE.model_copy(update={"prune": 0.9, "max_loss": 0.0})))
+    trainer = trained(moving_config(moving, tmp_path, stage=STAGE.model_copy(update={"share": 0.9, "max_loss": 0.0})))
     found = compact_(trainer)
     assert found.share < 0.9
     assert found.loss <= 0.0

@@ -337,7 +337,7 @@ def test_headers_of_other_types_are_refused(tmp_path: Path, key: str, value: obj
 def test_what_does_not_fit_is_named(
     tmp_path: Path, name: str, change: Callable[[torch.Tensor], torch.Tensor], said: str
 ) -> None:
-    tensors, model = contents("skeleton")
+    tensors, model = contents("control_nodes")
     save_config(Config(data=DataConfig(root=tmp_path), model=model), tmp_path / RESOLVED_NAME)
     path = tmp_path / "checkpoints" / "step_0000007.safetensors"
     path.parent.mkdir()

@@ -75,7 +75,7 @@ Command = Callable[[Path, Path, Path], object]
 COMMANDS: dict[str, Command] = {
     "train": lambda capture, run, out: train(config_of(capture, out)),
     "compact": lambda capture, run, out: compact_run(
-        run, out, ("compact.prune=0.5", "compact.max_loss=100", "compact.steps=1", "run.threads=1")
+        run, out, ("prune.share=0.5", "prune.max_loss=100", "prune.steps=1", "run.threads=1")
     ),
     "export": lambda capture, run, out: write_compact(run, out),
     "resume": lambda capture, run, out: train(config_of(capture, out), resume_from=out),

@@ -174,6 +174,20 @@ def test_the_cap_holds_and_the_best_come_first(seed: int, cap: int, n: int) -> N
         assert score[chosen].min() >= score[wanted & ~chosen].max()
 
 
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31), n=st.integers(1, 40))
+def test_without_growth_gaussians_are_only_removed(seed: int, n: int) -> None:
+    """The same ones as with a cap that leaves no room."""
+    generator = torch.Generator().manual_seed(seed)
+    scales, opacities, score = (torch.rand(n, generator=generator) * high + 1e-3 for high in (2.0, 0.02, 4e-4))
+    gaussians = _gaussians(scales.tolist(), opacities.tolist())
+    plan = plan_edit(gaussians, score, DefaultStrategy(grow=False), EXTENT, 1.0)
+    capped = plan_edit(gaussians, score, DefaultStrategy(max_gaussians=1), EXTENT, 1.0)
+    assert not (plan.cloned | plan.split).any()
+    assert torch.equal(plan.kept, capped.kept)
+    assert DefaultStrategy(grow=False).growth_limit == 0
+
+
 @pytest.mark.parametrize(("cap", "expected"), [(3, 4), (5, 5), (9, 8)])
 def test_a_later_limit_replaces_the_cap(cap: int, expected: int) -> None:
     densifier = _densifier(DefaultStrategy(max_gaussians=6))

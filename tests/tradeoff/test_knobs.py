@@ -14,9 +14,9 @@ from dyngs.tradeoff.knobs import KNOBS, Traits, Variant, parse_settings, single_
 
 VARIANTS = st.builds(
     Variant,
-    colour=st.sampled_from([None, "dcac"]),
+    colour=st.sampled_from([None, "network"]),
     prune=st.sampled_from([0.0, 0.5, 0.7]),
-    masks=st.sampled_from([0, 6]),
+    mask_times=st.sampled_from([0, 6]),
     sh_degree=st.sampled_from([None, 0, 1]),
     storage=st.sampled_from([None, "auto", 1.0]),
     mode=st.sampled_from([None, "antialiased"]),
@@ -27,7 +27,13 @@ VARIANTS = st.builds(
     field_step=st.sampled_from([1.0, 4.0]),
 )
 DYNAMIC = Traits(
-    sh_degree=2, mode="classic", alpha_min=1 / 255, transmittance_min=1e-4, masks=0, colour="sh", field="skeleton"
+    sh_degree=2,
+    mode="classic",
+    alpha_min=1 / 255,
+    transmittance_min=1e-4,
+    mask_times=0,
+    colour="sh",
+    field="control_nodes",
 )
 
 
@@ -71,18 +77,20 @@ def test_the_knob_of_a_variant() -> None:
 def test_single_changes_leave_out_what_a_run_is_already() -> None:
     names = [v.name for v in single_changes(parse_settings([], trains=True), DYNAMIC, 0)]
     assert len(names) == len(set(names))
-    assert {"sh_degree=0", "sh_degree=1", "masks=6", "mode=antialiased", "colour=dcac", "field=mlp"} <= set(names)
-    assert not {"sh_degree=2", "mode=classic", "colour=sh", "field=skeleton"} & set(names)
+    assert {"sh_degree=0", "sh_degree=1", "mask_times=6", "mode=antialiased", "colour=network", "field=mlp"} <= set(
+        names
+    )
+    assert not {"sh_degree=2", "mode=classic", "colour=sh", "field=control_nodes"} & set(names)
     still = replace(DYNAMIC, sh_degree=0, field=None)
     fewer = [v.name for v in single_changes(parse_settings([], trains=True), still, 0)]
-    assert not any(name.startswith(("masks", "sh_degree", "field")) or "field_step" in name for name in fewer)
+    assert not any(name.startswith(("mask_times", "sh_degree", "field")) or "field_step" in name for name in fewer)
 
 
 def test_own_values_are_the_start() -> None:
     settings = parse_settings(["alpha_min=0.008,0.016"], trains=False)
     assert single_changes(settings, replace(DYNAMIC, alpha_min=0.008), 0) == [Variant(alpha_min=0.016)]
-    settings = parse_settings(["masks=6,16"], trains=False)
-    assert single_changes(settings, replace(DYNAMIC, masks=6), 0) == [Variant(masks=16)]
+    settings = parse_settings(["mask_times=6,16"], trains=False)
+    assert single_changes(settings, replace(DYNAMIC, mask_times=6), 0) == [Variant(mask_times=16)]
 
 
 def test_steps_of_the_field_are_those_of_storage() -> None:
@@ -103,11 +111,11 @@ def test_settings_keep_the_order_of_their_values() -> None:
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("prun", "no such knob; there are prune, masks, sh_degree"),
+        ("prun", "no such knob; there are prune, mask_times, sh_degree"),
         ("prune=1.5", "--vary prune=1.5: give a number from 0.01 to 0.99"),
         ("prune=", "give a number"),
         ("prune=nan", "give a number"),
-        ("masks=2.5", "give a whole number from 2 to 1000"),
+        ("mask_times=2.5", "give a whole number from 2 to 1000"),
         ("storage=fine", "give a number from 0.01 to 64 or auto"),
         ("mode=smooth", "give classic or antialiased"),
         ("colour", "add --train"),

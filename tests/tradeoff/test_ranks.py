@@ -18,7 +18,7 @@ from dyngs.train.trainer import num_cores
 
 VARIANTS = st.builds(
     Variant,
-    colour=st.sampled_from([None, "dcac"]),
+    colour=st.sampled_from([None, "network"]),
     prune=st.sampled_from([0.0, 0.5, 0.7]),
     finetune=st.sampled_from([0, 9]),
     sh_degree=st.sampled_from([None, 0]),

@@ -25,7 +25,7 @@ from dyngs.tradeoff.sweep import Plan, figures_of, sweep
 from dyngs.train.trainer import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-KNOBS = ("prune=0.5", "masks=3", "sh_degree=0", "storage=2", "field_step=64", "alpha_min=0.02", "scale=0.5")
+KNOBS = ("prune=0.5", "mask_times=3", "sh_degree=0", "storage=2", "field_step=64", "alpha_min=0.02", "scale=0.5")
 PLAN = Plan(parse_settings(KNOBS, trains=False), finetune=2, combine=2, rounds=1, threads=1)
 
 
@@ -110,7 +110,7 @@ def test_the_report_has_every_point(points: list[Point], models: Models) -> None
 
 
 def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Point], models: Models) -> None:
-    variant = Variant(prune=0.5, masks=3, storage=2.0, mode="antialiased", alpha_min=0.02, scale=0.5)
+    variant = Variant(prune=0.5, mask_times=3, storage=2.0, mode="antialiased", alpha_min=0.02, scale=0.5)
     folder = write_chosen(models, variant)
     chosen = load_run(folder)
     assert is_compact(folder)
@@ -128,7 +128,7 @@ def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Point], models:
     ("variant", "kind", "size"),
     [
         (Variant(field_size=0.5), "trajectory", {"fourier": 2}),
-        (Variant(field="skeleton", field_size=0.25), "skeleton", {"nodes": 128}),
+        (Variant(field="control_nodes", field_size=0.25), "control_nodes", {"nodes": 128}),
         (Variant(field="hexplane"), "hexplane", {"channels": 32}),
     ],
 )
@@ -146,7 +146,7 @@ def test_another_field_moves_the_same(
 
 
 def test_masks_that_a_run_has_stay(points: list[Point], models: Models, tmp_path: Path) -> None:
-    masked = Models(models.out / "training" / Variant(masks=3, finetune=2).slug, tmp_path, 1)
+    masked = Models(models.out / "training" / Variant(mask_times=3, finetune=2).slug, tmp_path, 1)
     assert traits(masked.run_dir).masks == 3
     for variant in (Variant(prune=0.5), Variant(prune=0.5, finetune=1)):
         scene = load_run(masked.folder(variant)).scene

@@ -49,6 +49,13 @@ def test_resets_leave_time_to_recover(steps: int, white: bool) -> None:
     assert schedule.stop <= max(1, steps // 2 + 1)
 
 
+def test_without_resets_nothing_is_lowered_or_too_large() -> None:
+    schedule = densify_schedule(DefaultStrategy(reset_every=None), 5000, white_background=True)
+    assert schedule.resets == ()
+    assert schedule.prune_scale_after == 5000
+    assert densify_schedule(DefaultStrategy(reset_every=10**6), 5000, white_background=True).resets == ()
+
+
 def test_short_runs() -> None:
     schedule = densify_schedule(DefaultStrategy(), 2000, white_background=False)
     assert (schedule.start, schedule.stop, schedule.resets) == (100, 1000, (400,))
@@ -101,37 +108,39 @@ def test_the_filter_is_refreshed_after_densification_only() -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(st.integers(1, 30_000), st.floats(0, 1), st.floats(0, 1))
-def test_phases_of_a_dynamic_model_come_in_order(steps: int, coarse: float, all_views_at: float) -> None:
+def test_phases_of_a_dynamic_model_come_in_order(steps: int, coarse: float, time_window_full_at: float) -> None:
     """Coarse, fine, all times, splits; each within the run, and never is there none before motion begins."""
-    model = DynamicModel(coarse=coarse, all_views_at=all_views_at)
+    model = DynamicModel(motion_from=coarse, time_window_full_at=time_window_full_at)
     schedule = deform_schedule(model, Rates(steps))
     assert schedule.rates.steps == steps
     assert 1 <= schedule.fine <= schedule.full <= steps
     assert all(schedule.full < split <= steps for split in schedule.splits)
     assert list(schedule.splits) == sorted(set(schedule.splits))
-    assert deform_schedule(model.model_copy(update={"still_below": 0.0}), Rates(steps)).splits == ()
+    assert deform_schedule(model.model_copy(update={"freeze_below_px": 0.0}), Rates(steps)).splits == ()
 
 
 def test_phases_of_runs_of_usual_lengths() -> None:
     """Splits come after a tenth, three tenths and a half of the steps that see all times."""
-    schedule = deform_schedule(DynamicModel(coarse=0.13, all_views_at=0.4), Rates(20_000))
+    schedule = deform_schedule(DynamicModel(motion_from=0.13, time_window_full_at=0.4), Rates(20_000))
     assert (schedule.fine, schedule.full, schedule.splits) == (2600, 8000, (9200, 11_600, 14_000))
-    assert deform_schedule(DynamicModel(all_views_at=0.69), Rates(1000)).splits == (721, 783, 845)
+    assert deform_schedule(DynamicModel(time_window_full_at=0.69), Rates(1000)).splits == (721, 783, 845)
     assert deform_schedule(DynamicModel(), Rates(1)).fine == 1
 
 
 @pytest.mark.parametrize(("steps", "fine"), [(300, 100), (2000, 666), (5000, 1000), (10_000, 1300)])
 def test_short_runs_stay_still_for_longer(steps: int, fine: int) -> None:
     """1000 steps, but no more than a third of the run, unless a larger share is asked for."""
-    assert deform_schedule(DynamicModel(coarse=0.13), Rates(steps)).fine == fine
-    assert deform_schedule(DynamicModel(coarse=0.5), Rates(steps)).fine == steps // 2
+    assert deform_schedule(DynamicModel(motion_from=0.13), Rates(steps)).fine == fine
+    assert deform_schedule(DynamicModel(motion_from=0.5), Rates(steps)).fine == steps // 2
 
 
 @pytest.mark.parametrize(
     ("coarsest", "expected"), [(1, {1}), (2, {2, 1}), (8, {8, 4, 2, 1})], ids=["never", "one level", "three levels"]
 )
 def test_pictures_sharpen_in_even_steps(coarsest: int, expected: set[int]) -> None:
-    options = TrainConfig.model_validate({"steps": 1000, "coarsest": coarsest, "sharpen_from": 0.3, "sharpen_to": 0.6})
+    options = TrainConfig.model_validate(
+        {"steps": 1000, "initial_downscale": coarsest, "resolution_grows_from": 0.3, "resolution_full_at": 0.6}
+    )
     divisors = [picture_divisor(options, step) for step in range(1, 1001)]
     assert set(divisors) == expected
     assert divisors == sorted(divisors, reverse=True)
@@ -144,5 +153,5 @@ def test_pictures_sharpen_in_even_steps(coarsest: int, expected: set[int]) -> No
 def test_pictures_may_sharpen_at_once() -> None:
     """Also where the last halving is asked for before the first."""
     for to in (0.5, 0.2):
-        options = TrainConfig(steps=10, coarsest=4, sharpen_from=0.5, sharpen_to=to)
+        options = TrainConfig(steps=10, initial_downscale=4, resolution_grows_from=0.5, resolution_full_at=to)
         assert [picture_divisor(options, step) for step in range(1, 11)] == [4] * 4 + [1] * 6

@@ -17,8 +17,8 @@ from dyngs.config import (
     AutoColour,
     Config,
     DataConfig,
-    DcacColour,
     DefaultStrategy,
+    NetworkColour,
     RandomInit,
     RunConfig,
     StaticModel,
@@ -150,7 +150,7 @@ def test_a_model_may_change_the_set(capture: Path) -> None:
 
 MEASURED_AFTER = 24
 COLOURS = {
-    "dcac": DcacColour(width=8, depth=1, warm_up=5, opacity_entropy=1e-3),
+    "network": NetworkColour(width=8, depth=1, warm_up=5, opacity_entropy=1e-3),
     "none pays": AutoColour(measure_at=0.6, tolerance=300.0),
     "some pay": AutoColour(measure_at=0.6, tolerance=0.0),
 }
@@ -163,7 +163,7 @@ def seven_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _coloured(capture: Path, colour: DcacColour | AutoColour, strategy: DefaultStrategy | None = None) -> Trainer:
+def _coloured(capture: Path, colour: NetworkColour | AutoColour, strategy: DefaultStrategy | None = None) -> Trainer:
     return assemble(
         Config(
             data=DataConfig(root=capture),
@@ -225,7 +225,7 @@ def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> 
 
 def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> None:
     """And what was trained is drawn with it."""
-    trainer = _coloured(seven_views, COLOURS["dcac"])
+    trainer = _coloured(seven_views, COLOURS["network"])
     for _ in range(30):
         trainer.step()
     assert trainer.optimizer.parameters.sh_degree == 0

@@ -279,7 +279,7 @@ def test_a_resumed_moving_run_equals_an_uninterrupted_one(
 @pytest.mark.parametrize("steps", [2, 8, 11, 20], ids=["coarse", "begin", "fine", "split"])
 def test_what_is_loaded_is_what_the_trainer_draws(moving_capture: Path, tmp_path: Path, kind: str, steps: int) -> None:
     """At any time, with the 3D filter."""
-    config = busy_config(moving_capture, tmp_path, kind, filter_3d=True, time_jitter=0.0, still_below=0.1)
+    config = busy_config(moving_capture, tmp_path, kind, filter_3d=True, time_jitter=0.0, freeze_below_px=0.1)
     trainer = assemble(config)
     for _ in range(steps):
         trainer.step()
@@ -299,7 +299,7 @@ def test_what_is_loaded_is_what_the_trainer_draws(moving_capture: Path, tmp_path
 def test_where_nothing_moves_no_field_is_kept(tmp_path: Path, kind: str) -> None:
     """A capture with times of a scene that stands still: after the split it is static, in the run and on disk."""
     capture = write_timed_capture(tmp_path / "capture")
-    run = train(busy_config(capture, tmp_path / "run", kind, still_below=1e6))
+    run = train(busy_config(capture, tmp_path / "run", kind, freeze_below_px=1e6))
     assert [record["num_moving"] > 0 for record in _log(run)] == [8 <= step <= 14 for step in range(1, 25)]
     assert load_run(run).scene.is_still
     tensors = load_checkpoint(checkpoint_paths(run)[-1]).part("model")
@@ -311,11 +311,11 @@ def test_where_a_still_model_explains_all_the_run_stays_static(
     moving_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int
 ) -> None:
     """No seeds, no field, resumed or not, as if no error were large enough."""
-    changes = {"moving_error": 10.0, "first_views": 1.0}
-    whole = train(busy_config(moving_capture, tmp_path / "whole", "skeleton", **changes))
+    changes = {"motion_threshold": 10.0, "time_window": 1.0}
+    whole = train(busy_config(moving_capture, tmp_path / "whole", "control_nodes", **changes))
     assert {record["num_moving"] for record in _log(whole)} == {0}
     assert load_checkpoint(checkpoint_paths(whole)[-1]).part("model").keys() == {"times"}
-    config = busy_config(moving_capture, tmp_path / "parts", "skeleton", **changes)
+    config = busy_config(moving_capture, tmp_path / "parts", "control_nodes", **changes)
     with monkeypatch.context() as patch:
         _interrupt_after(stop_at, patch)
         with pytest.raises(KeyboardInterrupt):

@@ -27,11 +27,11 @@ class ShColour(ColourSection):
     )
 
 
-class DcacColour(ColourSection):
+class NetworkColour(ColourSection):
     """Three base values per Gaussian and one small network for all (MEGA, Zhang et al. 2024); no harmonics."""
 
-    kind: Literal["dcac"] = Field(
-        default="dcac",
+    kind: Literal["network"] = Field(
+        default="network",
         description="a base colour (DC) per Gaussian, to which one small network for all adds what depends on "
         "direction and time (AC; MEGA, Zhang et al. 2024); no harmonics",
     )

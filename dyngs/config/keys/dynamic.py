@@ -65,11 +65,11 @@ class MlpField(FieldSection):
     lr_decay: Fraction = Field(default=0.002, description="last over first learning rate")
 
 
-class SkeletonField(FieldSection):
+class ControlNodesField(FieldSection):
     """Control nodes that move along splines, which Gaussians around them follow (after SC-GS, Huang et al. 2024)."""
 
-    kind: Literal["skeleton"] = Field(
-        default="skeleton",
+    kind: Literal["control_nodes"] = Field(
+        default="control_nodes",
         description="sparse control nodes on cubic splines, which Gaussians follow (after SC-GS); no network",
     )
     nodes: int = Field(default=512, ge=1, description="number of control nodes")
@@ -106,7 +106,7 @@ class TrajectoryField(FieldSection):
     lr_decay: Fraction = Field(default=0.01, description="last over first learning rate")
 
 
-DeformField = HexplaneField | MlpField | TrajectoryField | SkeletonField
+DeformField = HexplaneField | MlpField | TrajectoryField | ControlNodesField
 
 
 class DynamicModel(SceneModel):
@@ -118,29 +118,31 @@ class DynamicModel(SceneModel):
     deform: Annotated[
         DeformField, Field(discriminator="kind", description="how the canonical Gaussians are moved over time")
     ] = HexplaneField()
-    coarse: Fraction = Field(
+    motion_from: Fraction = Field(
         default=0.13,
-        description="share of the run before motion is learned; a static model is trained on all views until then, "
-        "for 1000 steps or a third of the run at least (coarse stage of 4DGS)",
+        description="share of the run after which motion is learned; until then a static model is trained on all "
+        "views, for 1000 steps or a third of the run at least (coarse stage of 4DGS)",
     )
-    moving_error: float = Field(
+    motion_threshold: float = Field(
         default=0.04,
         ge=0,
         description="colour error (0 to 1) of the static model from which Gaussians are taken to move",
     )
-    seeds: int = Field(
+    num_random_moving: int = Field(
         default=4000, ge=0, description="random Gaussians that are added among the moving ones when motion begins"
     )
-    first_views: Fraction = Field(
+    time_window: Fraction = Field(
         default=1.0,
         description="share of the training views, around the middle of the clip, that motion is first learned on; "
         "1: all at once",
     )
-    first_views_until: Fraction = Field(
+    time_window_grows_from: Fraction = Field(
         default=0.0, description="share of the run after which more views are added to these"
     )
-    all_views_at: Fraction = Field(default=0.5, description="share of the run after which all views are trained on")
-    still_below: float = Field(
+    time_window_full_at: Fraction = Field(
+        default=0.5, description="share of the run after which all views are trained on"
+    )
+    freeze_below_px: float = Field(
         default=0.3,
         ge=0,
         description="Gaussians that move by less than this many px in the nearest training view are frozen; 0: none",

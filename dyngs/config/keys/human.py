@@ -17,13 +17,13 @@ class _OnTemplate(SceneModel):
     body: Path | None = Field(default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template")
     uv: Path | None = Field(default=None, description=".obj with the texture coordinates of body; null: its own")
     resolution: int = Field(default=128, ge=8, le=1024, description="texels per side of the template's texture atlas")
-    heights: tuple[float, ...] = Field(
+    scaffold_heights: tuple[float, ...] = Field(
         default=(0.0, 0.02),
         min_length=1,
         description="heights above the skin, m, at which copies of its surface carry one Gaussian per texel (the "
         "multi-scaffold of GHG)",
     )
-    carve: Fraction = Field(
+    min_silhouette_share: Fraction = Field(
         default=0.9,
         description="Gaussians above the lowest scaffold must lie inside at least this share of the silhouettes "
         "(visual hull); 0: all are kept",
@@ -68,24 +68,24 @@ class HumanModel(_OnTemplate):
     )
 
 
-class HumanNetModel(_OnTemplate):
+class HumanPredictorModel(_OnTemplate):
     """A network that predicts people from a few pictures, trained on others (docs/people_network.md)."""
 
-    kind: Literal["human_net"] = Field(
-        default="human_net",
+    kind: Literal["human_predictor"] = Field(
+        default="human_predictor",
         description="a network that predicts people from a few pictures, after GHG (docs/people_network.md)",
     )
-    heights: tuple[float, ...] = Field(
+    scaffold_heights: tuple[float, ...] = Field(
         default=(0.0, 0.02, 0.04),
         min_length=1,
-        description=str(_OnTemplate.model_fields["heights"].description),
+        description=str(_OnTemplate.model_fields["scaffold_heights"].description),
     )
-    views: int = Field(default=3, ge=1, description="source views: pictures of a person that it is predicted from")
-    inputs: int = Field(
-        default=6, ge=1, description="different sets of source views per person in training; their maps are cached"
+    source_views: int = Field(default=3, ge=1, description="pictures of a person that it is predicted from")
+    source_sets: int = Field(
+        default=6, ge=1, description="different choices of source views per person in training; their maps are cached"
     )
-    targets: int = Field(
-        default=2, ge=1, description="target views: pictures of one moment that a prediction is compared with per step"
+    target_views: int = Field(
+        default=2, ge=1, description="pictures of one moment that a prediction is compared with in each step"
     )
     widths: tuple[Annotated[int, Field(ge=8)], ...] = Field(
         default=(24, 32, 48, 64),

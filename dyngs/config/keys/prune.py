@@ -1,4 +1,4 @@
-"""Section ``compact``: a last stage of a run, with fewer Gaussians."""
+"""Section ``prune``: a last stage of a run, with fewer Gaussians."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pydantic import Field
 from dyngs.config.keys.section import Fraction, Section
 
 
-class CompactConfig(Section):
+class PruneConfig(Section):
     """A last stage with fewer Gaussians, after ``train.steps`` (docs/compact.md). Off where nothing is asked for."""
 
-    prune: float = Field(default=0.0, ge=0, lt=1, description="share of the Gaussians to remove; 0: none")
+    share: float = Field(default=0.0, ge=0, lt=1, description="share of the Gaussians to remove; 0: none")
     score: Literal["variation", "sensitivity", "contribution", "temporal"] = Field(
         default="sensitivity", description="importance of a Gaussian (docs/compact.md); the lowest are removed"
     )
@@ -22,7 +22,7 @@ class CompactConfig(Section):
         description="largest loss of PSNR on training pictures before fine-tuning, dB; fewer are removed where it is "
         "exceeded",
     )
-    masks: int = Field(
+    mask_times: int = Field(
         default=0, ge=0, description="key times of visibility masks over time (4DGS-1K); 0 or 1: no masks"
     )
     mask_below: float = Field(
@@ -38,4 +38,4 @@ class CompactConfig(Section):
     @property
     def is_wanted(self) -> bool:
         """Whether Gaussians are to be pruned or masked."""
-        return self.prune > 0 or self.masks > 1
+        return self.share > 0 or self.mask_times > 1

@@ -33,12 +33,23 @@ class DefaultStrategy(Section):
     every: int = Field(default=100, ge=1, description="steps between these changes; not scaled")
     prune_opacity: Fraction = Field(default=0.005, description="Gaussians with a lower opacity are removed")
     prune_scale: Positive = Field(default=0.1, description="of the extent, after the first opacity reset")
-    reset_every: int = Field(
+    reset_every: int | None = Field(
         default=3000,
         ge=1,
-        description=f"steps, {_OF_30000}, between resets of opacity to 0.01 at most; 400 steps of this run at least",
+        description=f"steps, {_OF_30000}, between resets of opacity to 0.01, 400 steps of this run at least; "
+        "null: never",
     )
+    grow: bool = Field(default=True, description="clone and split Gaussians; false: they are only removed")
     max_gaussians: int = Field(default=3_000_000, ge=1, description="no Gaussians are added beyond so many")
+
+    @property
+    def growth_limit(self) -> int:
+        """Number of Gaussians from which on none are added; 0: none ever are."""
+        return self.max_gaussians if self.grow else 0
+
+    def limited(self, cap: int) -> DefaultStrategy:
+        """Return this strategy with at most ``cap`` as its limit of growth."""
+        return self.model_copy(update={"max_gaussians": min(self.max_gaussians, cap)})
 
 
 class McmcStrategy(Section):
@@ -61,6 +72,43 @@ class McmcStrategy(Section):
     scale_reg: float = Field(default=0.01, ge=0, description="weight of the mean scale, world units")
     init_opacity: Fraction = Field(default=0.5, description="opacity of the first Gaussians")
     init_scale: Positive = Field(default=0.1, description="scale of the first Gaussians, in distances to neighbours")
+
+    @property
+    def growth_limit(self) -> int:
+        """Number of Gaussians from which on none are added."""
+        return self.max_gaussians
+
+    def limited(self, cap: int) -> McmcStrategy:
+        """Return this strategy with at most ``cap`` as its limit of growth."""
+        return self.model_copy(update={"max_gaussians": min(self.max_gaussians, cap)})
+
+
+class FixedStrategy(Section):
+    """The first Gaussians stay: none are added, none removed."""
+
+    kind: Literal["fixed"] = Field(default="fixed", description="the first Gaussians stay, none are added or removed")
+
+    @property
+    def start(self) -> int:
+        """Step after which Gaussians are added and removed: there is no such time."""
+        return 0
+
+    @property
+    def stop(self) -> int:
+        """Step from which their number is fixed."""
+        return 0
+
+    @property
+    def growth_limit(self) -> int:
+        """Number of Gaussians from which on none are added; 0: none ever are."""
+        return 0
+
+    def limited(self, cap: int) -> FixedStrategy:
+        """Return this strategy, which has no limit to lower."""
+        return self
+
+
+Strategy = DefaultStrategy | McmcStrategy | FixedStrategy
 
 
 class OptimConfig(Section):

@@ -13,11 +13,15 @@ class TrainConfig(Section):
     """Length, loss and logging of a run."""
 
     steps: int = Field(default=7000, ge=1, description="optimisation steps; all schedules follow this number")
-    coarsest: Literal[1, 2, 4, 8, 16] = Field(
+    initial_downscale: Literal[1, 2, 4, 8, 16] = Field(
         default=1, description="sides of the training pictures are divided by this at first; 1: full resolution"
     )
-    sharpen_from: Fraction = Field(default=0.4, description="share of the run after which that is halved first")
-    sharpen_to: Fraction = Field(default=0.7, description="share of the run after which pictures have their full size")
+    resolution_grows_from: Fraction = Field(
+        default=0.4, description="share of the run after which initial_downscale is halved for the first time"
+    )
+    resolution_full_at: Fraction = Field(
+        default=0.7, description="share of the run after which pictures have their full resolution"
+    )
     ssim_weight: Fraction = Field(
         default=0.2, description="weight w of 1 - SSIM; the loss is (1 - w) L1 + w (1 - SSIM)"
     )

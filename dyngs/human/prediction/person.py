@@ -68,7 +68,7 @@ def captured_person(capture: Capture, model: HumanModel, body: BodyTemplate) -> 
     given, views = capture.body["train"], capture.splits["train"]
     vertices, joints = rest_shape(body, torch.from_numpy(given.betas).float())
     texels = atlas_texels(body, model.resolution, vertices)
-    heights = tuple(sorted(set(model.heights)))
+    heights = tuple(sorted(set(model.scaffold_heights)))
     gaussians, anchors = texel_gaussians(texels, heights, 0)
     filmed = captured_motion(capture.root, given, views, joints)
     shape = {"shape_dirs": None, "joint_shape_dirs": None, "expression_dirs": None, "joint_expression_dirs": None}

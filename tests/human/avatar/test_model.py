@@ -23,7 +23,7 @@ from dyngs.train.step import Trainer
 from dyngs.train.trainer import train
 from dyngs.view.playing import at_rest, playing_motion
 
-BUSY = DefaultStrategy(start=1, stop=30_000, every=4, max_gaussians=1, prune_opacity=0.11)
+BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.11)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,13 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def tiny(capture: Path, run_dir: Path | None = None, steps: int = 10, **changes: object) -> Config:
-    model = {"resolution": 24, "heights": (0.0, 0.02), "carve": 0.0, "refine_from": 0.2, "sh_degree": 0} | changes
+    model = {
+        "resolution": 24,
+        "scaffold_heights": (0.0, 0.02),
+        "min_silhouette_share": 0.0,
+        "refine_from": 0.2,
+        "sh_degree": 0,
+    } | changes
     return Config(
         data=DataConfig(root=capture),
         model=HumanModel(**model),  # type: ignore[arg-type]
@@ -143,9 +149,9 @@ def test_penalties_are_zero_at_the_start_and_grow_with_offsets(capture: Path) ->
 def test_scaffolds_outside_the_silhouette_are_carved(capture: Path) -> None:
     counts = {}
     for height in (0.02, 0.5):
-        config = tiny(capture, heights=(0.0, height), carve=0.9)
+        config = tiny(capture, scaffold_heights=(0.0, height), min_silhouette_share=0.9)
         counts[height] = len(assemble(config).optimizer.parameters)
-    skin = len(assemble(tiny(capture, heights=(0.0,))).optimizer.parameters)
+    skin = len(assemble(tiny(capture, scaffold_heights=(0.0,))).optimizer.parameters)
     assert counts[0.5] - skin < 0.05 * skin
     assert counts[0.02] > counts[0.5]
 

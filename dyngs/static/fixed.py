@@ -9,7 +9,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.static.densify import EditResult
 
 
-class Settled:
+class FixedDensifier:
     """A ``Densifier`` that leaves everything as it is."""
 
     touches_all = False

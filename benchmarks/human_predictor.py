@@ -1,6 +1,6 @@
 """The network that predicts people, on synthetic ones that it has not seen, against mean textures.
 
-    python benchmarks/human_net.py FOLDER [--people 12] [--held-out 4] [--size 128] [--steps 2000] [--threads 1]
+    python benchmarks/human_predictor.py FOLDER [--people 12] [--held-out 4] [--size 128] [--steps 2000] [--threads 1]
 
 FOLDER keeps the captures and the run, which are used again. Printed per held-out person, for other cameras (`test`) and
 for another clip (`pose`): PSNR in the person's box / of the whole picture, from three pictures of one moment, of
@@ -22,7 +22,7 @@ from statistics import fmean
 
 import torch
 
-from dyngs.config import Config, HumanNetModel
+from dyngs.config import Config, HumanPredictorModel
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.evaluate.report import evaluate_run
 from dyngs.human.prediction.person import spread_views
@@ -59,7 +59,7 @@ def captures(folder: Path, seeds: range, options: HumanOptions) -> None:
 def trained(folder: Path, run: Path, steps: int, threads: int) -> Path:
     """The run of the network, made or gone on with where it is not finished."""
     words = [f"data.root={folder}", f"run.dir={run}", f"run.threads={threads}", f"train.steps={steps}"]
-    config: Config = load_config(packaged_preset("human_net"), words)
+    config: Config = load_config(packaged_preset("human_predictor"), words)
     return train(config, resume_from=run if checkpoint_paths(run) else None)
 
 
@@ -73,7 +73,7 @@ def baselines(network: Path, capture: Path, out: Path, count: int) -> list[Row]:
     """The bare template, coloured without the network."""
     config, model = network_config(network)
     mean = load_network(new_network(model, torch.Generator()), latest_checkpoint(network), model.resolution)
-    bare: HumanNetModel = model.model_copy(update={"heights": (min(model.heights),)})
+    bare: HumanPredictorModel = model.model_copy(update={"scaffold_heights": (min(model.scaffold_heights),)})
     data = config.data.model_copy(update={"root": capture.absolute()})
     person = filmed(data, bare, load_template(human_options(bare)))
     rows = []
@@ -82,7 +82,7 @@ def baselines(network: Path, capture: Path, out: Path, count: int) -> list[Row]:
         maps = person.look(spread_views(person.sitter, count))
         if name == "mean texture":
             maps = replace(maps, seen=torch.zeros_like(maps.seen))
-        avatar = predict_gaussians(person.sitter, maps, mean, None, bare.carve)
+        avatar = predict_gaussians(person.sitter, maps, mean, None, bare.min_silhouette_share)
         seconds = time.perf_counter() - start
         run = out / name.replace(", ", "_").replace(" ", "_")
         if not checkpoint_paths(run):
