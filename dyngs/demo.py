@@ -14,11 +14,11 @@ from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import EvalReport, evaluate_run
-from dyngs.export.run import export_ply
+from dyngs.export.run_to_ply import export_ply
 from dyngs.runs.lock import LOCK_NAME, InUseError, writing
 from dyngs.train.trainer import train
-from dyngs.view.frames import OutputOptions, write_path_frames, write_split
-from dyngs.view.shots import ShotOptions, shot_of_run
+from dyngs.view.image_files import OutputOptions, write_job_images, write_split_images
+from dyngs.view.job_of_run import RenderJobOptions, job_of_run
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -90,11 +90,11 @@ def _run_demo(folder: Path, options: DemoOptions, start: float) -> DemoResult:
     print("[3/4] measuring on pictures that were not trained on", flush=True)
     report = evaluate_run(run_dir, threads=options.threads)
     print("[4/4] rendering the test views and a flight around the moving scene", flush=True)
-    write_split(run_dir, "test", pictures)
-    shot = shot_of_run(run_dir, ShotOptions("orbit", options.num_frames))
+    write_split_images(run_dir, "test", pictures)
+    shot = job_of_run(run_dir, RenderJobOptions("orbit", options.num_frames))
     video = folder / "orbit.mp4"
     output = OutputOptions(video=video)
-    write_path_frames(shot, None, output)
+    write_job_images(shot, None, output)
     ply = export_ply(run_dir, folder / "splats.ply")
     seconds = time.perf_counter() - start
     return DemoResult(folder, capture, run_dir, pictures, pictures / "sheet.png", video, ply, report, seconds)

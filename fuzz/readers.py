@@ -147,7 +147,7 @@ def read_a_motion(root: Path) -> object:
 def read_splats(root: Path) -> object:
     """The Gaussians, drawn."""
     from dyngs.export.ply import read_ply
-    from dyngs.view.frames import splat_options
+    from dyngs.view.image_files import splat_options
 
     splat = read_ply(only(root))
     return splat, drawn(splat.gaussians, replace(splat_options(splat), nonfinite="skip"))
@@ -192,7 +192,7 @@ def read_override_lines(root: Path) -> object:
 
 def read_a_path(root: Path) -> object:
     """The cameras."""
-    from dyngs.view.paths import read_path
+    from dyngs.view.camera_paths import read_path
 
     path = read_path(only(root))
     return path.cameras, path.fps, path.times
@@ -200,22 +200,22 @@ def read_a_path(root: Path) -> object:
 
 def read_a_point(root: Path) -> object:
     """The point and its row of the report."""
-    from dyngs.tradeoff.points import read_point
+    from dyngs.tradeoff.measurements import read_measurement
     from dyngs.tradeoff.report import rows_of
 
-    point = read_point(only(root))
+    point = read_measurement(only(root))
     return rows_of([point]), point
 
 
 def read_option_values(root: Path) -> object:
     """Values of options of the command line; each must be read or refused."""
     from dyngs.data.frame_selection import parse_frames
-    from dyngs.tradeoff.knobs import parse_settings
     from dyngs.tradeoff.requirements import parse_requirements
-    from dyngs.view.paths import parse_times
+    from dyngs.tradeoff.variants import parse_variations
+    from dyngs.view.camera_paths import parse_times
 
     parsers: tuple[Callable[[str], object], ...]
-    parsers = (parse_requirements, lambda word: parse_settings([word], trains=True), parse_frames, parse_times)
+    parsers = (parse_requirements, lambda word: parse_variations([word], trains=True), parse_frames, parse_times)
     return [parse(word) for parse, word in zip(parsers, words(root), strict=False)]
 
 
@@ -313,7 +313,7 @@ READERS: dict[str, Reader] = {
     "presets": Reader({"preset": files.write_preset}, read_a_preset),
     "overrides": Reader({"lines": files.write_overrides}, read_override_lines, names_file=False),
     "camera_paths": Reader({"frames": files.write_frames_path, "keyframes": files.write_keyframes}, read_a_path),
-    "points": Reader({"point": files.write_point}, read_a_point),
+    "points": Reader({"point": files.write_measurement}, read_a_point),
     "options": Reader({"words": files.write_words}, read_option_values, names_file=False),
     "logs": Reader({"log": files.write_log}, read_a_log, writes=True),
     "bench": Reader({"load": files.write_load}, read_a_load),

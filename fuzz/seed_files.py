@@ -25,7 +25,7 @@ from dyngs.human.motion.amass import write_amass
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.storage.file import SceneInfo, encoded
-from dyngs.view.paths import CameraPath, write_path
+from dyngs.view.camera_paths import CameraPath, write_path
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 
@@ -237,14 +237,14 @@ def write_keyframes(root: Path) -> None:
     (root / "a.json").write_text(json.dumps(document))
 
 
-def write_point(root: Path) -> None:
+def write_measurement(root: Path) -> None:
     """A measured point of ``dyngs tradeoff``."""
-    from dyngs.tradeoff.knobs import Variant
-    from dyngs.tradeoff.points import Point, Speed, Spread
-    from dyngs.tradeoff.points import write_point as write
+    from dyngs.tradeoff.measurements import Measurement, Quartiles, Speed
+    from dyngs.tradeoff.measurements import write_measurement as write
+    from dyngs.tradeoff.variants import Variant
 
-    speed = Speed(Spread(3.0, 2.0, 4.0), Spread(1.0, 0.9, 1.1))
-    write(root / "a.json", Point(Variant(prune=0.5), 3, 30.0, 0.9, 0.1, 100, 1.5, 20.0, speed))
+    speed = Speed(Quartiles(3.0, 2.0, 4.0), Quartiles(1.0, 0.9, 1.1))
+    write(root / "a.json", Measurement(Variant(prune=0.5), 3, 30.0, 0.9, 0.1, 100, 1.5, 20.0, speed))
 
 
 def write_words(root: Path) -> None:

@@ -191,5 +191,13 @@ def import_everything() -> None:
             importlib.import_module(name)
         except ImportError:
             continue
-    for name in ("data.read", "data.inspect", "data.loader", "train.checkpoint", "export.avatar", "view.shots", "demo"):
+    for name in (
+        "data.read",
+        "data.inspect",
+        "data.loader",
+        "runs.checkpoint",
+        "export.avatar",
+        "view.job_of_run",
+        "demo",
+    ):
         importlib.import_module(f"dyngs.{name}")

@@ -10,7 +10,7 @@ from dyngs.cli.render import is_avatar, moment, say
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
-    from dyngs.export.run import Part
+    from dyngs.export.run_to_ply import Part
     from dyngs.runs.checkpoint import LoadedRun
 
 _EPILOG = """\
@@ -78,9 +78,9 @@ def run(arguments: argparse.Namespace) -> int:
     times = _times(arguments)
     loaded = (read_avatar if is_file else load_run)(arguments.run_dir)
     if arguments.motion is not None:
-        from dyngs.view.playing import playing_motion
+        from dyngs.view.animation import with_motion
 
-        loaded = playing_motion(loaded, arguments.motion).run
+        loaded = with_motion(loaded, arguments.motion).run
         times = loaded.scene.times if times is None else times
     if loaded.scene.is_still and times is not None:
         say(("nothing moves in this run: it is the same at all times",))
@@ -136,7 +136,7 @@ def _export_avatar(arguments: argparse.Namespace) -> int:
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """The times asked for, within [0, 1]; None where none is."""
     from dyngs.evaluate.temporal import clamped_times
-    from dyngs.view.paths import parse_times
+    from dyngs.view.camera_paths import parse_times
 
     if arguments.times is None and arguments.time is None:
         return None
@@ -147,7 +147,7 @@ def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
 
 def _export_ply(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...] | None) -> list[Path]:
     """The files written: a sequence where things move at several times, one file otherwise."""
-    from dyngs.export.run import write_moment, write_moments
+    from dyngs.export.run_to_ply import write_run_ply, write_run_ply_sequence
 
     if loaded.scene.colour is not None:
         say(("the run's colours are a network; the file holds harmonics of degree 3 that are fitted to it",))
@@ -161,10 +161,10 @@ def _export_ply(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[f
         if times is None and not arguments.static and not loaded.scene.is_still:
             say(("this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence",))
         time = 0.0 if times is None else times[0]
-        return [write_moment(loaded, out or arguments.run_dir / f"{stem}.ply", time, part)]
+        return [write_run_ply(loaded, out or arguments.run_dir / f"{stem}.ply", time, part)]
     if out is not None and out.suffix.lower() == ".ply":
         raise DyngsError(f"{out}: a sequence is a folder of files; give --out DIR, or --time for one file")
-    return write_moments(loaded, out or arguments.run_dir / stem, times or (), part)
+    return write_run_ply_sequence(loaded, out or arguments.run_dir / stem, times or (), part)
 
 
 def _export_tracks(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...] | None) -> list[Path]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
-    from dyngs.view.frames import Shot
+    from dyngs.view.image_files import RenderJob
 
 MAX_THREADS = 1024
 
@@ -125,33 +125,33 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
 
 
 def _render_split(arguments: argparse.Namespace) -> list[Path]:
-    from dyngs.view.frames import OutputOptions, write_split
+    from dyngs.view.image_files import OutputOptions, write_split_images
 
     output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or 30.0)
-    return write_split(arguments.source, arguments.split or "test", arguments.out, output)
+    return write_split_images(arguments.source, arguments.split or "test", arguments.out, output)
 
 
 def _render_shot(arguments: argparse.Namespace) -> list[Path]:
-    from dyngs.view.frames import OutputOptions, write_path_frames
+    from dyngs.view.image_files import OutputOptions, write_job_images
 
     shot = _shot(arguments)
     say(shot.notes, shot.path.warnings)
     output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or shot.path.fps)
-    return write_path_frames(shot, arguments.out, output)
+    return write_job_images(shot, arguments.out, output)
 
 
-def _shot(arguments: argparse.Namespace) -> Shot:
+def _shot(arguments: argparse.Namespace) -> RenderJob:
     """What the arguments ask for."""
-    from dyngs.view.avatar_shots import shot_of_avatar
-    from dyngs.view.paths import parse_times
-    from dyngs.view.shots import ShotOptions, shot_of_ply, shot_of_run
+    from dyngs.view.camera_paths import parse_times
+    from dyngs.view.job_of_avatar import job_of_avatar
+    from dyngs.view.job_of_run import RenderJobOptions, job_of_ply, job_of_run
 
     times = None if arguments.time is None else (arguments.time,)
     num_frames = arguments.frames
     if arguments.times is not None:
         times = parse_times(arguments.times)
         num_frames = len(times)
-    options = ShotOptions(
+    options = RenderJobOptions(
         path=None if _stands_still(arguments) else arguments.path or "orbit",
         num_frames=num_frames,
         size=arguments.size,
@@ -164,8 +164,8 @@ def _shot(arguments: argparse.Namespace) -> Shot:
         at_rest=arguments.pose == "rest",
     )
     if not arguments.source.is_file():
-        return shot_of_run(arguments.source, options)
-    return (shot_of_avatar if is_avatar(arguments.source) else shot_of_ply)(arguments.source, options)
+        return job_of_run(arguments.source, options)
+    return (job_of_avatar if is_avatar(arguments.source) else job_of_ply)(arguments.source, options)
 
 
 def is_avatar(path: Path) -> bool:

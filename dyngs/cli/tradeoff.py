@@ -12,10 +12,10 @@ from dyngs.cli.render import threads
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
-    from dyngs.tradeoff.models import Models
-    from dyngs.tradeoff.points import Point
-    from dyngs.tradeoff.ranks import Ranks
+    from dyngs.tradeoff.distributed import ProcessGroup
+    from dyngs.tradeoff.measurements import Measurement
     from dyngs.tradeoff.requirements import Goal, Requirement
+    from dyngs.tradeoff.variant_runs import VariantRuns
 
 _EPILOG = """\
 examples:
@@ -71,33 +71,33 @@ def run(arguments: argparse.Namespace) -> int:
     from contextlib import nullcontext
 
     from dyngs.runs.lock import writing
-    from dyngs.tradeoff.ranks import Ranks
+    from dyngs.tradeoff.distributed import ProcessGroup
 
     for name, least in (("finetune", 0), ("combine", 0), ("rounds", 1), ("threads", 0)):
         if getattr(arguments, name) < least:
             raise DyngsError(f"--{name} {getattr(arguments, name)}: give a whole number from {least} on")
-    target, ranks = Path(arguments.target), Ranks.from_environment()
+    target, ranks = Path(arguments.target), ProcessGroup.from_environment()
     out: Path | None = arguments.out or (target / "tradeoff" if target.is_dir() else None)
     with writing(out) if ranks.is_first and out is not None else nullcontext():
         return _run(arguments, ranks)
 
 
-def _run(arguments: argparse.Namespace, ranks: Ranks) -> int:
+def _run(arguments: argparse.Namespace, ranks: ProcessGroup) -> int:
     from rich.console import Console
 
-    from dyngs.tradeoff.knobs import parse_settings
-    from dyngs.tradeoff.models import Models
     from dyngs.tradeoff.report import write_report
     from dyngs.tradeoff.requirements import parse_goal, parse_requirements
     from dyngs.tradeoff.sweep import Plan, sweep
+    from dyngs.tradeoff.variant_runs import VariantRuns
+    from dyngs.tradeoff.variants import parse_variations
 
     is_run = Path(arguments.target).is_dir()
-    settings = parse_settings(arguments.vary, trains=arguments.train or not is_run)
+    settings = parse_variations(arguments.vary, trains=arguments.train or not is_run)
     asked = parse_requirements(arguments.require) if arguments.require is not None else ()
     name = arguments.minimize or arguments.maximize or "psnr"
     goal = parse_goal(name, smallest=arguments.minimize is not None)
     run_dir = Path(arguments.target) if is_run else _trained(arguments, ranks)
-    models = Models(run_dir, arguments.out or run_dir / "tradeoff", arguments.threads or ranks.cores)
+    models = VariantRuns(run_dir, arguments.out or run_dir / "tradeoff", arguments.threads or ranks.cores)
     plan = Plan(settings, arguments.finetune, arguments.combine, arguments.split, arguments.rounds, arguments.threads)
     try:
         points = sweep(models, plan, print, ranks)
@@ -115,10 +115,10 @@ def _run(arguments: argparse.Namespace, ranks: Ranks) -> int:
     return 0
 
 
-def _trained(arguments: argparse.Namespace, ranks: Ranks) -> Path:
+def _trained(arguments: argparse.Namespace, ranks: ProcessGroup) -> Path:
     """The run folder of a config, trained to its end by the first process."""
     from dyngs.config.io import find_preset, load_config
-    from dyngs.tradeoff.models import finished
+    from dyngs.tradeoff.variant_runs import finished
 
     try:
         config = find_preset(Path(arguments.target))
@@ -134,12 +134,12 @@ def _trained(arguments: argparse.Namespace, ranks: Ranks) -> Path:
     return folder
 
 
-def _tables(points: list[Point]) -> list[object]:
+def _tables(points: list[Measurement]) -> list[object]:
     """Points and exchange rates, for people; the files have more."""
     from rich import box
     from rich.table import Table
 
-    from dyngs.tradeoff.front import exchanges
+    from dyngs.tradeoff.pareto import exchange_rates
     from dyngs.tradeoff.report import EXCHANGE_HEAD, exchange_cells, rows_of
 
     def table(title: str, head: Sequence[str]) -> Table:
@@ -158,16 +158,16 @@ def _tables(points: list[Point]) -> list[object]:
         name = f"{'* ' if row.on_front else '  '}{row.name}"
         shown.add_row(name, *quality, f"{row.fps:.1f}", f"{row.gain:.2f}", f"{row.mb:.2f}", memory)
     prices = table("each knob alone", EXCHANGE_HEAD)
-    for exchange in exchanges(points[0], points):
+    for exchange in exchange_rates(points[0], points):
         prices.add_row(*exchange_cells(exchange))
     return [shown, prices]
 
 
-def _choose(points: list[Point], asked: tuple[Requirement, ...], goal: Goal, models: Models) -> None:
+def _choose(points: list[Measurement], asked: tuple[Requirement, ...], goal: Goal, models: VariantRuns) -> None:
     """Write the best run and say what it is like."""
-    from dyngs.tradeoff.models import write_chosen
     from dyngs.tradeoff.requirements import choose
     from dyngs.tradeoff.sweep import figures_of
+    from dyngs.tradeoff.variant_runs import write_chosen
 
     best = choose(figures_of(points), asked, goal)
     folder = write_chosen(models, best.variant)

@@ -95,7 +95,7 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
 
 
 def read_avatar(path: Path) -> LoadedRun:
-    """The person of a file, upright and at rest; ``dyngs.view.playing`` moves it as it does one of a run.
+    """The person of a file, upright and at rest; ``dyngs.view.animation`` moves it as it does one of a run.
 
     The template of an avatar that is not built on the free one is looked for beside the file when a motion needs it.
 

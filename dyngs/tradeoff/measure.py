@@ -20,12 +20,12 @@ from dyngs.evaluate.metrics import Lpips, psnr, ssim
 from dyngs.evaluate.report import render_options
 from dyngs.rendering import RenderOptions
 from dyngs.scene import Scene, moment_of
-from dyngs.tradeoff.knobs import Variant
-from dyngs.tradeoff.points import Speed, Spread
+from dyngs.tradeoff.measurements import Quartiles, Speed
+from dyngs.tradeoff.variants import Variant
 
 
 @dataclass(frozen=True)
-class Drawer:
+class VariantRenderer:
     """Draws a variant.
 
     Attributes:
@@ -43,7 +43,11 @@ class Drawer:
     @torch.no_grad()
     def picture(self, cameras: Cameras, time: float | None) -> Tensor:
         """(H, W, 3) what the one camera sees at ``time``; drawn smaller and enlarged bilinearly where ``scale`` < 1."""
-        seen = moment_of(self.scene, time).seen_by(shrunk(cameras, self.scale), self.options, self.background).rgb[0]
+        seen = (
+            moment_of(self.scene, time)
+            .seen_by(scaled_cameras(cameras, self.scale), self.options, self.background)
+            .rgb[0]
+        )
         if seen.shape[:2] == (cameras.height, cameras.width):
             return seen
         size = (cameras.height, cameras.width)
@@ -61,7 +65,7 @@ class Quality:
     lpips: float | None
 
 
-def drawn_so(variant: Variant, model: SceneModel) -> SceneModel:
+def with_render_settings(variant: Variant, model: SceneModel) -> SceneModel:
     """The ``model`` of a run with how a variant of it is drawn."""
     mode = None if variant.mode is None else RasterizeMode(variant.mode)
     changes = {
@@ -72,12 +76,12 @@ def drawn_so(variant: Variant, model: SceneModel) -> SceneModel:
     return model.model_copy(update={name: value for name, value in changes.items() if value is not None})
 
 
-def options_of(variant: Variant, model: SceneModel) -> RenderOptions:
+def render_options_of(variant: Variant, model: SceneModel) -> RenderOptions:
     """How a variant is drawn that changes a run of ``model``."""
-    return render_options(drawn_so(variant, model))
+    return render_options(with_render_settings(variant, model))
 
 
-def shrunk(cameras: Cameras, scale: float) -> Cameras:
+def scaled_cameras(cameras: Cameras, scale: float) -> Cameras:
     """The same cameras with pictures whose sides are ``scale`` times as long, rounded to whole pixels."""
     if scale == 1:
         return cameras
@@ -86,7 +90,7 @@ def shrunk(cameras: Cameras, scale: float) -> Cameras:
     return Cameras(cameras.cam_from_world, factors[:, None] * cameras.intrinsics, width, height)
 
 
-def quality(drawer: Drawer, pictures: Iterable[Picture], lpips: Lpips) -> Quality:
+def measure_quality(drawer: VariantRenderer, pictures: Iterable[Picture], lpips: Lpips) -> Quality:
     """Means over the pictures, each at its own time.
 
     Raises:
@@ -104,7 +108,7 @@ def quality(drawer: Drawer, pictures: Iterable[Picture], lpips: Lpips) -> Qualit
     return Quality(fmean(psnrs), fmean(ssims), fmean(known) if len(known) == len(distances) else None)
 
 
-def race(drawers: Sequence[Drawer], pictures: Sequence[Picture], rounds: int) -> list[Speed]:
+def time_interleaved(drawers: Sequence[VariantRenderer], pictures: Sequence[Picture], rounds: int) -> list[Speed]:
     """How fast each is, the first being the run itself: all draw each picture in turn, so that what else the machine
     does hits all alike, and another one begins each time.
 
@@ -123,10 +127,10 @@ def race(drawers: Sequence[Drawer], pictures: Sequence[Picture], rounds: int) ->
             start = time.perf_counter()
             drawers[row].picture(picture.cameras, picture.time)
             seconds[row, column] = time.perf_counter() - start
-    return [Speed(ms=spread_of(1e3 * own), gain=spread_of(seconds[0] / own)) for own in seconds]
+    return [Speed(ms=quartiles(1e3 * own), gain=quartiles(seconds[0] / own)) for own in seconds]
 
 
-def spread_of(values: np.ndarray) -> Spread:
+def quartiles(values: np.ndarray) -> Quartiles:
     """Median and quartiles."""
     low, high = np.percentile(values, [25, 75])
-    return Spread(float(median(values)), float(low), float(high))
+    return Quartiles(float(median(values)), float(low), float(high))

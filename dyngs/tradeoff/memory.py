@@ -20,8 +20,8 @@ from dyngs.camera import Cameras
 from dyngs.data.loader import Picture
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import load_run
-from dyngs.tradeoff.knobs import Variant
-from dyngs.tradeoff.measure import Drawer, options_of
+from dyngs.tradeoff.measure import VariantRenderer, render_options_of
+from dyngs.tradeoff.variants import Variant
 
 _STATUS = Path("/proc/self/status")
 
@@ -101,8 +101,8 @@ def _measure(request: dict[str, Any]) -> None:
     variant = Variant.from_json(request["variant"])
     with kernel_threads(1):
         run = load_run(Path(request["folder"]))
-        options, background = options_of(variant, run.config.model), torch.tensor(request["background"])
-        drawer = Drawer(run.scene, options, background, variant.scale)
+        options, background = render_options_of(variant, run.config.model), torch.tensor(request["background"])
+        drawer = VariantRenderer(run.scene, options, background, variant.scale)
         for shot in request["shots"]:
             pose, intrinsics = (torch.tensor(shot[name]) for name in ("pose", "intrinsics"))
             drawer.picture(Cameras(pose, intrinsics, *shot["size"]), shot["time"])

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from dyngs.tradeoff.canvas import Dot, Drawing, Label, Line, Shape
-from dyngs.tradeoff.front import pareto
-from dyngs.tradeoff.knobs import SEVERAL
+from dyngs.tradeoff.pareto import pareto_mask
 from dyngs.tradeoff.requirements import Figures
+from dyngs.tradeoff.variants import SEVERAL
+from dyngs.tradeoff.vector_graphics import Circle, Drawing, Line, Shape, Text
 
 PANEL = (520, 400)
 """Width and height, px."""
@@ -83,7 +83,7 @@ def plot(points: Sequence[Figures]) -> Drawing:
     ]
     for i, knob in enumerate(knobs):
         x, y = LEFT + (i % PER_ROW) * (width - LEFT) / PER_ROW, PANEL[1] + 12 + LEGEND_ROW * (i // PER_ROW)
-        shapes += [Dot(x, y - 4, 5, colours[knob]), Label(x + 10, y, knob or "the run itself")]
+        shapes += [Circle(x, y - 4, 5, colours[knob]), Text(x + 10, y, knob or "the run itself")]
     return Drawing(width, height, shapes)
 
 
@@ -103,7 +103,7 @@ def _panel(
     across = _Axis(low, high, left + LEFT, left + PANEL[0] - RIGHT, True)
     up = _Axis(*_wider([p.psnr for p in shown], logarithmic=False), PANEL[1] - BOTTOM, TOP, False)
     places = {p.variant: (across.at(value(p)), up.at(p.psnr)) for p in shown}
-    best = pareto([(p.psnr, sign * value(p)) for p in shown])
+    best = pareto_mask([(p.psnr, sign * value(p)) for p in shown])
     front = sorted({places[p.variant] for p, is_best in zip(shown, best, strict=True) if is_best})
     shapes = [*_frame(across, up, f"PSNR and {title}", label), Line(tuple(front), "#d4d4d4", 5)]
     for knob, colour in colours.items():
@@ -112,23 +112,23 @@ def _panel(
             shapes.append(Line(turned, colour, 0.75))
     for p in reversed(shown):  # the run itself on top
         tip = f"{p.variant.name}: {p.psnr:.2f} dB, {p.fps:.1f} fps, {p.mb:.2f} MB"
-        shapes.append(Dot(*places[p.variant], 6.5 if not p.variant.knob else 5, colours[p.variant.knob], tip))
+        shapes.append(Circle(*places[p.variant], 6.5 if not p.variant.knob else 5, colours[p.variant.knob], tip))
     return shapes
 
 
 def _frame(across: _Axis, up: _Axis, title: str, label: str) -> list[Shape]:
     """Grid, numbers and words around a panel."""
-    shapes: list[Shape] = [Label(across.start, 20, title, size=13, bold=True), Label(across.start - 44, TOP - 8, "dB")]
+    shapes: list[Shape] = [Text(across.start, 20, title, size=13, bold=True), Text(across.start - 44, TOP - 8, "dB")]
     for tick in across.ticks():
         x = across.at(tick)
         shapes.append(Line(((x, up.start), (x, up.end)), "#e4e4e4", 1))
-        shapes.append(Label(x, up.start + 16, f"{tick:,.6g}", "middle"))
+        shapes.append(Text(x, up.start + 16, f"{tick:,.6g}", "middle"))
     for tick in up.ticks():
         y = up.at(tick)
         shapes.append(Line(((across.start, y), (across.end, y)), "#e4e4e4", 1))
-        shapes.append(Label(across.start - 6, y + 4, f"{tick:,.6g}", "end"))
+        shapes.append(Text(across.start - 6, y + 4, f"{tick:,.6g}", "end"))
     middle = (across.start + across.end) / 2
-    return [*shapes, Label(middle, up.start + 34, f"{label}, logarithmic", "middle")]
+    return [*shapes, Text(middle, up.start + 34, f"{label}, logarithmic", "middle")]
 
 
 def _wider(values: Sequence[float], *, logarithmic: bool) -> tuple[float, float]:

@@ -11,9 +11,9 @@ from html import escape
 from pathlib import Path
 
 from dyngs.files.write import write_image, write_text
-from dyngs.tradeoff.front import Exchange, exchanges, on_front
+from dyngs.tradeoff.measurements import Measurement
+from dyngs.tradeoff.pareto import ExchangeRate, exchange_rates, on_front
 from dyngs.tradeoff.plot import plot
-from dyngs.tradeoff.points import Point
 from dyngs.tradeoff.sweep import figures_of
 
 STEM = "tradeoff"
@@ -36,7 +36,7 @@ class Row:
         fps: of the run itself, times ``gain``.
         gain, gain_low, gain_high: how many times as fast as the run: median and quartiles of pairs drawn in turn.
         ms: median of one picture, as it was measured.
-        mb, memory_mb, gaussians: see ``Point``.
+        mb, memory_mb, gaussians: see ``Measurement``.
         on_front: no other point is as good in PSNR, speed and size.
     """
 
@@ -55,7 +55,7 @@ class Row:
     on_front: bool
 
 
-def rows_of(points: Sequence[Point]) -> list[Row]:
+def rows_of(points: Sequence[Measurement]) -> list[Row]:
     """One per point that was timed, in their order."""
     rows = []
     for point, figures, front in zip(points, figures_of(points), on_front(points), strict=True):
@@ -81,7 +81,7 @@ def rows_of(points: Sequence[Point]) -> list[Row]:
     return rows
 
 
-def write_report(out: Path, points: Sequence[Point]) -> list[Path]:
+def write_report(out: Path, points: Sequence[Measurement]) -> list[Path]:
     """``tradeoff.csv``, ``.json``, ``.svg``, ``.html`` and ``.png`` in ``out``.
 
     The page needs nothing beside it, and no network.
@@ -90,7 +90,7 @@ def write_report(out: Path, points: Sequence[Point]) -> list[Path]:
         out: folder.
         points: timed, the run itself first.
     """
-    rows, found = rows_of(points), exchanges(points[0], points)
+    rows, found = rows_of(points), exchange_rates(points[0], points)
     drawing = plot(figures_of(points))
     table = io.StringIO()
     writer = csv.DictWriter(table, list(asdict(rows[0])), lineterminator="\n")
@@ -141,7 +141,7 @@ _TABLE_HEAD = (
 )
 
 
-def exchange_cells(exchange: Exchange) -> tuple[str, ...]:
+def exchange_cells(exchange: ExchangeRate) -> tuple[str, ...]:
     """What people read of an exchange rate, below ``EXCHANGE_HEAD``."""
     prices = (exchange.db_per_speed, exchange.db_per_size)
     return (
@@ -161,7 +161,7 @@ EXCHANGE_HEAD = (
 )
 
 
-def _page(rows: Sequence[Row], found: Sequence[Exchange], picture: str) -> str:
+def _page(rows: Sequence[Row], found: Sequence[ExchangeRate], picture: str) -> str:
     body = [_line("th", _TABLE_HEAD), *(_line("td", _table_cells(row), front=row.on_front) for row in rows)]
     prices = [_line("th", EXCHANGE_HEAD), *(_line("td", exchange_cells(exchange)) for exchange in found)]
     return "\n".join(

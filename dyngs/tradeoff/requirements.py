@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dyngs.errors import DyngsError, printable
-from dyngs.tradeoff.knobs import Variant
+from dyngs.tradeoff.variants import Variant
 
 _CONDITION = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*(\S+)\s*$")
 

@@ -19,14 +19,14 @@ from dyngs.evaluate.report import scene_of_split, split_views
 from dyngs.files.write import write_text
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.tradeoff.front import combinations
-from dyngs.tradeoff.knobs import Setting, Variant, single_changes
-from dyngs.tradeoff.measure import Drawer, options_of, quality, race
+from dyngs.tradeoff.distributed import SINGLE_PROCESS, ProcessGroup
+from dyngs.tradeoff.measure import VariantRenderer, measure_quality, render_options_of, time_interleaved
+from dyngs.tradeoff.measurements import Measurement, read_measurement, write_measurement
 from dyngs.tradeoff.memory import MemoryMeter
-from dyngs.tradeoff.models import Models, megabytes_on_disk, traits
-from dyngs.tradeoff.points import Point, read_point, write_point
-from dyngs.tradeoff.ranks import ALONE, Ranks
+from dyngs.tradeoff.pareto import combinations
 from dyngs.tradeoff.requirements import Figures
+from dyngs.tradeoff.variant_runs import VariantRuns, megabytes_on_disk, run_settings
+from dyngs.tradeoff.variants import Variant, Variation, single_changes
 from dyngs.train.background import evaluation_background
 from dyngs.train.trainer import num_cores
 
@@ -52,7 +52,7 @@ class Plan:
         lpips_net: backbone of LPIPS.
     """
 
-    settings: tuple[Setting, ...]
+    settings: tuple[Variation, ...]
     finetune: int = 0
     combine: int = 4
     split: str = "test"
@@ -61,7 +61,9 @@ class Plan:
     lpips_net: LpipsNet = "alex"
 
 
-def sweep(models: Models, plan: Plan, say: Callable[[str], None], ranks: Ranks = ALONE) -> list[Point]:
+def sweep(
+    models: VariantRuns, plan: Plan, say: Callable[[str], None], ranks: ProcessGroup = SINGLE_PROCESS
+) -> list[Measurement]:
     """All points, the run itself first; those kept in ``models.out / "points"`` are not measured again.
 
     Args:
@@ -76,7 +78,7 @@ def sweep(models: Models, plan: Plan, say: Callable[[str], None], ranks: Ranks =
     with MemoryMeter() as meter:
         bench = _Bench(models, plan, meter, say)
         _require_same_source(models, plan, is_first=ranks.is_first)
-        own = traits(models.run_dir)
+        own = run_settings(models.run_dir)
         idle = [s.knob.name for s in plan.settings if not any(own.allows(s.knob, value) for value in s.values)]
         if idle and ranks.is_first:
             say(f"nothing to vary in this run: {', '.join(idle)}")
@@ -86,7 +88,7 @@ def sweep(models: Models, plan: Plan, say: Callable[[str], None], ranks: Ranks =
         return bench.measured([*singles, *together], ranks)
 
 
-def figures_of(points: Sequence[Point]) -> list[Figures]:
+def figures_of(points: Sequence[Measurement]) -> list[Figures]:
     """What can be asked of each; frames per second are the run's own times how many times as fast a point was in turn
     with it, so that points timed in another hour compare."""
     base = points[0].speed
@@ -99,7 +101,7 @@ def figures_of(points: Sequence[Point]) -> list[Figures]:
 class _Bench:
     """Pictures of a split, and whatever is measured on them."""
 
-    def __init__(self, models: Models, plan: Plan, meter: MemoryMeter, say: Callable[[str], None]) -> None:
+    def __init__(self, models: VariantRuns, plan: Plan, meter: MemoryMeter, say: Callable[[str], None]) -> None:
         config = load_resolved(models.run_dir)
         self._models, self._plan, self._meter, self._say = models, plan, meter, say
         self._capture = read_capture(config.data)
@@ -107,7 +109,7 @@ class _Bench:
         self._background = evaluation_background(config.data.background, self._capture.has_alpha)[1]
         self._lpips = load_lpips(plan.lpips_net)
 
-    def measured(self, variants: Sequence[Variant], ranks: Ranks) -> list[Point]:
+    def measured(self, variants: Sequence[Variant], ranks: ProcessGroup) -> list[Measurement]:
         """The points of ``variants``: each process makes its share, then the first measures the speed of all."""
         with kernel_threads(self._models.threads or num_cores()):
             for variant in ranks.share(variants):
@@ -119,15 +121,15 @@ class _Bench:
         ranks.wait()
         return [self.point(variant) for variant in variants]
 
-    def point(self, variant: Variant) -> Point:
+    def point(self, variant: Variant) -> Measurement:
         """The point of a variant, its speed perhaps not measured yet."""
         path = self._path(variant)
         if path.is_file():
-            return read_point(path)
+            return read_measurement(path)
         folder, drawer = self._models.folder(variant), self._drawer(variant)
-        found = quality(drawer, (self._loader[i] for i in range(len(self._loader))), self._lpips)
+        found = measure_quality(drawer, (self._loader[i] for i in range(len(self._loader))), self._lpips)
         shown = self._pictures(MEMORY_VIEWS)
-        point = Point(
+        point = Measurement(
             variant=variant,
             num_views=len(self._loader),
             psnr=found.psnr,
@@ -137,11 +139,11 @@ class _Bench:
             mb=megabytes_on_disk(folder),
             memory_mb=self._meter.peak_megabytes(folder, variant, shown, self._background),
         )
-        write_point(path, point)
+        write_measurement(path, point)
         self._say(f"{variant.name}: {point.psnr:.2f} dB, {point.num_gaussians:,} Gaussians, {point.mb:.2f} MB")
         return point
 
-    def _time(self, points: Sequence[Point]) -> None:
+    def _time(self, points: Sequence[Measurement]) -> None:
         """Measure speeds, in turn with the first, where they lack."""
         lacking = [point for point in points[1:] if point.speed is None]
         first = points[0]
@@ -152,16 +154,16 @@ class _Bench:
         for group in groups:
             self._say(f"timing {len(group) + 1} variants in turn")
             together = [first, *group]
-            speeds = race([self._drawer(p.variant) for p in together], pictures, self._plan.rounds)
+            speeds = time_interleaved([self._drawer(p.variant) for p in together], pictures, self._plan.rounds)
             for point, speed in zip(together, speeds, strict=True):
                 if point.speed is None:
-                    write_point(self._path(point.variant), replace(point, speed=speed))
+                    write_measurement(self._path(point.variant), replace(point, speed=speed))
             first = self.point(first.variant)
 
-    def _drawer(self, variant: Variant) -> Drawer:
+    def _drawer(self, variant: Variant) -> VariantRenderer:
         run = load_run(self._models.folder(variant))
         scene = scene_of_split(run, self._capture, self._plan.split)
-        return Drawer(scene, options_of(variant, run.config.model), self._background, variant.scale)
+        return VariantRenderer(scene, render_options_of(variant, run.config.model), self._background, variant.scale)
 
     def _pictures(self, count: int) -> list[Picture]:
         return [self._loader[i] for i in evenly_spaced(len(self._loader), count)]
@@ -170,7 +172,7 @@ class _Bench:
         return self._models.out / "points" / f"{variant.slug}.json"
 
 
-def _require_same_source(models: Models, plan: Plan, *, is_first: bool) -> None:
+def _require_same_source(models: VariantRuns, plan: Plan, *, is_first: bool) -> None:
     """The first process notes what is measured: points of another run, or of one that was trained on, must not mix."""
     newest = checkpoint_paths(models.run_dir)[-1]
     source = {

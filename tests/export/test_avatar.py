@@ -25,7 +25,7 @@ from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.train.trainer import train
-from dyngs.view.playing import at_rest, playing_motion
+from dyngs.view.animation import at_rest, with_motion
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def motion(tmp_path: Path) -> Path:
 
 def test_the_file_plays_as_the_run(run_dir: Path, file: Path, motion: Path) -> None:
     run, read = load_run(run_dir), read_avatar(file)
-    for one, other in ((playing_motion(run, motion).run, playing_motion(read, motion).run), (at_rest(run), read)):
+    for one, other in ((with_motion(run, motion).run, with_motion(read, motion).run), (at_rest(run), read)):
         for time in (0.0, 0.7, 1.0):
             wanted, found = one.scene.at(time).tensors(), other.scene.at(time).tensors()
             for name, x in found.items():
@@ -85,9 +85,9 @@ def test_blend_shapes_go_along_and_the_template_is_looked_for_beside_the_file(
     run = load_run(trained(capture, tmp_path / "run", body=body))
     file = write_avatar(run, tmp_path / "elsewhere" / "ann.safetensors")
     with pytest.raises(DyngsError, match=r"elsewhere/bodies\.npz: cannot be read"):
-        playing_motion(read_avatar(file), motion)
+        with_motion(read_avatar(file), motion)
     (tmp_path / "elsewhere" / "bodies.npz").write_bytes(body.read_bytes())
-    one, other = (playing_motion(x, motion).run.scene for x in (run, read_avatar(file)))
+    one, other = (with_motion(x, motion).run.scene for x in (run, read_avatar(file)))
     assert isinstance(other, AvatarScene)
     assert other.shapes is not None
     torch.testing.assert_close(other.at(0.4).means, one.at(0.4).means, rtol=0, atol=1e-5)

@@ -12,38 +12,45 @@ from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Picture
 from dyngs.evaluate.metrics import Lpips
 from dyngs.rendering import RenderOptions
-from dyngs.tradeoff.knobs import Variant
-from dyngs.tradeoff.measure import Drawer, options_of, quality, race, shrunk, spread_of
+from dyngs.tradeoff.measure import (
+    VariantRenderer,
+    measure_quality,
+    quartiles,
+    render_options_of,
+    scaled_cameras,
+    time_interleaved,
+)
+from dyngs.tradeoff.variants import Variant
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 BLACK = torch.zeros(3)
 
 
-def picture_of(drawer: Drawer, time: float = 0.0) -> Picture:
+def picture_of(drawer: VariantRenderer, time: float = 0.0) -> Picture:
     """What a drawer sees, as a true picture."""
     return Picture("view", camera(), drawer.picture(camera(), time).clamp(0, 1), None, None, time)
 
 
 def test_options_are_those_of_the_run_but_for_what_is_changed() -> None:
     model = StaticModel(near=0.5, eps2d=0.1)
-    assert options_of(Variant(), model) == RenderOptions(near=0.5, eps2d=0.1)
-    changed = options_of(Variant(mode="antialiased", alpha_min=0.02, transmittance_min=0.01), model)
+    assert render_options_of(Variant(), model) == RenderOptions(near=0.5, eps2d=0.1)
+    changed = render_options_of(Variant(mode="antialiased", alpha_min=0.02, transmittance_min=0.01), model)
     assert (changed.near, changed.mode) == (0.5, RasterizeMode.ANTIALIASED)
     assert (changed.alpha_min, changed.transmittance_min) == (0.02, 0.01)
 
 
 def test_a_shrunk_camera_sees_the_same() -> None:
-    small = shrunk(camera(20, 14), 0.5)
+    small = scaled_cameras(camera(20, 14), 0.5)
     assert (small.width, small.height) == (10, 7)
     corner = torch.tensor([20.0, 14.0, 1.0])
     ray, same = (torch.linalg.inv(c.intrinsics[0]) @ p for c, p in ((camera(20, 14), corner), (small, corner / 2)))
     assert torch.allclose(ray[:2], (ray / same * same)[:2])
     assert torch.allclose(small.intrinsics[0] @ ray / ray[2], torch.tensor([10.0, 7.0, 1.0]))
-    assert shrunk(camera(), 1.0).width == 20
+    assert scaled_cameras(camera(), 1.0).width == 20
 
 
 def test_a_small_drawing_comes_out_at_full_size_and_in_its_place() -> None:
-    drawers = [Drawer(still_scene(1), RenderOptions(), BLACK + 1, scale) for scale in (1.0, 0.5)]
+    drawers = [VariantRenderer(still_scene(1), RenderOptions(), BLACK + 1, scale) for scale in (1.0, 0.5)]
     pictures = [1 - drawer.picture(camera(40, 28), None).mean(2) for drawer in drawers]
     assert [tuple(x.shape) for x in pictures] == [(28, 40), (28, 40)]
     assert not torch.equal(*pictures)
@@ -52,30 +59,30 @@ def test_a_small_drawing_comes_out_at_full_size_and_in_its_place() -> None:
 
 
 def test_quality_compares_each_view_at_its_time() -> None:
-    moving = Drawer(moving_scene(Sliding()), RenderOptions(), BLACK)
+    moving = VariantRenderer(moving_scene(Sliding()), RenderOptions(), BLACK)
     truths = [picture_of(moving, time) for time in (0.0, 0.5)]
     no_lpips = Lpips("alex", "not here")
-    perfect = quality(moving, truths, no_lpips)
+    perfect = measure_quality(moving, truths, no_lpips)
     assert perfect.psnr == 100.0
     assert perfect.ssim == pytest.approx(1.0)
     assert perfect.lpips is None
-    stopped = Drawer(moving_scene(Sliding(0.0)), RenderOptions(), BLACK)
-    assert quality(stopped, truths[:1], no_lpips).psnr == 100.0
-    assert quality(stopped, truths, no_lpips).psnr < 90
+    stopped = VariantRenderer(moving_scene(Sliding(0.0)), RenderOptions(), BLACK)
+    assert measure_quality(stopped, truths[:1], no_lpips).psnr == 100.0
+    assert measure_quality(stopped, truths, no_lpips).psnr < 90
 
 
 def test_lpips_is_the_mean_where_it_can_be_had() -> None:
-    drawer = Drawer(still_scene(), RenderOptions(), BLACK)
+    drawer = VariantRenderer(still_scene(), RenderOptions(), BLACK)
     distance = Lpips("alex", None, lambda a, b: (a - b).abs().mean() + 0.25)
-    assert quality(drawer, [picture_of(drawer)] * 2, distance).lpips == pytest.approx(0.25)
+    assert measure_quality(drawer, [picture_of(drawer)] * 2, distance).lpips == pytest.approx(0.25)
 
 
 def test_all_draw_every_picture_in_turn() -> None:
     scenes = [moving_scene(Sliding()), moving_scene(Sliding())]
-    drawers = [Drawer(scene, RenderOptions(), BLACK) for scene in scenes]
+    drawers = [VariantRenderer(scene, RenderOptions(), BLACK) for scene in scenes]
     views = [picture_of(drawers[0], 0.5)] * 3
     before = [scene.field.calls for scene in scenes if isinstance(scene.field, Sliding)]
-    speeds = race(drawers, views, rounds=2)
+    speeds = time_interleaved(drawers, views, rounds=2)
     after = [scene.field.calls for scene in scenes if isinstance(scene.field, Sliding)]
     assert [b - a for a, b in zip(before, after, strict=True)] == [7, 7]  # a warm-up, and twice three views
     assert speeds[0].gain.low == speeds[0].gain.median == speeds[0].gain.high == 1.0
@@ -83,5 +90,5 @@ def test_all_draw_every_picture_in_turn() -> None:
 
 
 def test_a_spread() -> None:
-    found = spread_of(np.array([4.0, 1.0, 2.0, 3.0, 100.0]))
+    found = quartiles(np.array([4.0, 1.0, 2.0, 3.0, 100.0]))
     assert (found.low, found.median, found.high) == (2.0, 3.0, 4.0)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.tradeoff.canvas import Dot, Label, Line
-from dyngs.tradeoff.knobs import Variant
 from dyngs.tradeoff.plot import plot
 from dyngs.tradeoff.requirements import Figures
+from dyngs.tradeoff.variants import Variant
+from dyngs.tradeoff.vector_graphics import Circle, Line, Text
 
 
 def figures(variant: Variant, psnr: float, fps: float, mb: float) -> Figures:
@@ -20,7 +20,7 @@ def figures(variant: Variant, psnr: float, fps: float, mb: float) -> Figures:
 def test_every_point_lies_inside(values: list[tuple[float, float, float]]) -> None:
     points = [figures(Variant(prune=i / 10), *v) for i, v in enumerate(values)]
     drawing = plot(points)
-    dots = [shape for shape in drawing.shapes if isinstance(shape, Dot) and shape.tip]
+    dots = [shape for shape in drawing.shapes if isinstance(shape, Circle) and shape.tip]
     assert len(dots) == 2 * len(points)
     assert all(0 < dot.x < drawing.width and 0 < dot.y < drawing.height for dot in dots)
 
@@ -28,7 +28,7 @@ def test_every_point_lies_inside(values: list[tuple[float, float, float]]) -> No
 def test_points_have_names() -> None:
     points = [figures(Variant(), 30, 10, 5), figures(Variant(alpha_min=0.01), 29, 15, 5)]
     assert "alpha_min=0.01: 29.00 dB, 15.0 fps, 5.00 MB" in plot(points).svg()
-    labels = [shape.text for shape in plot(points).shapes if isinstance(shape, Label)]
+    labels = [shape.text for shape in plot(points).shapes if isinstance(shape, Text)]
     assert {"the run itself", "alpha_min"} <= set(labels)
 
 

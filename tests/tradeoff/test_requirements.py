@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dyngs.errors import DyngsError
-from dyngs.tradeoff.knobs import Variant
 from dyngs.tradeoff.requirements import Figures, Goal, Requirement, choose, parse_goal, parse_requirements
+from dyngs.tradeoff.variants import Variant
 
 
 def figures(prune: float, psnr: float, fps: float, mb: float) -> Figures:

@@ -16,17 +16,17 @@ from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run, render_options
 from dyngs.runs.checkpoint import is_compact, load_run
-from dyngs.tradeoff.knobs import Variant, parse_settings
-from dyngs.tradeoff.measure import options_of
-from dyngs.tradeoff.models import Models, field_changes, traits, write_chosen
-from dyngs.tradeoff.points import Point, read_point
+from dyngs.tradeoff.measure import render_options_of
+from dyngs.tradeoff.measurements import Measurement, read_measurement
 from dyngs.tradeoff.report import write_report
 from dyngs.tradeoff.sweep import Plan, figures_of, sweep
+from dyngs.tradeoff.variant_runs import VariantRuns, field_changes, run_settings, write_chosen
+from dyngs.tradeoff.variants import Variant, parse_variations
 from dyngs.train.trainer import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-KNOBS = ("prune=0.5", "mask_times=3", "sh_degree=0", "storage=2", "field_step=64", "alpha_min=0.02", "scale=0.5")
-PLAN = Plan(parse_settings(KNOBS, trains=False), finetune=2, combine=2, rounds=1, threads=1)
+SETTINGS = ("prune=0.5", "mask_times=3", "sh_degree=0", "storage=2", "field_step=64", "alpha_min=0.02", "scale=0.5")
+PLAN = Plan(parse_variations(SETTINGS, trains=False), finetune=2, combine=2, rounds=1, threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -36,20 +36,20 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def models(run_dir: Path) -> Models:
-    return Models(run_dir, run_dir / "tradeoff", 1)
+def models(run_dir: Path) -> VariantRuns:
+    return VariantRuns(run_dir, run_dir / "tradeoff", 1)
 
 
 @pytest.fixture(scope="module")
-def points(models: Models) -> list[Point]:
+def points(models: VariantRuns) -> list[Measurement]:
     return sweep(models, PLAN, lambda line: None)
 
 
-def named(points: list[Point], variant: Variant) -> Point:
+def named(points: list[Measurement], variant: Variant) -> Measurement:
     return next(p for p in points if p.variant == variant)
 
 
-def test_the_run_itself_is_what_eval_says(points: list[Point], run_dir: Path) -> None:
+def test_the_run_itself_is_what_eval_says(points: list[Measurement], run_dir: Path) -> None:
     report, base = evaluate_run(run_dir, "test", threads=1), points[0]
     assert base.variant == Variant()
     assert (base.psnr, base.ssim) == pytest.approx((report.psnr, report.ssim))
@@ -57,7 +57,7 @@ def test_the_run_itself_is_what_eval_says(points: list[Point], run_dir: Path) ->
     assert base.gain == 1.0
 
 
-def test_every_knob_does_what_it_says(points: list[Point]) -> None:
+def test_every_knob_does_what_it_says(points: list[Measurement]) -> None:
     base, pruned = points[0], named(points, Variant(prune=0.5))
     assert pruned.num_gaussians == base.num_gaussians / 2
     assert pruned.mb < 0.75 * base.mb  # what moves is worth more and holds more numbers
@@ -73,29 +73,29 @@ def test_every_knob_does_what_it_says(points: list[Point]) -> None:
     assert all(p.memory_mb is None or p.memory_mb > 0 for p in points)
 
 
-def test_combinations_are_measured_too(points: list[Point]) -> None:
+def test_combinations_are_measured_too(points: list[Measurement]) -> None:
     together = [p for p in points if p.variant.knob == "several"]
     assert 0 < len(together) <= 3 * PLAN.combine
 
 
-def test_finished_points_are_not_measured_again(points: list[Point], models: Models) -> None:
+def test_finished_points_are_not_measured_again(points: list[Measurement], models: VariantRuns) -> None:
     said: list[str] = []
     files = sorted((models.out / "points").iterdir())
     times = [file.stat().st_mtime_ns for file in files]
     assert sweep(models, PLAN, said.append) == points
     assert said == []
     assert [file.stat().st_mtime_ns for file in files] == times
-    assert [read_point(file).variant.slug for file in files] == [file.stem for file in files]
+    assert [read_measurement(file).variant.slug for file in files] == [file.stem for file in files]
 
 
-def test_points_of_something_else_do_not_mix(points: list[Point], models: Models, tmp_path: Path) -> None:
+def test_points_of_something_else_do_not_mix(points: list[Measurement], models: VariantRuns, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="points of another run, checkpoint or split"):
         sweep(models, replace(PLAN, split="train"), lambda line: None)
     with pytest.raises(DyngsError, match="no views"):
-        sweep(Models(models.run_dir, tmp_path, 1), replace(PLAN, split="val"), lambda line: None)
+        sweep(VariantRuns(models.run_dir, tmp_path, 1), replace(PLAN, split="val"), lambda line: None)
 
 
-def test_the_report_has_every_point(points: list[Point], models: Models) -> None:
+def test_the_report_has_every_point(points: list[Measurement], models: VariantRuns) -> None:
     table, values, picture, page, pixels = write_report(models.out, points)
     assert pixels.read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader(table.read_text().splitlines()))
@@ -109,7 +109,7 @@ def test_the_report_has_every_point(points: list[Point], models: Models) -> None
     assert "src=" not in page.read_text()
 
 
-def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Point], models: Models) -> None:
+def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Measurement], models: VariantRuns) -> None:
     variant = Variant(prune=0.5, mask_times=3, storage=2.0, mode="antialiased", alpha_min=0.02, scale=0.5)
     folder = write_chosen(models, variant)
     chosen = load_run(folder)
@@ -118,7 +118,7 @@ def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Point], models:
     assert chosen.config.data.downscale == 2 * load_resolved(models.run_dir).data.downscale
     assert isinstance(chosen.scene, TrainedScene)
     assert chosen.scene.masks is not None
-    assert render_options(chosen.config.model) == options_of(variant, load_resolved(models.run_dir).model)
+    assert render_options(chosen.config.model) == render_options_of(variant, load_resolved(models.run_dir).model)
     for single in (Variant(sh_degree=0), Variant(alpha_min=0.02), Variant(storage=2.0)):
         folder = write_chosen(models, single)
         assert evaluate_run(folder, "test", threads=1).psnr == pytest.approx(named(points, single).psnr)
@@ -145,9 +145,9 @@ def test_another_field_moves_the_same(
     assert changed.deform.move_rotations
 
 
-def test_masks_that_a_run_has_stay(points: list[Point], models: Models, tmp_path: Path) -> None:
-    masked = Models(models.out / "training" / Variant(mask_times=3, finetune=2).slug, tmp_path, 1)
-    assert traits(masked.run_dir).masks == 3
+def test_masks_that_a_run_has_stay(points: list[Measurement], models: VariantRuns, tmp_path: Path) -> None:
+    masked = VariantRuns(models.out / "training" / Variant(mask_times=3, finetune=2).slug, tmp_path, 1)
+    assert run_settings(masked.run_dir).mask_times == 3
     for variant in (Variant(prune=0.5), Variant(prune=0.5, finetune=1)):
         scene = load_run(masked.folder(variant)).scene
         assert isinstance(scene, TrainedScene)
@@ -155,15 +155,15 @@ def test_masks_that_a_run_has_stay(points: list[Point], models: Models, tmp_path
         assert len(scene.masks.times) == 3
 
 
-def test_what_cannot_be_varied_is_named(models: Models) -> None:
+def test_what_cannot_be_varied_is_named(models: VariantRuns) -> None:
     said: list[str] = []
-    sweep(models, replace(PLAN, settings=parse_settings(["sh_degree=3"], trains=False), combine=0), said.append)
+    sweep(models, replace(PLAN, settings=parse_variations(["sh_degree=3"], trains=False), combine=0), said.append)
     assert said == ["nothing to vary in this run: sh_degree"]
 
 
-def test_a_stored_run_cannot_be_varied(points: list[Point], models: Models) -> None:
+def test_a_stored_run_cannot_be_varied(points: list[Measurement], models: VariantRuns) -> None:
     with pytest.raises(DyngsError, match=r"only scene\.dyngs is there; give the run that it was made from"):
-        traits(models.folder(Variant(storage=2.0)))
+        run_settings(models.folder(Variant(storage=2.0)))
 
 
 def test_a_damaged_point_says_what_to_do(tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_a_damaged_point_says_what_to_do(tmp_path: Path) -> None:
     point = '{"variant": {}, "num_views": 3, "psnr": %s, "ssim": 0.9, "lpips": null, "num_gaussians": 5, "mb": 1.5'
     point += ', "memory_mb": null, "speed": %s}'
     path.write_text(point % (30.5, "null"))
-    assert read_point(path).psnr == 30.5
+    assert read_measurement(path).psnr == 30.5
     spread, zero = (f'{{"median": {n}, "low": 1, "high": 2}}' for n in (1.5, 0))
     bad = [point % (psnr, "null") for psnr in ("NaN", "1e999", "[1]", '"x"', "[" * 5000 + "]" * 5000)]
     bad += [
@@ -180,4 +180,4 @@ def test_a_damaged_point_says_what_to_do(tmp_path: Path) -> None:
     for text in ("", "[]", "{}", '{"variant": {"prine": 1}, "speed": null}', *bad):
         path.write_text(text)
         with pytest.raises(DyngsError, match=r"x\.json: .* no measured point: remove it"):
-            read_point(path)
+            read_measurement(path)

@@ -21,7 +21,7 @@ from dyngs.runs.checkpoint import load_run, save_checkpoint, stored_scene
 from dyngs.static.densify import EditResult
 from dyngs.train.step import Trainer
 from dyngs.train.trainer import train
-from dyngs.view.playing import at_rest, playing_motion
+from dyngs.view.animation import at_rest, with_motion
 
 BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.11)
 
@@ -176,7 +176,7 @@ def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> No
 
     save_config(trainer.config, tmp_path / RESOLVED_NAME)
     run = load_run(tmp_path)
-    own = playing_motion(run, capture / "body_train.npz")
+    own = with_motion(run, capture / "body_train.npz")
     assert len(own.run.scene.times) == 3
     first, again = run.scene.at(0.0), own.run.scene.at(0.0)
     torch.testing.assert_close(again.log_scales, first.log_scales, rtol=0, atol=1e-4)

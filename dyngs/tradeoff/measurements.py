@@ -11,11 +11,11 @@ from pydantic import TypeAdapter
 
 from dyngs.errors import reading, require_regular
 from dyngs.files.write import write_text
-from dyngs.tradeoff.knobs import Variant
+from dyngs.tradeoff.variants import Variant
 
 
 @dataclass(frozen=True)
-class Spread:
+class Quartiles:
     """A median and its quartiles."""
 
     median: float
@@ -32,12 +32,12 @@ class Speed:
         gain: how many times as fast as the run itself is, in pairs of pictures drawn one after the other.
     """
 
-    ms: Spread
-    gain: Spread
+    ms: Quartiles
+    gain: Quartiles
 
 
 @dataclass(frozen=True)
-class Point:
+class Measurement:
     """A variant of a run, measured.
 
     Attributes:
@@ -66,10 +66,10 @@ class Point:
         return 1.0 if self.speed is None else self.speed.gain.median
 
 
-_POINT = TypeAdapter(Point)
+_POINT = TypeAdapter(Measurement)
 
 
-def read_point(path: Path) -> Point:
+def read_measurement(path: Path) -> Measurement:
     """The point in a file.
 
     Raises:
@@ -80,13 +80,13 @@ def read_point(path: Path) -> Point:
         stored = json.loads(path.read_text(encoding="utf-8"), parse_float=_finite, parse_constant=_finite)
         variant, speed = Variant.from_json(stored.pop("variant")), stored.pop("speed")
         if speed is not None:
-            speed = Speed(Spread(**speed["ms"]), Spread(**speed["gain"]))
+            speed = Speed(Quartiles(**speed["ms"]), Quartiles(**speed["gain"]))
             if min(*speed.ms.__dict__.values(), *speed.gain.__dict__.values()) <= 0:
                 raise ValueError("a time that is not positive")
-        return _POINT.validate_python(asdict(Point(variant=variant, speed=speed, **stored)))
+        return _POINT.validate_python(asdict(Measurement(variant=variant, speed=speed, **stored)))
 
 
-def write_point(path: Path, point: Point) -> None:
+def write_measurement(path: Path, point: Measurement) -> None:
     """Write it, atomically."""
     values = asdict(point) | {"variant": point.variant.to_json()}
     write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")

@@ -10,9 +10,9 @@ import torch
 from moving_scene import MOVING_ROWS, Sliding, moved_x, moving_scene, row_of_balls, still_scene, write_moving_run
 
 from dyngs.errors import DyngsError
-from dyngs.export import run as export_run
+from dyngs.export import run_to_ply
 from dyngs.export.ply import read_ply
-from dyngs.export.run import export_ply, frame_names, scene_part, write_moment, write_moments
+from dyngs.export.run_to_ply import export_ply, frame_names, scene_part, write_run_ply, write_run_ply_sequence
 from dyngs.runs.checkpoint import LoadedRun, load_run
 
 ALL = (0, 1, 2, 3, 4)
@@ -35,7 +35,7 @@ def x_of(path: Path) -> torch.Tensor:
 
 @pytest.mark.parametrize("time", [0.0, 0.3, 1.0])
 def test_one_moment(moving: LoadedRun, time: float, tmp_path: Path) -> None:
-    splat = read_ply(write_moment(moving, tmp_path / "a.ply", time))
+    splat = read_ply(write_run_ply(moving, tmp_path / "a.ply", time))
     torch.testing.assert_close(splat.gaussians.means[:, 0], moved_x(ALL, time))
     assert torch.equal(splat.gaussians.means[:, 1:], row_of_balls().means[:, 1:])
     assert f"dyngs time {time!r}" in splat.comments
@@ -44,10 +44,10 @@ def test_one_moment(moving: LoadedRun, time: float, tmp_path: Path) -> None:
 
 
 def test_a_still_run_has_no_time(still: LoadedRun, tmp_path: Path) -> None:
-    early, late = (write_moment(still, tmp_path / f"{time}.ply", time) for time in (0.0, 1.0))
+    early, late = (write_run_ply(still, tmp_path / f"{time}.ply", time) for time in (0.0, 1.0))
     assert early.read_bytes() == late.read_bytes()
     assert not any("time" in comment for comment in read_ply(early).comments)
-    everything = write_moment(still, tmp_path / "still.ply", part="still")
+    everything = write_run_ply(still, tmp_path / "still.ply", part="still")
     assert everything.read_bytes() == early.read_bytes()
 
 
@@ -58,8 +58,8 @@ def test_the_default_is_the_beginning(tmp_path: Path) -> None:
 
 def test_parts_together_are_the_whole(moving: LoadedRun, tmp_path: Path) -> None:
     for time in (0.0, 0.7):
-        moves = x_of(write_moment(moving, tmp_path / "moving.ply", time, "moving"))
-        stays = x_of(write_moment(moving, tmp_path / "still.ply", time, "still"))
+        moves = x_of(write_run_ply(moving, tmp_path / "moving.ply", time, "moving"))
+        stays = x_of(write_run_ply(moving, tmp_path / "still.ply", time, "still"))
         torch.testing.assert_close(moves, moved_x(MOVING_ROWS, time))
         torch.testing.assert_close(stays, moved_x(STILL_ROWS, time))
     assert not any("time" in comment for comment in read_ply(tmp_path / "still.ply").comments)
@@ -75,7 +75,7 @@ def test_empty_parts_are_refused() -> None:
 @pytest.mark.parametrize(("part", "rows"), [("all", ALL), ("moving", MOVING_ROWS)])
 def test_a_sequence(moving: LoadedRun, part, rows: tuple[int, ...], tmp_path: Path) -> None:
     times = (0.0, 0.25, 1.0)
-    written = write_moments(moving, tmp_path / "new" / "seq", times, part)
+    written = write_run_ply_sequence(moving, tmp_path / "new" / "seq", times, part)
     assert [p.name for p in written] == ["frame_0000.ply", "frame_0001.ply", "frame_0002.ply"]
     assert sorted((tmp_path / "new" / "seq").iterdir()) == written
     assert all(re.fullmatch(r"(.*?)(\d+)\.ply", p.name) for p in written)  # what players look for
@@ -95,16 +95,16 @@ def test_names_are_in_order_of_frames(count: int, last: str) -> None:
 
 def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(moving: LoadedRun, tmp_path: Path) -> None:
     folder = tmp_path / "seq"
-    write_moments(moving, folder, (0.0, 0.5))
+    write_run_ply_sequence(moving, folder, (0.0, 0.5))
     (folder / "notes.txt").write_text("mine")
-    longer = write_moments(moving, folder, (1.0, 1.0, 1.0))
+    longer = write_run_ply_sequence(moving, folder, (1.0, 1.0, 1.0))
     assert all(torch.equal(x_of(path), x_of(longer[0])) for path in longer)
     before = {p: p.read_bytes() for p in folder.iterdir()}
     with pytest.raises(DyngsError, match=r"holds other \.ply files \(frame_0002\.ply\)"):
-        write_moments(moving, folder, (0.0, 0.5))
+        write_run_ply_sequence(moving, folder, (0.0, 0.5))
     assert {p: p.read_bytes() for p in folder.iterdir()} == before
     with pytest.raises(DyngsError, match="is a file, but a sequence needs a folder"):
-        write_moments(moving, folder / "notes.txt", (0.0, 0.5))
+        write_run_ply_sequence(moving, folder / "notes.txt", (0.0, 0.5))
 
 
 @pytest.mark.parametrize("problem", [DyngsError("NaN"), OSError(28, "No space left on device"), KeyboardInterrupt()])
@@ -112,7 +112,7 @@ def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(moving
 def test_a_sequence_that_fails_leaves_nothing(
     moving: LoadedRun, problem: BaseException, exists: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, real, count = tmp_path / "seq", export_run.write_ply, []
+    folder, real, count = tmp_path / "seq", run_to_ply.write_ply, []
     if exists:
         folder.mkdir()
         (folder / "notes.txt").write_text("mine")
@@ -123,8 +123,8 @@ def test_a_sequence_that_fails_leaves_nothing(
             raise problem
         return real(*arguments, **options)
 
-    monkeypatch.setattr(export_run, "write_ply", failing)
+    monkeypatch.setattr(run_to_ply, "write_ply", failing)
     with pytest.raises(DyngsError if isinstance(problem, OSError) else type(problem)):
-        write_moments(moving, folder, (0.0, 0.25, 0.5, 0.75))
+        write_run_ply_sequence(moving, folder, (0.0, 0.25, 0.5, 0.75))
     assert len(count) == 3
     assert [p.name for p in tmp_path.rglob("*")] == (["seq", "notes.txt"] if exists else [])

@@ -6,12 +6,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from dyngs.tradeoff.canvas import Dot, Drawing, Label, Line
+from dyngs.tradeoff.vector_graphics import Circle, Drawing, Line, Text
 
 SHAPES = (
     Line(((10, 10), (90, 10)), "#ff0000", 2),
-    Dot(30, 30, 6, "#0000ff", "a <tip> & more"),
-    Label(60, 40, "dB < 3 & more", "middle", bold=True),
+    Circle(30, 30, 6, "#0000ff", "a <tip> & more"),
+    Text(60, 40, "dB < 3 & more", "middle", bold=True),
 )
 
 
@@ -36,6 +36,6 @@ def test_pixels_are_where_the_shapes_are() -> None:
 
 
 def test_later_shapes_are_on_top() -> None:
-    over = (Dot(20, 20, 6, "#00ff00"), Line(((0, 20), (40, 20)), "#000000", 2))
+    over = (Circle(20, 20, 6, "#00ff00"), Line(((0, 20), (40, 20)), "#000000", 2))
     assert Drawing(40, 40, over).pixels()[40, 40].tolist() == [0, 0, 0]
     assert Drawing(40, 40, over[::-1]).pixels()[40, 40].tolist() == [0, 255, 0]

@@ -23,8 +23,8 @@ from dyngs.files.write import to_uint8, write_image
 from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import load_run
 from dyngs.scene import Moment, Scene, moment_of
-from dyngs.view.paths import CameraPath
-from dyngs.view.sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
+from dyngs.view.camera_paths import CameraPath
+from dyngs.view.contact_sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
 from dyngs.view.video import VideoWriter
 
 DEFAULT_OPTIONS = RenderOptions()
@@ -65,7 +65,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Shot:
+class RenderJob:
     """A scene, and the cameras and times at which it is seen.
 
     Attributes:
@@ -102,7 +102,7 @@ def render_frame(
     return Frame(rendering.rgb[0].clamp(0, 1).cpu().numpy(), rendering.alpha[0].cpu().numpy(), depth)
 
 
-def shot_frames(shot: Shot) -> Iterator[Frame]:
+def job_frames(shot: RenderJob) -> Iterator[Frame]:
     """The pictures of a shot, one at a time: memory does not grow with their number.
 
     The scene is deformed anew only where the time differs from that of the picture before.
@@ -116,7 +116,7 @@ def shot_frames(shot: Shot) -> Iterator[Frame]:
         yield render_frame(moment, shot.path.cameras.select(i), shot.options, shot.background)
 
 
-def write_path_frames(shot: Shot, out_dir: Path | None, output: OutputOptions = OutputOptions()) -> list[Path]:
+def write_job_images(shot: RenderJob, out_dir: Path | None, output: OutputOptions = OutputOptions()) -> list[Path]:
     """Paths of the files written for a shot: ``frame_0000.png`` and so on, and the video if one is asked for.
 
     Args:
@@ -134,15 +134,15 @@ def write_path_frames(shot: Shot, out_dir: Path | None, output: OutputOptions = 
     shot = replace(shot, options=_with_depth(shot.options, output))
     limits = None
     if output.depth and out_dir is not None:
-        limits = _shared_depth_limits(shot_frames(replace(shot, path=_sample(shot.path))))
+        limits = _shared_depth_limits(job_frames(replace(shot, path=_sample(shot.path))))
     digits = max(4, len(str(len(shot.path) - 1)))
     with _FrameWriter(out_dir, output, shot.kept, limits) as writer:
-        for i, frame in enumerate(shot_frames(shot)):
+        for i, frame in enumerate(job_frames(shot)):
             writer.write(f"frame_{i:0{digits}d}", frame)
     return writer.written
 
 
-def write_split(run_dir: Path, split: str, out_dir: Path, output: OutputOptions = OutputOptions()) -> list[Path]:
+def write_split_images(run_dir: Path, split: str, out_dir: Path, output: OutputOptions = OutputOptions()) -> list[Path]:
     """Paths of the files written for a split of a run: ``NAME.png`` per view, and ``sheet.png`` (truth, render, error).
 
     The sheet shows at most 12 views, evenly spread, with their PSNR, black where a mask leaves pixels out. The

@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
-from dyngs.view.paths import (
+from dyngs.view.camera_paths import (
     CameraPath,
     frame_orbit_for_points,
-    frozen_path,
     look_at,
     look_at_point,
     mean_up,
@@ -26,6 +25,7 @@ from dyngs.view.paths import (
     parse_times,
     read_path,
     spiral_path,
+    static_path,
     with_times,
     write_path,
 )
@@ -337,13 +337,13 @@ def test_wrong_numbers_of_times_and_times_that_are_none() -> None:
 
 def test_a_frozen_path_is_one_camera_at_many_times() -> None:
     camera = _ring(3, np.zeros(3)).select(1)
-    path = frozen_path(camera, (0.0, 0.5, 1.0), 12.0)
+    path = static_path(camera, (0.0, 0.5, 1.0), 12.0)
     assert (len(path), path.times, path.fps, path.warnings) == (3, (0.0, 0.5, 1.0), 12.0, ())
     for i in range(3):
         assert torch.equal(path.cameras.cam_from_world[i], camera.cam_from_world[0])
         assert torch.equal(path.cameras.intrinsics[i], camera.intrinsics[0])
     with pytest.raises(ValueError, match="one camera"):
-        frozen_path(_ring(3, np.zeros(3)), (0.0,))
+        static_path(_ring(3, np.zeros(3)), (0.0,))
 
 
 def test_times_in_words() -> None:

@@ -30,7 +30,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Dot:
+class Circle:
     """A disc with a white rim; ``tip`` is shown where the pointer rests on it."""
 
     x: float
@@ -41,7 +41,7 @@ class Dot:
 
 
 @dataclass(frozen=True)
-class Label:
+class Text:
     """Words whose baseline starts, ends or has its middle at (x, y)."""
 
     x: float
@@ -52,7 +52,7 @@ class Label:
     bold: bool = False
 
 
-Shape = Line | Dot | Label
+Shape = Line | Circle | Text
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def _element(shape: Shape) -> str:
     if isinstance(shape, Line):
         joined = " ".join(f"{x:.1f},{y:.1f}" for x, y in shape.points)
         return f'<polyline points="{joined}" fill="none" stroke="{shape.colour}" stroke-width="{shape.width}"/>'
-    if isinstance(shape, Dot):
+    if isinstance(shape, Circle):
         tip = f"<title>{escape(shape.tip)}</title>" if shape.tip else ""
         place = f'cx="{shape.x:.1f}" cy="{shape.y:.1f}" r="{shape.radius}"'
         return f'<circle {place} fill="{shape.colour}" stroke="white">{tip}</circle>'
@@ -102,7 +102,7 @@ def _draw(pen: ImageDraw.ImageDraw, shape: Shape, scale: int) -> None:
     if isinstance(shape, Line):
         points = [(scale * x, scale * y) for x, y in shape.points]
         pen.line(points, fill=shape.colour, width=round(scale * shape.width), joint="curve")
-    elif isinstance(shape, Dot):
+    elif isinstance(shape, Circle):
         pen.circle((scale * shape.x, scale * shape.y), scale * (shape.radius + 0.5), fill="white")
         pen.circle((scale * shape.x, scale * shape.y), scale * (shape.radius - 0.5), fill=shape.colour)
     else:

@@ -20,15 +20,15 @@ Part = Literal["all", "moving", "still"]
 
 
 def export_ply(run_dir: Path, path: Path) -> Path:
-    """``path`` of the .ply written from a run's newest checkpoint, at time 0; see ``write_moment``.
+    """``path`` of the .ply written from a run's newest checkpoint, at time 0; see ``write_run_ply``.
 
     Raises:
         DyngsError: no such run, no checkpoint, or the file cannot be written.
     """
-    return write_moment(load_run(run_dir), path)
+    return write_run_ply(load_run(run_dir), path)
 
 
-def write_moment(run: LoadedRun, path: Path, time: float = 0.0, part: Part = "all") -> Path:
+def write_run_ply(run: LoadedRun, path: Path, time: float = 0.0, part: Part = "all") -> Path:
     """``path`` of the .ply written; a 3D filter is fused, the header names the mode, and the time where things move.
 
     Args:
@@ -43,7 +43,7 @@ def write_moment(run: LoadedRun, path: Path, time: float = 0.0, part: Part = "al
     return _write(run, scene_part(run.scene, part), path, time)
 
 
-def write_moments(run: LoadedRun, folder: Path, times: Sequence[float], part: Part = "all") -> list[Path]:
+def write_run_ply_sequence(run: LoadedRun, folder: Path, times: Sequence[float], part: Part = "all") -> list[Path]:
     """Paths of the numbered files written, one per time: ``frame_0000.ply`` and so on, a sequence for players.
 
     All are written into a hidden folder first and appear together at the end, so that an export that fails leaves no
@@ -53,7 +53,7 @@ def write_moments(run: LoadedRun, folder: Path, times: Sequence[float], part: Pa
         run: a trained model.
         folder: where to; made where it is missing. Files of an earlier sequence of the same length are replaced.
         times: T >= 1, in [0, 1].
-        part: as in ``write_moment``.
+        part: as in ``write_run_ply``.
 
     Raises:
         DyngsError: the part is empty, the folder holds other .ply files, or the files cannot be written.

@@ -20,13 +20,13 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.export.ply import write_ply
 from dyngs.gaussians import Gaussians
-from dyngs.view.paths import CameraPath, write_path
-from dyngs.view.shots import (
-    ShotOptions,
+from dyngs.view.camera_paths import CameraPath, write_path
+from dyngs.view.job_of_run import (
+    RenderJobOptions,
     cameras_for_paths,
+    job_of_ply,
+    job_of_run,
     resize_cameras,
-    shot_of_ply,
-    shot_of_run,
     view_to_show,
 )
 
@@ -60,7 +60,7 @@ def test_resizing_keeps_corners_inside_and_pixels_square(old: tuple[int, int], n
 @pytest.mark.parametrize("up", ["z", "-y", "x"])
 def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) -> None:
     file = write_ply(tmp_path / "a.ply", some_gaussians(), RasterizeMode.ANTIALIASED, eps2d=0.1)
-    shot = shot_of_ply(file, ShotOptions(path, num_frames=5, size=(80, 60), up=up))
+    shot = job_of_ply(file, RenderJobOptions(path, num_frames=5, size=(80, 60), up=up))
     axis = np.zeros(3)
     axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     means = torch.cat([shot.scene.gaussians.means, torch.ones(len(shot.scene), 1)], dim=1)
@@ -83,14 +83,16 @@ def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) 
 def test_an_unknown_path_is_named(tmp_path: Path) -> None:
     file = write_ply(tmp_path / "a.ply", some_gaussians())
     with pytest.raises(DyngsError, match="no camera path 'circle'"):
-        shot_of_ply(file, ShotOptions("circle"))
+        job_of_ply(file, RenderJobOptions("circle"))
 
 
-@pytest.mark.parametrize("options", [ShotOptions(times=(0.5,)), ShotOptions(None), ShotOptions(view="0")])
-def test_a_file_has_neither_times_nor_views(options: ShotOptions, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "options", [RenderJobOptions(times=(0.5,)), RenderJobOptions(None), RenderJobOptions(view="0")]
+)
+def test_a_file_has_neither_times_nor_views(options: RenderJobOptions, tmp_path: Path) -> None:
     file = write_ply(tmp_path / "a.ply", some_gaussians())
     with pytest.raises(DyngsError, match=r"a \.ply holds one moment and no views"):
-        shot_of_ply(file, options)
+        job_of_ply(file, options)
 
 
 @pytest.fixture(scope="module")
@@ -109,29 +111,32 @@ def capture_of(run_dir: Path) -> Capture:
 
 @pytest.mark.parametrize("path", ["orbit", "spiral"])
 def test_time_runs_along_a_path_unless_told_otherwise(path: str, moving_run: Path, still_run: Path) -> None:
-    shot = shot_of_run(moving_run, ShotOptions(path, 5))
+    shot = job_of_run(moving_run, RenderJobOptions(path, 5))
     assert shot.path.times == (0.0, 0.25, 0.5, 0.75, 1.0)
     assert len(shot.notes) == 1
     assert "from 0 to 1" in shot.notes[0]
-    frozen = shot_of_run(moving_run, ShotOptions(path, 5, times=(0.4,)))
+    frozen = job_of_run(moving_run, RenderJobOptions(path, 5, times=(0.4,)))
     assert frozen.path.times == (0.4,) * 5
     assert torch.equal(frozen.path.cameras.cam_from_world, shot.path.cameras.cam_from_world)
-    together = shot_of_run(moving_run, ShotOptions(path, 3, times=(1.0, 0.5, 0.0)))
+    together = job_of_run(moving_run, RenderJobOptions(path, 3, times=(1.0, 0.5, 0.0)))
     assert together.path.times == (1.0, 0.5, 0.0)
     assert (frozen.notes, together.notes) == ((), ())
-    still = shot_of_run(still_run, ShotOptions(path, 3))
+    still = job_of_run(still_run, RenderJobOptions(path, 3))
     assert (still.path.times, still.notes) == (None, ())
 
 
 def test_times_of_a_still_run_are_accepted_with_a_note(still_run: Path) -> None:
-    shot = shot_of_run(still_run, ShotOptions("orbit", 3, times=(0.0, 0.5, 1.0)))
+    shot = job_of_run(still_run, RenderJobOptions("orbit", 3, times=(0.0, 0.5, 1.0)))
     assert len(shot.path) == 3
     assert "nothing moves" in shot.notes[0]
 
 
 def test_times_outside_are_clamped_with_one_warning(moving_run: Path) -> None:
-    for options in (ShotOptions("orbit", 3, times=(-1.0, 0.5, 9.0)), ShotOptions(None, times=(-1.0, 0.5, 9.0))):
-        shot = shot_of_run(moving_run, options)
+    for options in (
+        RenderJobOptions("orbit", 3, times=(-1.0, 0.5, 9.0)),
+        RenderJobOptions(None, times=(-1.0, 0.5, 9.0)),
+    ):
+        shot = job_of_run(moving_run, options)
         assert shot.path.times == (0.0, 0.5, 1.0)
         assert len(shot.path.warnings) == 1
         assert "clamped" in shot.path.warnings[0]
@@ -141,28 +146,28 @@ def test_times_of_a_file_are_overridden(moving_run: Path, tmp_path: Path) -> Non
     cameras = cameras_for_paths(capture_of(moving_run), DataConfig(root=moving_run.parent / "capture"))
     file = tmp_path / "path.json"
     write_path(file, CameraPath(cameras, 12.0, (0.1, 0.2, 0.3, 0.4, 0.5)))
-    own = shot_of_run(moving_run, ShotOptions(str(file)))
+    own = job_of_run(moving_run, RenderJobOptions(str(file)))
     assert own.path.times == pytest.approx((0.1, 0.2, 0.3, 0.4, 0.5))
     assert (own.path.fps, own.notes) == (12.0, ())
-    assert shot_of_run(moving_run, ShotOptions(str(file), times=(0.7,))).path.times == (0.7,) * 5
+    assert job_of_run(moving_run, RenderJobOptions(str(file), times=(0.7,))).path.times == (0.7,) * 5
     given = (0.0, 0.0, 1.0, 1.0, 0.5)
-    assert shot_of_run(moving_run, ShotOptions(str(file), times=given)).path.times == given
+    assert job_of_run(moving_run, RenderJobOptions(str(file), times=given)).path.times == given
     with pytest.raises(DyngsError, match="5 cameras, but there are 3 times"):
-        shot_of_run(moving_run, ShotOptions(str(file), times=(0.0, 0.5, 1.0)))
+        job_of_run(moving_run, RenderJobOptions(str(file), times=(0.0, 0.5, 1.0)))
 
 
 def test_a_camera_that_stands_still(moving_run: Path) -> None:
     capture = capture_of(moving_run)
     wanted = PictureLoader(capture.splits["test"], DataConfig(root=capture.root))[1]
-    shot = shot_of_run(moving_run, ShotOptions(None, times=(0.0, 0.5, 1.0), view="1"))
+    shot = job_of_run(moving_run, RenderJobOptions(None, times=(0.0, 0.5, 1.0), view="1"))
     assert shot.path.times == (0.0, 0.5, 1.0)
     assert (shot.path.cameras.width, shot.path.cameras.height) == (16, 16)
     for i in range(3):
         torch.testing.assert_close(shot.path.cameras.cam_from_world[i], wanted.cameras.cam_from_world[0])
         torch.testing.assert_close(shot.path.cameras.intrinsics[i], wanted.cameras.intrinsics[0])
-    assert shot_of_run(moving_run, ShotOptions(None, view="1")).path.times == (TEST_TIMES[1],)
-    assert shot_of_run(moving_run, ShotOptions(None, split="train", view="1")).path.times == (TRAIN_TIMES[1],)
-    small = shot_of_run(moving_run, ShotOptions(None, times=(0.5,), size=(8, 4))).path.cameras
+    assert job_of_run(moving_run, RenderJobOptions(None, view="1")).path.times == (TEST_TIMES[1],)
+    assert job_of_run(moving_run, RenderJobOptions(None, split="train", view="1")).path.times == (TRAIN_TIMES[1],)
+    small = job_of_run(moving_run, RenderJobOptions(None, times=(0.5,), size=(8, 4))).path.cameras
     assert (len(small), small.width, small.height) == (1, 8, 4)
 
 

@@ -18,17 +18,17 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
 from dyngs.export.ply import read_ply
 from dyngs.runs.checkpoint import LoadedRun, load_run
-from dyngs.view.frames import Shot, file_stems, files_of, splat_options
-from dyngs.view.paths import (
+from dyngs.view.animation import at_rest, with_motion
+from dyngs.view.camera_paths import (
     CameraPath,
     frame_orbit_for_points,
-    frozen_path,
     orbit_path,
     read_path,
     spiral_path,
+    static_path,
     with_times,
 )
-from dyngs.view.playing import at_rest, playing_motion
+from dyngs.view.image_files import RenderJob, file_stems, files_of, splat_options
 
 DEFAULT_FRAMES = 120
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -36,7 +36,7 @@ DEFAULT_SIZE = (960, 720)
 
 
 @dataclass(frozen=True)
-class ShotOptions:
+class RenderJobOptions:
     """Which cameras to place, and when they look.
 
     Attributes:
@@ -65,7 +65,7 @@ class ShotOptions:
     at_rest: bool = False
 
 
-def shot_of_run(run_dir: Path, options: ShotOptions) -> Shot:
+def job_of_run(run_dir: Path, options: RenderJobOptions) -> RenderJob:
     """The scene of a run along a path placed by its training cameras, or before one of its cameras.
 
     Raises:
@@ -73,7 +73,7 @@ def shot_of_run(run_dir: Path, options: ShotOptions) -> Shot:
     """
     run, fps = load_run(run_dir), None
     if options.motion is not None:
-        played = playing_motion(run, options.motion)
+        played = with_motion(run, options.motion)
         run, fps = played.run, played.fps
     elif options.at_rest:
         run = at_rest(run)
@@ -92,10 +92,10 @@ def shot_of_run(run_dir: Path, options: ShotOptions) -> Shot:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     if fps is not None:
         path = replace(path, fps=fps)
-    return Shot(run.scene, path, render_options(run.config.model), background, notes, files_of(capture))
+    return RenderJob(run.scene, path, render_options(run.config.model), background, notes, files_of(capture))
 
 
-def shot_of_ply(file: Path, options: ShotOptions) -> Shot:
+def job_of_ply(file: Path, options: RenderJobOptions) -> RenderJob:
     """A path around the Gaussians of a .ply, placed by their extent; non-finite Gaussians are left out.
 
     Raises:
@@ -115,7 +115,7 @@ def shot_of_ply(file: Path, options: ShotOptions) -> Shot:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     _, background = evaluation_background(options.background or "black", has_alpha=False)
     scene = TrainedScene(splat.gaussians, torch.zeros(0, dtype=torch.long))
-    return Shot(scene, path, splat_options(splat), background)
+    return RenderJob(scene, path, splat_options(splat), background)
 
 
 def cameras_for_paths(capture: Capture, data: DataConfig) -> Cameras:
@@ -155,15 +155,15 @@ def view_to_show(capture: Capture, name: str | None = None, split: str | None = 
     )
 
 
-def _standing_path(run: LoadedRun, capture: Capture, options: ShotOptions) -> CameraPath:
+def _standing_path(run: LoadedRun, capture: Capture, options: RenderJobOptions) -> CameraPath:
     """One camera of the capture at ``options.times``, or at its own time."""
     view = view_to_show(capture, options.view, options.split)
     (camera,) = training_cameras([view], run.config.data)
     times = run.scene.times if options.motion is not None else (view.time or 0.0,)
-    return frozen_path(camera, times if options.times is None else options.times)
+    return static_path(camera, times if options.times is None else options.times)
 
 
-def _moving_path(run: LoadedRun, capture: Capture, options: ShotOptions) -> CameraPath:
+def _moving_path(run: LoadedRun, capture: Capture, options: RenderJobOptions) -> CameraPath:
     """The path that ``options`` name, with ``options.times`` if there are any."""
     path = options.path or "orbit"
     file = path_file(path)
@@ -189,7 +189,7 @@ def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
     return replace(cameras, intrinsics=intrinsics, width=width, height=height)
 
 
-def _around_points(means: np.ndarray, options: ShotOptions) -> Cameras:
+def _around_points(means: np.ndarray, options: RenderJobOptions) -> Cameras:
     """An orbit around the points, or a spiral before the side that an orbit shows first."""
     axis = _AXES[options.up.lstrip("-")]
     sign = -1.0 if options.up.startswith("-") else 1.0

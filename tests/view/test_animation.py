@@ -9,12 +9,12 @@ from moving_scene import write_moving_run
 
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import load_run
-from dyngs.view.playing import at_rest, playing_motion
+from dyngs.view.animation import at_rest, with_motion
 
 
 def test_only_people_play_motions(tmp_path: Path) -> None:
     run = load_run(write_moving_run(tmp_path / "run"))
     with pytest.raises(DyngsError, match=r"--motion walk.npz needs the run of a person \(model.kind=human\)"):
-        playing_motion(run, Path("walk.npz"))
+        with_motion(run, Path("walk.npz"))
     with pytest.raises(DyngsError, match="--pose rest needs the run of a person"):
         at_rest(run)

@@ -13,7 +13,7 @@ from datetime import timedelta
 import torch
 
 from dyngs.errors import DyngsError
-from dyngs.tradeoff.knobs import Variant
+from dyngs.tradeoff.variants import Variant
 from dyngs.train.trainer import num_cores
 
 PATIENCE = timedelta(days=30)
@@ -21,7 +21,7 @@ PATIENCE = timedelta(days=30)
 
 
 @dataclass(frozen=True)
-class Ranks:
+class ProcessGroup:
     """This process among all.
 
     Attributes:
@@ -35,7 +35,7 @@ class Ranks:
     here: int = 1
 
     @staticmethod
-    def from_environment() -> Ranks:
+    def from_environment() -> ProcessGroup:
         """What ``torchrun`` says; one process without it.
 
         Raises:
@@ -43,9 +43,9 @@ class Ranks:
         """
         names = ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")
         if any(name not in os.environ for name in (*names, "MASTER_ADDR", "MASTER_PORT")):
-            return ALONE
+            return SINGLE_PROCESS
         try:
-            return Ranks(*(int(os.environ[name]) for name in names))
+            return ProcessGroup(*(int(os.environ[name]) for name in names))
         except ValueError:
             raise DyngsError(f"{', '.join(names)} must be numbers, as torchrun sets them") from None
 
@@ -75,7 +75,7 @@ class Ranks:
         torch.distributed.barrier()
 
 
-ALONE = Ranks()
+SINGLE_PROCESS = ProcessGroup()
 
 
 def _made_with(variant: Variant) -> Variant:

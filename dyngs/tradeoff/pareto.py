@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from dyngs.tradeoff.knobs import SEVERAL, Variant
-from dyngs.tradeoff.points import Point
+from dyngs.tradeoff.measurements import Measurement
+from dyngs.tradeoff.variants import SEVERAL, Variant
 
 NO_GAIN = 0.05
 """Doublings below which nothing counts as gained: 3.5 %."""
@@ -16,7 +16,7 @@ TOO_MUCH_DB = 6.0
 
 
 @dataclass(frozen=True)
-class Exchange:
+class ExchangeRate:
     """What one knob costs and brings.
 
     Attributes:
@@ -33,7 +33,7 @@ class Exchange:
     size: float
 
 
-def pareto(goals: Sequence[Sequence[float]]) -> list[bool]:
+def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
     """Whether each of some points is beaten by none: no other is as good in all goals and better in one.
 
     Args:
@@ -42,9 +42,9 @@ def pareto(goals: Sequence[Sequence[float]]) -> list[bool]:
     return [not any(_beats(other, own) for other in goals) for own in goals]
 
 
-def on_front(points: Sequence[Point]) -> list[bool]:
+def on_front(points: Sequence[Measurement]) -> list[bool]:
     """Whether each is beaten by none in PSNR, speed and size together."""
-    return pareto([(p.psnr, p.gain, -p.mb) for p in points])
+    return pareto_mask([(p.psnr, p.gain, -p.mb) for p in points])
 
 
 def rate(loss: float, factor: float) -> float | None:
@@ -59,19 +59,19 @@ def slope(losses_and_factors: Iterable[tuple[float, float]]) -> float | None:
     return sum(loss * x for loss, x in pairs) / sum(x * x for _, x in pairs) if pairs else None
 
 
-def exchanges(base: Point, points: Iterable[Point]) -> list[Exchange]:
+def exchange_rates(base: Measurement, points: Iterable[Measurement]) -> list[ExchangeRate]:
     """For each knob what it costs and brings, from the points that turn it alone; in the order of their first points.
 
     Args:
         base: the run itself.
         points: any.
     """
-    groups: dict[str, list[Point]] = {}
+    groups: dict[str, list[Measurement]] = {}
     for point in points:
         if point.variant.knob not in ("", SEVERAL):
             groups.setdefault(point.variant.knob, []).append(point)
     return [
-        Exchange(
+        ExchangeRate(
             knob=knob,
             db_per_speed=slope((base.psnr - p.psnr, p.gain) for p in group),
             db_per_size=slope((base.psnr - p.psnr, base.mb / p.mb) for p in group),
@@ -82,7 +82,7 @@ def exchanges(base: Point, points: Iterable[Point]) -> list[Exchange]:
     ]
 
 
-def combinations(base: Point, singles: Sequence[Point], count: int) -> list[Variant]:
+def combinations(base: Measurement, singles: Sequence[Measurement], count: int) -> list[Variant]:
     """Variants worth measuring next: single changes put together, the cheapest first.
 
     Three ways are gone from the run on: for speed, for size, and for both. Each adds the change that loses least PSNR
@@ -94,7 +94,7 @@ def combinations(base: Point, singles: Sequence[Point], count: int) -> list[Vari
         singles: points that turn one knob each; of one knob the stronger values come later.
         count: steps of each way.
     """
-    ways: list[list[tuple[float, Point]]] = [[], [], []]
+    ways: list[list[tuple[float, Measurement]]] = [[], [], []]
     for point in singles:
         loss, smaller = base.psnr - point.psnr, base.mb / point.mb
         if loss > TOO_MUCH_DB:

@@ -15,17 +15,17 @@ from dyngs.export.avatar import read_avatar
 from dyngs.human.avatar.trained import AvatarScene
 from dyngs.human.motion.placement import up_direction
 from dyngs.human.pose.skinning import axis_angle_to_matrix
-from dyngs.view.frames import Shot
-from dyngs.view.paths import CameraPath, frame_orbit_for_points, frozen_path, read_path, spiral_path, with_times
-from dyngs.view.playing import playing_motion
-from dyngs.view.shots import DEFAULT_FRAMES, DEFAULT_SIZE, ShotOptions, path_file, resize_cameras
+from dyngs.view.animation import with_motion
+from dyngs.view.camera_paths import CameraPath, frame_orbit_for_points, read_path, spiral_path, static_path, with_times
+from dyngs.view.image_files import RenderJob
+from dyngs.view.job_of_run import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJobOptions, path_file, resize_cameras
 
 _MOMENTS = 8
 """Of a motion, at which the camera must see the person."""
 _RING = 24
 
 
-def shot_of_avatar(file: Path, options: ShotOptions) -> Shot:
+def job_of_avatar(file: Path, options: RenderJobOptions) -> RenderJob:
     """The person of a file along a path around it, or before one camera that stands in front of it.
 
     Raises:
@@ -35,7 +35,7 @@ def shot_of_avatar(file: Path, options: ShotOptions) -> Shot:
         raise DyngsError(f"{file}: an avatar file holds no views; leave out --view")
     run, fps = read_avatar(file), None
     if options.motion is not None:
-        played = playing_motion(run, options.motion)
+        played = with_motion(run, options.motion)
         run, fps = played.run, played.fps
     if not isinstance(run.scene, AvatarScene):
         raise DyngsError(f"{file}: holds no person; give a file of `dyngs export RUN --format avatar`")
@@ -45,14 +45,14 @@ def shot_of_avatar(file: Path, options: ShotOptions) -> Shot:
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     _, background = evaluation_background(options.background or run.info.background, has_alpha=True)
-    return Shot(run.scene, path, render_options(run.config.model), background)
+    return RenderJob(run.scene, path, render_options(run.config.model), background)
 
 
-def _path(scene: AvatarScene, world_offset: tuple[float, float, float], options: ShotOptions) -> CameraPath:
+def _path(scene: AvatarScene, world_offset: tuple[float, float, float], options: RenderJobOptions) -> CameraPath:
     """The cameras that are asked for, and the moments of the clip that they see."""
     times = scene.times if options.times is None else options.times
     if options.path is None:
-        return frozen_path(_around(scene, options, 1), times)
+        return static_path(_around(scene, options, 1), times)
     named = path_file(options.path)
     if named is not None:
         path = read_path(named, np.asarray(world_offset))
@@ -67,7 +67,7 @@ def _path(scene: AvatarScene, world_offset: tuple[float, float, float], options:
     return with_times(replace(path, warnings=()), times * len(path) if len(times) == 1 else times)
 
 
-def _around(scene: AvatarScene, options: ShotOptions, count: int) -> Cameras:
+def _around(scene: AvatarScene, options: RenderJobOptions, count: int) -> Cameras:
     """An orbit around where the person is, a spiral before it, or without a path the one camera in front of it."""
     moments = np.linspace(0, 1, 1 if scene.is_still else _MOMENTS)
     means = torch.cat([scene.at(moment).means for moment in moments.tolist()]).numpy()

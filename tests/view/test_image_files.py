@@ -26,19 +26,19 @@ from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, render
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.scene import Moment, moment_of
-from dyngs.view.frames import (
+from dyngs.view.camera_paths import CameraPath, static_path
+from dyngs.view.image_files import (
     DEFAULT_OPTIONS,
     OutputOptions,
-    Shot,
+    RenderJob,
     file_stems,
     files_of,
+    job_frames,
     render_frame,
-    shot_frames,
     splat_options,
-    write_path_frames,
-    write_split,
+    write_job_images,
+    write_split_images,
 )
-from dyngs.view.paths import CameraPath, frozen_path
 from dyngs.view.video import read_frames
 
 
@@ -65,10 +65,10 @@ def cameras_around(count: int, width: int = 24, height: int = 18, distance: floa
 
 def balls_shot(
     cameras: Cameras, options: RenderOptions = DEFAULT_OPTIONS, background: torch.Tensor | None = None
-) -> Shot:
+) -> RenderJob:
     """The two balls seen by ``cameras``."""
     scene = TrainedScene(two_balls(), torch.zeros(0, dtype=torch.long))
-    return Shot(scene, CameraPath(cameras), options, background)
+    return RenderJob(scene, CameraPath(cameras), options, background)
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -96,7 +96,7 @@ def test_frames_are_the_renders_one_by_one() -> None:
     gaussians, cameras = two_balls(), cameras_around(3)
     options, background = RenderOptions(depth="expected"), torch.tensor([0.1, 0.2, 0.9])
     together = render(gaussians, cameras, options, background=background)
-    frames = list(shot_frames(balls_shot(cameras, options, background)))
+    frames = list(job_frames(balls_shot(cameras, options, background)))
     assert len(frames) == 3
     for i, frame in enumerate(frames):
         np.testing.assert_allclose(frame.rgb, together.rgb[i].clamp(0, 1), atol=1e-6)
@@ -110,30 +110,30 @@ def test_frames_are_the_renders_one_by_one() -> None:
     assert red[1] < 0.2
     assert frames[0].depth is not None
     assert abs(frames[0].depth[9, 9] - 4) < 0.01
-    assert next(shot_frames(balls_shot(cameras))).depth is None
+    assert next(job_frames(balls_shot(cameras))).depth is None
 
 
 def test_frames_are_drawn_lazily() -> None:
-    frames = shot_frames(balls_shot(cameras_around(3)))
+    frames = job_frames(balls_shot(cameras_around(3)))
     next(frames)
     frames.close()  # type: ignore[attr-defined]
 
 
 def test_path_writes_numbered_pictures(tmp_path) -> None:
-    written = write_path_frames(balls_shot(cameras_around(3)), tmp_path / "out")
+    written = write_job_images(balls_shot(cameras_around(3)), tmp_path / "out")
     assert names(tmp_path / "out") == ["frame_0000.png", "frame_0001.png", "frame_0002.png"]
     assert [p.name for p in written] == names(tmp_path / "out")
-    frame = next(shot_frames(balls_shot(cameras_around(3))))
+    frame = next(job_frames(balls_shot(cameras_around(3))))
     np.testing.assert_allclose(read_image(written[0]), frame.rgb, atol=0.5 / 255 + 1e-6)
 
 
 def test_path_writes_depth_alpha_and_video(tmp_path) -> None:
     cameras = cameras_around(4)
     output = OutputOptions(depth=True, alpha=True, video=tmp_path / "v" / "path.mp4", fps=12)
-    written = write_path_frames(balls_shot(cameras), tmp_path / "out", output)
+    written = write_job_images(balls_shot(cameras), tmp_path / "out", output)
     assert len(written) == 4 * 4 + 1
     assert all(p.is_file() for p in written)
-    frame = next(shot_frames(balls_shot(cameras, RenderOptions(depth="expected"))))
+    frame = next(job_frames(balls_shot(cameras, RenderOptions(depth="expected"))))
     depth = read_image(tmp_path / "out" / "frame_0000_depth.exr")
     assert depth.shape == (18, 24, 1)
     np.testing.assert_array_equal(depth[..., 0], frame.depth)
@@ -148,15 +148,15 @@ def test_path_writes_depth_alpha_and_video(tmp_path) -> None:
 
 def test_path_to_a_video_alone(tmp_path) -> None:
     output = OutputOptions(video=tmp_path / "path.mp4", depth=True)
-    assert write_path_frames(balls_shot(cameras_around(2)), None, output) == [tmp_path / "path.mp4"]
+    assert write_job_images(balls_shot(cameras_around(2)), None, output) == [tmp_path / "path.mp4"]
     assert names(tmp_path) == ["path.mp4"]
 
 
 def test_path_with_nothing_to_do(tmp_path) -> None:
     with pytest.raises(DyngsError, match="nothing to write"):
-        write_path_frames(balls_shot(cameras_around(1)), None)
+        write_job_images(balls_shot(cameras_around(1)), None)
     with pytest.raises(DyngsError, match="no cameras"):
-        write_path_frames(balls_shot(cameras_around(0)), tmp_path)
+        write_job_images(balls_shot(cameras_around(0)), tmp_path)
 
 
 def test_depth_colours_share_one_range_along_a_path(tmp_path) -> None:
@@ -164,7 +164,7 @@ def test_depth_colours_share_one_range_along_a_path(tmp_path) -> None:
     near, far = cameras_around(1, distance=3.0), cameras_around(1, distance=6.0)
     poses = torch.cat([near.cam_from_world, far.cam_from_world])
     cameras = Cameras(poses, near.intrinsics.repeat(2, 1, 1), 24, 18)
-    write_path_frames(balls_shot(cameras), tmp_path, OutputOptions(depth=True))
+    write_job_images(balls_shot(cameras), tmp_path, OutputOptions(depth=True))
     a, b = (read_image(tmp_path / f"frame_000{i}_depth.png") for i in range(2))
     assert a[9, 8, 0] > 3 * a[9, 8, 2]  # the near ball is red, the far one blue
     assert b[9, 10, 2] > b[9, 10, 0]
@@ -172,7 +172,7 @@ def test_depth_colours_share_one_range_along_a_path(tmp_path) -> None:
 
 def test_each_frame_shows_the_scene_at_its_time() -> None:
     scene, times = moving_scene(Sliding()), (0.0, 0.3, 1.0)
-    frames = list(shot_frames(Shot(scene, frozen_path(camera(), times))))
+    frames = list(job_frames(RenderJob(scene, static_path(camera(), times))))
     for frame, time in zip(frames, times, strict=True):
         np.testing.assert_array_equal(frame.rgb, render_frame(moment_of(scene, time), camera()).rgb)
     assert np.abs(frames[0].rgb - frames[2].rgb).max() > 0.1
@@ -180,26 +180,26 @@ def test_each_frame_shows_the_scene_at_its_time() -> None:
 
 def test_equal_times_deform_once() -> None:
     motion = Sliding()
-    shot = Shot(moving_scene(motion), frozen_path(camera(), (0.5, 0.5, 0.5, 0.7, 0.7)))
-    assert len(list(shot_frames(shot))) == 5
+    shot = RenderJob(moving_scene(motion), static_path(camera(), (0.5, 0.5, 0.5, 0.7, 0.7)))
+    assert len(list(job_frames(shot))) == 5
     assert motion.calls == 2
 
 
 def test_what_never_moves_looks_the_same_at_all_times() -> None:
-    frames = list(shot_frames(Shot(still_scene(), frozen_path(camera(), (0.0, 0.5, 1.0)))))
+    frames = list(job_frames(RenderJob(still_scene(), static_path(camera(), (0.0, 0.5, 1.0)))))
     assert all(np.array_equal(frame.rgb, frames[0].rgb) for frame in frames)
 
 
 def test_depth_of_a_moving_path_shares_one_range(tmp_path) -> None:
     """Of 20 frames 8 are looked at beforehand, each at its own time."""
-    shot = Shot(moving_scene(Sliding()), frozen_path(camera(), np.linspace(0, 1, 20).tolist()))
-    written = write_path_frames(shot, tmp_path, OutputOptions(depth=True))
+    shot = RenderJob(moving_scene(Sliding()), static_path(camera(), np.linspace(0, 1, 20).tolist()))
+    written = write_job_images(shot, tmp_path, OutputOptions(depth=True))
     assert len(written) == 60
 
 
 def test_views_of_a_moving_run_are_drawn_at_their_own_times(tmp_path) -> None:
     run_dir = write_moving_run(tmp_path, standing=True)
-    write_split(run_dir, "test", tmp_path / "out")
+    write_split_images(run_dir, "test", tmp_path / "out")
     a, b, c = (read_image(tmp_path / "out" / f"r_00{i}.png") for i in range(3))
     assert np.abs(a - b).max() > 10 / 255
     assert np.abs(b - c).max() > 10 / 255
@@ -207,7 +207,7 @@ def test_views_of_a_moving_run_are_drawn_at_their_own_times(tmp_path) -> None:
 
 def test_split_of_a_run(tmp_path) -> None:
     run_dir = write_run(tmp_path)
-    written = write_split(run_dir, "test", tmp_path / "out", OutputOptions(depth=True, alpha=True))
+    written = write_split_images(run_dir, "test", tmp_path / "out", OutputOptions(depth=True, alpha=True))
     stems = ["r_000", "r_001"]
     assert names(tmp_path / "out") == sorted(
         [f"{s}{end}" for s in stems for end in (".png", "_alpha.png", "_depth.png", "_depth.exr")] + ["sheet.png"]
@@ -218,11 +218,11 @@ def test_split_of_a_run(tmp_path) -> None:
     sheet = read_image(written[-1])
     assert sheet.shape[1] >= 3 * 24
     assert sheet.shape[0] >= 2 * 24
-    write_split(run_dir, "train", tmp_path / "train", OutputOptions(video=tmp_path / "train.mp4"))
+    write_split_images(run_dir, "train", tmp_path / "train", OutputOptions(video=tmp_path / "train.mp4"))
     assert names(tmp_path / "train") == ["r_000.png", "r_001.png", "sheet.png"]
     assert len(list(read_frames(tmp_path / "train.mp4"))) == 2
     with pytest.raises(DyngsError, match="'val' has no views"):
-        write_split(run_dir, "val", tmp_path / "val")
+        write_split_images(run_dir, "val", tmp_path / "val")
     assert not (tmp_path / "val").exists()
 
 
@@ -235,10 +235,10 @@ def test_pictures_of_the_capture_are_not_replaced(tmp_path) -> None:
     (tmp_path / "link").symlink_to(folder)
     for out in (folder, tmp_path / "link"):
         with pytest.raises(DyngsError, match=r"picture of the capture.*--out"):
-            write_split(run_dir, "test", out)
+            write_split_images(run_dir, "test", out)
     shot = balls_shot(cameras_around(1))
     with pytest.raises(DyngsError, match="picture of the capture"):
-        write_path_frames(replace(shot, kept=frozenset({tmp_path / "new" / "frame_0000.png"})), tmp_path / "new")
+        write_job_images(replace(shot, kept=frozenset({tmp_path / "new" / "frame_0000.png"})), tmp_path / "new")
     assert files_of(read_capture(load_resolved(run_dir).data)) >= {view.image_path.resolve() for view in views}
     assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
 

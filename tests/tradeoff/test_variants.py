@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dyngs.errors import DyngsError
-from dyngs.tradeoff.knobs import KNOBS, Traits, Variant, parse_settings, single_changes
+from dyngs.tradeoff.variants import SETTINGS, RunSettings, Variant, parse_variations, single_changes
 
 VARIANTS = st.builds(
     Variant,
@@ -26,7 +26,7 @@ VARIANTS = st.builds(
     field_size=st.sampled_from([1.0, 0.5]),
     field_step=st.sampled_from([1.0, 4.0]),
 )
-DYNAMIC = Traits(
+DYNAMIC = RunSettings(
     sh_degree=2,
     mode="classic",
     alpha_min=1 / 255,
@@ -75,36 +75,36 @@ def test_the_knob_of_a_variant() -> None:
 
 
 def test_single_changes_leave_out_what_a_run_is_already() -> None:
-    names = [v.name for v in single_changes(parse_settings([], trains=True), DYNAMIC, 0)]
+    names = [v.name for v in single_changes(parse_variations([], trains=True), DYNAMIC, 0)]
     assert len(names) == len(set(names))
     assert {"sh_degree=0", "sh_degree=1", "mask_times=6", "mode=antialiased", "colour=network", "field=mlp"} <= set(
         names
     )
     assert not {"sh_degree=2", "mode=classic", "colour=sh", "field=control_nodes"} & set(names)
     still = replace(DYNAMIC, sh_degree=0, field=None)
-    fewer = [v.name for v in single_changes(parse_settings([], trains=True), still, 0)]
+    fewer = [v.name for v in single_changes(parse_variations([], trains=True), still, 0)]
     assert not any(name.startswith(("mask_times", "sh_degree", "field")) or "field_step" in name for name in fewer)
 
 
 def test_own_values_are_the_start() -> None:
-    settings = parse_settings(["alpha_min=0.008,0.016"], trains=False)
+    settings = parse_variations(["alpha_min=0.008,0.016"], trains=False)
     assert single_changes(settings, replace(DYNAMIC, alpha_min=0.008), 0) == [Variant(alpha_min=0.016)]
-    settings = parse_settings(["mask_times=6,16"], trains=False)
+    settings = parse_variations(["mask_times=6,16"], trains=False)
     assert single_changes(settings, replace(DYNAMIC, mask_times=6), 0) == [Variant(mask_times=16)]
 
 
 def test_steps_of_the_field_are_those_of_storage() -> None:
-    settings = parse_settings(["field_step=4"], trains=False)
+    settings = parse_variations(["field_step=4"], trains=False)
     assert single_changes(settings, DYNAMIC, 0) == [Variant(storage="auto", field_step=4.0)]
 
 
 def test_fine_tuning_comes_in_addition() -> None:
-    found = single_changes(parse_settings(["prune=0.5", "scale=0.5"], trains=False), DYNAMIC, 7)
+    found = single_changes(parse_variations(["prune=0.5", "scale=0.5"], trains=False), DYNAMIC, 7)
     assert found == [Variant(prune=0.5), Variant(prune=0.5, finetune=7), Variant(scale=0.5)]
 
 
 def test_settings_keep_the_order_of_their_values() -> None:
-    (setting,) = parse_settings(["storage=auto, 2,0.5,2"], trains=False)
+    (setting,) = parse_variations(["storage=auto, 2,0.5,2"], trains=False)
     assert setting.values == ("auto", 2.0, 0.5)
 
 
@@ -123,17 +123,17 @@ def test_settings_keep_the_order_of_their_values() -> None:
 )
 def test_what_cannot_be_varied_is_refused(word: str, message: str) -> None:
     with pytest.raises(DyngsError, match=message):
-        parse_settings([word], trains=False)
+        parse_variations([word], trains=False)
 
 
 def test_a_knob_twice_is_refused() -> None:
     with pytest.raises(DyngsError, match="twice"):
-        parse_settings(["scale=0.5", "scale=0.7"], trains=False)
+        parse_variations(["scale=0.5", "scale=0.7"], trains=False)
 
 
-@pytest.mark.parametrize("knob", KNOBS, ids=lambda knob: knob.name)
+@pytest.mark.parametrize("knob", SETTINGS, ids=lambda knob: knob.name)
 def test_defaults_of_knobs_are_allowed(knob: object) -> None:
-    from dyngs.tradeoff.knobs import Knob
+    from dyngs.tradeoff.variants import Setting
 
-    assert isinstance(knob, Knob)
+    assert isinstance(knob, Setting)
     assert [knob.parsed(str(value)) for value in knob.values] == list(knob.values)

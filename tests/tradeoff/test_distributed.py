@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from moving_scene import write_moving_run
 
 from dyngs.errors import DyngsError
-from dyngs.tradeoff.knobs import Variant
-from dyngs.tradeoff.ranks import ALONE, Ranks
+from dyngs.tradeoff.distributed import SINGLE_PROCESS, ProcessGroup
+from dyngs.tradeoff.variants import Variant
 from dyngs.train.trainer import num_cores
 
 VARIANTS = st.builds(
@@ -30,7 +30,7 @@ NAMES = {"RANK": "1", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR":
 
 @given(st.lists(VARIANTS, unique=True, max_size=12), st.integers(1, 4))
 def test_all_is_shared_out_once(variants: list[Variant], size: int) -> None:
-    shares = [Ranks(rank, size).share(variants) for rank in range(size)]
+    shares = [ProcessGroup(rank, size).share(variants) for rank in range(size)]
     assert sorted(v.slug for share in shares for v in share) == sorted(v.slug for v in variants)
 
 
@@ -38,28 +38,28 @@ def test_what_is_made_from_one_another_stays_together() -> None:
     tuned = Variant(prune=0.5, finetune=9)
     together = [tuned, Variant(prune=0.5, finetune=9, storage="auto"), Variant(prune=0.5, finetune=9, sh_degree=0)]
     others = [Variant(alpha_min=0.01), Variant(storage="auto"), Variant(), Variant(storage="auto", scale=0.5)]
-    shares = [Ranks(rank, 2).share([*others, *together]) for rank in range(2)]
+    shares = [ProcessGroup(rank, 2).share([*others, *together]) for rank in range(2)]
     assert any(set(together) <= set(share) for share in shares)
     assert any({others[1], others[3]} <= set(share) for share in shares)
     assert all(shares)
 
 
 def test_one_process_waits_for_nobody() -> None:
-    ALONE.wait()
-    assert ALONE.is_first
-    assert ALONE.cores == num_cores()
+    SINGLE_PROCESS.wait()
+    assert SINGLE_PROCESS.is_first
+    assert SINGLE_PROCESS.cores == num_cores()
 
 
 def test_what_torchrun_says(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in NAMES.items():
         monkeypatch.delenv(name, raising=False)
-        assert Ranks.from_environment() == ALONE
+        assert ProcessGroup.from_environment() == SINGLE_PROCESS
         monkeypatch.setenv(name, value)
-    assert Ranks.from_environment() == Ranks(1, 4, 2)
-    assert not Ranks.from_environment().is_first
+    assert ProcessGroup.from_environment() == ProcessGroup(1, 4, 2)
+    assert not ProcessGroup.from_environment().is_first
     monkeypatch.setenv("RANK", "first")
     with pytest.raises(DyngsError, match="RANK, WORLD_SIZE, LOCAL_WORLD_SIZE must be numbers"):
-        Ranks.from_environment()
+        ProcessGroup.from_environment()
 
 
 def test_two_processes_make_one_report(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def with_times(path: CameraPath, times: Sequence[float]) -> CameraPath:
     return replace(path, times=clamped, warnings=path.warnings + warnings)
 
 
-def frozen_path(camera: Cameras, times: Sequence[float], fps: float = 30.0) -> CameraPath:
+def static_path(camera: Cameras, times: Sequence[float], fps: float = 30.0) -> CameraPath:
     """One camera that stands still while the scene moves.
 
     Args:

@@ -6,16 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dyngs.tradeoff.front import combinations, exchanges, on_front, pareto, rate, slope
-from dyngs.tradeoff.knobs import Variant
-from dyngs.tradeoff.points import Point, Speed, Spread
+from dyngs.tradeoff.measurements import Measurement, Quartiles, Speed
+from dyngs.tradeoff.pareto import combinations, exchange_rates, on_front, pareto_mask, rate, slope
+from dyngs.tradeoff.variants import Variant
 
 GOALS = st.lists(st.tuples(*[st.integers(0, 5)] * 3), min_size=1, max_size=12)
 
 
-def point(variant: Variant, psnr: float, gain: float = 1.0, mb: float = 8.0) -> Point:
-    speed = Speed(Spread(10 / gain, 9 / gain, 11 / gain), Spread(gain, gain, gain))
-    return Point(variant, 4, psnr, 0.9, None, 100, mb, None, speed)
+def point(variant: Variant, psnr: float, gain: float = 1.0, mb: float = 8.0) -> Measurement:
+    speed = Speed(Quartiles(10 / gain, 9 / gain, 11 / gain), Quartiles(gain, gain, gain))
+    return Measurement(variant, 4, psnr, 0.9, None, 100, mb, None, speed)
 
 
 BASE = point(Variant(), 30.0)
@@ -23,7 +23,7 @@ BASE = point(Variant(), 30.0)
 
 @given(GOALS)
 def test_every_point_is_on_the_front_or_beaten_by_one_that_is(goals: list[tuple[int, ...]]) -> None:
-    best = pareto(goals)
+    best = pareto_mask(goals)
     front = [goal for goal, is_best in zip(goals, best, strict=True) if is_best]
     assert front
     for goal, is_best in zip(goals, best, strict=True):
@@ -33,9 +33,9 @@ def test_every_point_is_on_the_front_or_beaten_by_one_that_is(goals: list[tuple[
 
 @given(GOALS)
 def test_the_front_does_not_depend_on_the_order(goals: list[tuple[int, ...]]) -> None:
-    found = dict(zip(goals, pareto(goals), strict=True))
+    found = dict(zip(goals, pareto_mask(goals), strict=True))
     backwards = goals[::-1]
-    assert pareto(backwards) == [found[goal] for goal in backwards]
+    assert pareto_mask(backwards) == [found[goal] for goal in backwards]
 
 
 def test_speed_size_and_quality_count() -> None:
@@ -68,7 +68,7 @@ def test_exchange_rates_are_those_of_single_knobs() -> None:
         point(Variant(storage="auto"), 30.0, 1.0, 1.0),
         point(Variant(storage="auto", prune=0.5), 20.0, 2.0, 0.5),
     ]
-    prune, storage = exchanges(BASE, points)
+    prune, storage = exchange_rates(BASE, points)
     assert (prune.knob, prune.db_per_speed, prune.db_per_size) == ("prune", pytest.approx(1.0), pytest.approx(1.0))
     assert (prune.speed, prune.size) == (4.0, 4.0)
     assert (storage.knob, storage.db_per_speed, storage.db_per_size) == ("storage", None, pytest.approx(0.0))

@@ -17,14 +17,14 @@ from dyngs.runs.checkpoint import LoadedRun
 
 
 @dataclass(frozen=True)
-class Played:
+class AnimatedRun:
     """A run whose scene plays something else, and how fast, in frames per second."""
 
     run: LoadedRun
     fps: float
 
 
-def playing_motion(run: LoadedRun, path: Path) -> Played:
+def with_motion(run: LoadedRun, path: Path) -> AnimatedRun:
     """The person of ``run`` in the motion of a file (AMASS, BVH or glTF).
 
     A file with ``scale`` is a fit to this person and has its world; any other motion is brought to the person's size,
@@ -44,7 +44,7 @@ def playing_motion(run: LoadedRun, path: Path) -> Played:
         clip = replace(clip, trans=clip.trans - torch.tensor(run.info.world_offset))
     else:
         clip = place_like(clip, scene.given_clip, scene.given_joints, scene.skeleton.parents)
-    return Played(replace(run, scene=scene.playing(clip)), motion.fps)
+    return AnimatedRun(replace(run, scene=scene.playing(clip)), motion.fps)
 
 
 def at_rest(run: LoadedRun) -> LoadedRun:

@@ -103,7 +103,7 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Knob:
+class Setting:
     """Something that can be varied.
 
     Attributes:
@@ -148,32 +148,32 @@ class Knob:
 
 
 FIELDS = ("trajectory", "hexplane", "mlp", "control_nodes")
-KNOBS = (
-    Knob("prune", (0.3, 0.5, 0.7, 0.85), low=0.01, high=0.99),
-    Knob("mask_times", (6, 16), low=2, high=1000, whole=True),
-    Knob("sh_degree", (2, 1, 0), low=0, high=3, whole=True),
-    Knob("storage", (AUTO, 1.0, 3.0), low=0.01, high=64, words=(AUTO,)),
-    Knob("mode", ("classic", "antialiased"), words=("classic", "antialiased")),
-    Knob("alpha_min", (0.008, 0.016, 0.032), low=1e-6, high=0.5),
-    Knob("transmittance_min", (1e-3, 1e-2, 5e-2), low=1e-6, high=0.5),
-    Knob("scale", (0.75, 0.5), low=0.05, high=1.0),
-    Knob("field_step", (4.0, 16.0), low=1 / 64, high=1024),
-    Knob("colour", ("sh", "network", "auto"), words=("sh", "network", "auto"), trains=True),
-    Knob("field", FIELDS, words=FIELDS, trains=True),
-    Knob("field_size", (0.5, 0.25), low=1 / 64, high=64, trains=True),
+SETTINGS = (
+    Setting("prune", (0.3, 0.5, 0.7, 0.85), low=0.01, high=0.99),
+    Setting("mask_times", (6, 16), low=2, high=1000, whole=True),
+    Setting("sh_degree", (2, 1, 0), low=0, high=3, whole=True),
+    Setting("storage", (AUTO, 1.0, 3.0), low=0.01, high=64, words=(AUTO,)),
+    Setting("mode", ("classic", "antialiased"), words=("classic", "antialiased")),
+    Setting("alpha_min", (0.008, 0.016, 0.032), low=1e-6, high=0.5),
+    Setting("transmittance_min", (1e-3, 1e-2, 5e-2), low=1e-6, high=0.5),
+    Setting("scale", (0.75, 0.5), low=0.05, high=1.0),
+    Setting("field_step", (4.0, 16.0), low=1 / 64, high=1024),
+    Setting("colour", ("sh", "network", "auto"), words=("sh", "network", "auto"), trains=True),
+    Setting("field", FIELDS, words=FIELDS, trains=True),
+    Setting("field_size", (0.5, 0.25), low=1 / 64, high=64, trains=True),
 )
 
 
 @dataclass(frozen=True)
-class Setting:
+class Variation:
     """A knob and the values that are to be tried."""
 
-    knob: Knob
+    knob: Setting
     values: tuple[Value, ...]
 
 
 @dataclass(frozen=True)
-class Traits:
+class RunSettings:
     """What a run is like, as far as knobs depend on it.
 
     Attributes:
@@ -192,7 +192,7 @@ class Traits:
     colour: str
     field: str | None
 
-    def allows(self, knob: Knob, value: Value) -> bool:
+    def allows(self, knob: Setting, value: Value) -> bool:
         """The value makes sense and is not the run's own."""
         if knob.name == "sh_degree":
             return value < self.sh_degree  # pyright: ignore[reportOperatorIssue]
@@ -202,7 +202,7 @@ class Traits:
         return own.get(knob.name) != value
 
 
-def parse_settings(words: Sequence[str], *, trains: bool) -> tuple[Setting, ...]:
+def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Variation, ...]:
     """What ``--vary`` asks for: KNOB, or KNOB=VALUE,VALUE; without any all knobs with their default values.
 
     Args:
@@ -213,25 +213,25 @@ def parse_settings(words: Sequence[str], *, trains: bool) -> tuple[Setting, ...]
         DyngsError: an unknown knob, one twice, or a value that is not allowed.
     """
     if not words:
-        return tuple(Setting(knob, knob.values) for knob in KNOBS if trains or not knob.trains)
-    found: dict[str, Setting] = {}
+        return tuple(Variation(knob, knob.values) for knob in SETTINGS if trains or not knob.trains)
+    found: dict[str, Variation] = {}
     for word in words:
         name, equals, listed = word.partition("=")
-        knob = next((k for k in KNOBS if k.name == name), None)
+        knob = next((k for k in SETTINGS if k.name == name), None)
         if knob is None:
             raise DyngsError(
-                f"--vary {printable(word, 60)}: no such knob; there are {', '.join(k.name for k in KNOBS)}"
+                f"--vary {printable(word, 60)}: no such knob; there are {', '.join(k.name for k in SETTINGS)}"
             )
         if knob.trains and not trains:
             raise DyngsError(f"--vary {printable(word, 60)}: this trains the run anew, several times; add --train")
         if name in found:
             raise DyngsError(f"--vary {name} is given twice; write --vary {name}=VALUE,VALUE")
         values = tuple(knob.parsed(text) for text in re.split(r"\s*,\s*", listed.strip())) if equals else knob.values
-        found[name] = Setting(knob, tuple(dict.fromkeys(values)))
+        found[name] = Variation(knob, tuple(dict.fromkeys(values)))
     return tuple(found.values())
 
 
-def single_changes(settings: Sequence[Setting], traits: Traits, finetune: int) -> list[Variant]:
+def single_changes(settings: Sequence[Variation], traits: RunSettings, finetune: int) -> list[Variant]:
     """One variant per knob and value that makes sense for a run; what is pruned or masked also with fine-tuning.
 
     Args:

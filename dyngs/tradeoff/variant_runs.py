@@ -28,8 +28,8 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.storage.file import write_scene
 from dyngs.storage.run import num_bytes_exact, write_compact
-from dyngs.tradeoff.knobs import Traits, Variant
-from dyngs.tradeoff.measure import drawn_so
+from dyngs.tradeoff.measure import with_render_settings
+from dyngs.tradeoff.variants import RunSettings, Variant
 from dyngs.train.trainer import num_cores, train
 
 FIELD_SIZE = {"control_nodes": "nodes", "hexplane": "channels", "mlp": "width", "trajectory": "fourier"}
@@ -40,7 +40,7 @@ NO_BUDGET = tuple(f"budget.{name}=null" for name in BudgetConfig.model_fields)
 
 
 @dataclass(frozen=True)
-class Models:
+class VariantRuns:
     """Where the run and its variants lie.
 
     Attributes:
@@ -119,7 +119,7 @@ def finished(config: Config, out: Path) -> Path:
     return train(config, resume_from=out if checkpoint_paths(out) else None)
 
 
-def traits(run_dir: Path) -> Traits:
+def run_settings(run_dir: Path) -> RunSettings:
     """What knobs depend on.
 
     Raises:
@@ -132,7 +132,7 @@ def traits(run_dir: Path) -> Traits:
         raise DyngsError(f"{run_dir}: a network, not a scene; vary what it predicts")
     scene = load_run(run_dir).scene
     model = config.model
-    return Traits(
+    return RunSettings(
         sh_degree=scene.gaussians.sh_degree,
         mode=model.rasterize_mode.value,
         alpha_min=model.alpha_min,
@@ -150,14 +150,14 @@ def megabytes_on_disk(folder: Path) -> float:
     return 1e-6 * num_bytes_exact(latest_checkpoint(folder))
 
 
-def write_chosen(models: Models, variant: Variant) -> Path:
+def write_chosen(models: VariantRuns, variant: Variant) -> Path:
     """The folder of a run that is drawn as the variant says, by every command: what was made, and its configuration.
 
     Pictures that are drawn smaller are so by ``data.downscale`` and ``data.longest_side``.
     """
     made, out = models.folder(variant), models.out / "chosen" / variant.slug
     config = load_resolved(made)
-    model, data = drawn_so(variant, config.model), config.data
+    model, data = with_render_settings(variant, config.model), config.data
     if variant.scale < 1:
         longest = None if data.longest_side is None else max(1, round(data.longest_side * variant.scale))
         data = data.model_copy(update={"downscale": data.downscale / variant.scale, "longest_side": longest})
