@@ -18,7 +18,8 @@ from dyngs.export.run_to_ply import export_ply
 from dyngs.runs.lock import LOCK_NAME, InUseError, writing
 from dyngs.train.trainer import train
 from dyngs.view.image_files import OutputOptions, write_job_images, write_split_images
-from dyngs.view.job_of_run import RenderJobOptions, job_of_run
+from dyngs.view.job_of_run import job_of_run
+from dyngs.view.render_job import RenderJobOptions
 
 if TYPE_CHECKING:
     from rich.table import Table

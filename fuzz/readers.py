@@ -147,7 +147,7 @@ def read_a_motion(root: Path) -> object:
 def read_splats(root: Path) -> object:
     """The Gaussians, drawn."""
     from dyngs.export.ply import read_ply
-    from dyngs.view.image_files import splat_options
+    from dyngs.view.job_of_ply import splat_options
 
     splat = read_ply(only(root))
     return splat, drawn(splat.gaussians, replace(splat_options(splat), nonfinite="skip"))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
-    from dyngs.view.image_files import RenderJob
+    from dyngs.view.render_job import RenderJob
 
 MAX_THREADS = 1024
 
@@ -144,7 +144,9 @@ def _shot(arguments: argparse.Namespace) -> RenderJob:
     """What the arguments ask for."""
     from dyngs.view.camera_paths import parse_times
     from dyngs.view.job_of_avatar import job_of_avatar
-    from dyngs.view.job_of_run import RenderJobOptions, job_of_ply, job_of_run
+    from dyngs.view.job_of_ply import job_of_ply
+    from dyngs.view.job_of_run import job_of_run
+    from dyngs.view.render_job import RenderJobOptions
 
     times = None if arguments.time is None else (arguments.time,)
     num_frames = arguments.frames

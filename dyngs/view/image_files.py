@@ -1,4 +1,4 @@
-"""Turns a scene into pictures: the views of a split beside their truth, or the frames of a camera path."""
+"""Rendered pictures written to files: the frames of a job, or the views of a split beside their ground truth."""
 
 from __future__ import annotations
 
@@ -11,23 +11,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.data.capture import Capture
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.metrics import psnr
 from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
-from dyngs.export.ply import SplatFile
 from dyngs.files.write import to_uint8, write_image
 from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import load_run
-from dyngs.scene import Moment, Scene, moment_of
+from dyngs.scene import moment_of
 from dyngs.view.camera_paths import CameraPath
 from dyngs.view.contact_sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
+from dyngs.view.render_job import Frame, RenderJob, job_frames, render_frame
 from dyngs.view.video import VideoWriter
 
-DEFAULT_OPTIONS = RenderOptions()
 _SHEET_ROWS = 12
 _DEPTH_SAMPLES = 8
 
@@ -47,73 +45,6 @@ class OutputOptions:
     alpha: bool = False
     video: Path | None = None
     fps: float = 30.0
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One rendered picture, float32.
-
-    Attributes:
-        rgb: (H, W, 3), composited on the background, clamped to [0, 1].
-        alpha: (H, W) in [0, 1].
-        depth: (H, W) expected depth, 0 where nothing was hit, or None where it was not asked for.
-    """
-
-    rgb: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray | None
-
-
-@dataclass(frozen=True)
-class RenderJob:
-    """A scene, and the cameras and times at which it is seen.
-
-    Attributes:
-        scene: what is drawn.
-        path: F cameras in the order of the video; without times, all see time 0.
-        options: how the scene wants to be drawn.
-        background: (3,) colour; None is black.
-        notes: lines for people, about what was chosen for them.
-        kept: files of the capture, which no picture replaces.
-    """
-
-    scene: Scene
-    path: CameraPath
-    options: RenderOptions = DEFAULT_OPTIONS
-    background: Tensor | None = None
-    notes: tuple[str, ...] = ()
-    kept: frozenset[Path] = frozenset()
-
-
-def render_frame(
-    moment: Moment, camera: Cameras, options: RenderOptions = DEFAULT_OPTIONS, background: Tensor | None = None
-) -> Frame:
-    """The picture that one camera sees, without gradients.
-
-    Args:
-        moment: what it looks at.
-        camera: one camera.
-        options: how to draw; ``depth`` other than "none" fills ``Frame.depth``.
-        background: (3,) colour; None is black.
-    """
-    with torch.no_grad():
-        rendering = moment.seen_by(camera, options, background)
-    depth = None if rendering.depth is None else rendering.depth[0].cpu().numpy()
-    return Frame(rendering.rgb[0].clamp(0, 1).cpu().numpy(), rendering.alpha[0].cpu().numpy(), depth)
-
-
-def job_frames(shot: RenderJob) -> Iterator[Frame]:
-    """The pictures of a shot, one at a time: memory does not grow with their number.
-
-    The scene is deformed anew only where the time differs from that of the picture before.
-    """
-    times = shot.path.times
-    moment, moment_time = None, None
-    for i in range(len(shot.path)):
-        time = None if times is None or shot.scene.is_still else times[i]
-        if moment is None or time != moment_time:
-            moment, moment_time = moment_of(shot.scene, time), time
-        yield render_frame(moment, shot.path.cameras.select(i), shot.options, shot.background)
 
 
 def write_job_images(shot: RenderJob, out_dir: Path | None, output: OutputOptions = OutputOptions()) -> list[Path]:
@@ -190,12 +121,6 @@ def _sheet_row(label: str, truth: Tensor, rendered: Tensor, mask: Tensor | None)
     """A row of the sheet; pixels that do not count are black on both sides, so that they show no error."""
     counts = 1.0 if mask is None else mask[..., None]
     return SheetRow(label, to_uint8((truth * counts).numpy()), to_uint8((rendered * counts).numpy()))
-
-
-def splat_options(splat: SplatFile) -> RenderOptions:
-    """How a splat file wants to be drawn: its mode, and its low-pass where it names one."""
-    options = RenderOptions(mode=splat.mode)
-    return options if splat.eps2d is None else replace(options, eps2d=splat.eps2d)
 
 
 def file_stems(names: Sequence[str]) -> list[str]:

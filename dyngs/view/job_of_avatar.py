@@ -17,8 +17,7 @@ from dyngs.human.motion.placement import up_direction
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.view.animation import with_motion
 from dyngs.view.camera_paths import CameraPath, frame_orbit_for_points, read_path, spiral_path, static_path, with_times
-from dyngs.view.image_files import RenderJob
-from dyngs.view.job_of_run import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJobOptions, path_file, resize_cameras
+from dyngs.view.render_job import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJob, RenderJobOptions, path_file, resize_cameras
 
 _MOMENTS = 8
 """Of a motion, at which the camera must see the person."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,64 +10,21 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from moving_scene import Sliding, camera, moving_scene, still_scene, write_moving_run
+from moving_scene import Sliding, camera, moving_scene, write_moving_run
+from two_balls import balls_job, cameras_around, two_balls
 
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.conventions import RasterizeMode
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
-from dyngs.export.ply import SplatFile, read_ply, write_ply
-from dyngs.gaussians import Gaussians
-from dyngs.rendering import RenderOptions, render
+from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.scene import Moment, moment_of
-from dyngs.view.camera_paths import CameraPath, static_path
-from dyngs.view.image_files import (
-    DEFAULT_OPTIONS,
-    OutputOptions,
-    RenderJob,
-    file_stems,
-    files_of,
-    job_frames,
-    render_frame,
-    splat_options,
-    write_job_images,
-    write_split_images,
-)
+from dyngs.view.camera_paths import static_path
+from dyngs.view.image_files import OutputOptions, file_stems, files_of, write_job_images, write_split_images
+from dyngs.view.render_job import RenderJob, job_frames
 from dyngs.view.video import read_frames
-
-
-def two_balls(distance: float = 4.0) -> Gaussians:
-    """A big red ball left, a small green one right, both ``distance`` from the camera of ``cameras_around``."""
-    means = torch.tensor([[-0.5, 0.0, 0.0], [0.7, 0.0, 0.0]])
-    colours = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    sizes = torch.tensor([0.3, 0.15]).log()[:, None].expand(2, 3)
-    identity = torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4)
-    return Gaussians(means, identity, sizes, torch.full((2,), 5.0), ((colours - 0.5) / 0.28209479177387814)[:, None])
-
-
-def cameras_around(count: int, width: int = 24, height: int = 18, distance: float = 4.0) -> Cameras:
-    """Cameras turning about the vertical, all looking at the origin."""
-    poses = torch.eye(4).repeat(count, 1, 1)
-    for i in range(count):
-        angle = 0.3 * i
-        poses[i, 0, 0] = poses[i, 2, 2] = math.cos(angle)
-        poses[i, 0, 2], poses[i, 2, 0] = math.sin(angle), -math.sin(angle)
-        poses[i, 2, 3] = distance
-    intrinsics = torch.tensor([[24.0, 0, width / 2], [0, 24, height / 2], [0, 0, 1]]).repeat(count, 1, 1)
-    return Cameras(poses, intrinsics, width, height)
-
-
-def balls_shot(
-    cameras: Cameras, options: RenderOptions = DEFAULT_OPTIONS, background: torch.Tensor | None = None
-) -> RenderJob:
-    """The two balls seen by ``cameras``."""
-    scene = TrainedScene(two_balls(), torch.zeros(0, dtype=torch.long))
-    return RenderJob(scene, CameraPath(cameras), options, background)
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -92,48 +48,21 @@ def write_run(folder: Path, size: int = 24) -> Path:
     return folder / "run"
 
 
-def test_frames_are_the_renders_one_by_one() -> None:
-    gaussians, cameras = two_balls(), cameras_around(3)
-    options, background = RenderOptions(depth="expected"), torch.tensor([0.1, 0.2, 0.9])
-    together = render(gaussians, cameras, options, background=background)
-    frames = list(job_frames(balls_shot(cameras, options, background)))
-    assert len(frames) == 3
-    for i, frame in enumerate(frames):
-        np.testing.assert_allclose(frame.rgb, together.rgb[i].clamp(0, 1), atol=1e-6)
-        np.testing.assert_allclose(frame.alpha, together.alpha[i], atol=1e-6)
-        assert frame.depth is not None
-        assert together.depth is not None
-        np.testing.assert_allclose(frame.depth, together.depth[i], rtol=1e-5)
-    np.testing.assert_allclose(frames[0].rgb[0, 0], [0.1, 0.2, 0.9], atol=0.01)  # a corner shows the background
-    red = frames[0].rgb[9, 9]
-    assert red[0] > 0.8
-    assert red[1] < 0.2
-    assert frames[0].depth is not None
-    assert abs(frames[0].depth[9, 9] - 4) < 0.01
-    assert next(job_frames(balls_shot(cameras))).depth is None
-
-
-def test_frames_are_drawn_lazily() -> None:
-    frames = job_frames(balls_shot(cameras_around(3)))
-    next(frames)
-    frames.close()  # type: ignore[attr-defined]
-
-
 def test_path_writes_numbered_pictures(tmp_path) -> None:
-    written = write_job_images(balls_shot(cameras_around(3)), tmp_path / "out")
+    written = write_job_images(balls_job(cameras_around(3)), tmp_path / "out")
     assert names(tmp_path / "out") == ["frame_0000.png", "frame_0001.png", "frame_0002.png"]
     assert [p.name for p in written] == names(tmp_path / "out")
-    frame = next(job_frames(balls_shot(cameras_around(3))))
+    frame = next(job_frames(balls_job(cameras_around(3))))
     np.testing.assert_allclose(read_image(written[0]), frame.rgb, atol=0.5 / 255 + 1e-6)
 
 
 def test_path_writes_depth_alpha_and_video(tmp_path) -> None:
     cameras = cameras_around(4)
     output = OutputOptions(depth=True, alpha=True, video=tmp_path / "v" / "path.mp4", fps=12)
-    written = write_job_images(balls_shot(cameras), tmp_path / "out", output)
+    written = write_job_images(balls_job(cameras), tmp_path / "out", output)
     assert len(written) == 4 * 4 + 1
     assert all(p.is_file() for p in written)
-    frame = next(job_frames(balls_shot(cameras, RenderOptions(depth="expected"))))
+    frame = next(job_frames(balls_job(cameras, RenderOptions(depth="expected"))))
     depth = read_image(tmp_path / "out" / "frame_0000_depth.exr")
     assert depth.shape == (18, 24, 1)
     np.testing.assert_array_equal(depth[..., 0], frame.depth)
@@ -148,15 +77,15 @@ def test_path_writes_depth_alpha_and_video(tmp_path) -> None:
 
 def test_path_to_a_video_alone(tmp_path) -> None:
     output = OutputOptions(video=tmp_path / "path.mp4", depth=True)
-    assert write_job_images(balls_shot(cameras_around(2)), None, output) == [tmp_path / "path.mp4"]
+    assert write_job_images(balls_job(cameras_around(2)), None, output) == [tmp_path / "path.mp4"]
     assert names(tmp_path) == ["path.mp4"]
 
 
 def test_path_with_nothing_to_do(tmp_path) -> None:
     with pytest.raises(DyngsError, match="nothing to write"):
-        write_job_images(balls_shot(cameras_around(1)), None)
+        write_job_images(balls_job(cameras_around(1)), None)
     with pytest.raises(DyngsError, match="no cameras"):
-        write_job_images(balls_shot(cameras_around(0)), tmp_path)
+        write_job_images(balls_job(cameras_around(0)), tmp_path)
 
 
 def test_depth_colours_share_one_range_along_a_path(tmp_path) -> None:
@@ -164,30 +93,10 @@ def test_depth_colours_share_one_range_along_a_path(tmp_path) -> None:
     near, far = cameras_around(1, distance=3.0), cameras_around(1, distance=6.0)
     poses = torch.cat([near.cam_from_world, far.cam_from_world])
     cameras = Cameras(poses, near.intrinsics.repeat(2, 1, 1), 24, 18)
-    write_job_images(balls_shot(cameras), tmp_path, OutputOptions(depth=True))
+    write_job_images(balls_job(cameras), tmp_path, OutputOptions(depth=True))
     a, b = (read_image(tmp_path / f"frame_000{i}_depth.png") for i in range(2))
     assert a[9, 8, 0] > 3 * a[9, 8, 2]  # the near ball is red, the far one blue
     assert b[9, 10, 2] > b[9, 10, 0]
-
-
-def test_each_frame_shows_the_scene_at_its_time() -> None:
-    scene, times = moving_scene(Sliding()), (0.0, 0.3, 1.0)
-    frames = list(job_frames(RenderJob(scene, static_path(camera(), times))))
-    for frame, time in zip(frames, times, strict=True):
-        np.testing.assert_array_equal(frame.rgb, render_frame(moment_of(scene, time), camera()).rgb)
-    assert np.abs(frames[0].rgb - frames[2].rgb).max() > 0.1
-
-
-def test_equal_times_deform_once() -> None:
-    motion = Sliding()
-    shot = RenderJob(moving_scene(motion), static_path(camera(), (0.5, 0.5, 0.5, 0.7, 0.7)))
-    assert len(list(job_frames(shot))) == 5
-    assert motion.calls == 2
-
-
-def test_what_never_moves_looks_the_same_at_all_times() -> None:
-    frames = list(job_frames(RenderJob(still_scene(), static_path(camera(), (0.0, 0.5, 1.0)))))
-    assert all(np.array_equal(frame.rgb, frames[0].rgb) for frame in frames)
 
 
 def test_depth_of_a_moving_path_shares_one_range(tmp_path) -> None:
@@ -236,20 +145,11 @@ def test_pictures_of_the_capture_are_not_replaced(tmp_path) -> None:
     for out in (folder, tmp_path / "link"):
         with pytest.raises(DyngsError, match=r"picture of the capture.*--out"):
             write_split_images(run_dir, "test", out)
-    shot = balls_shot(cameras_around(1))
+    shot = balls_job(cameras_around(1))
     with pytest.raises(DyngsError, match="picture of the capture"):
         write_job_images(replace(shot, kept=frozenset({tmp_path / "new" / "frame_0000.png"})), tmp_path / "new")
     assert files_of(read_capture(load_resolved(run_dir).data)) >= {view.image_path.resolve() for view in views}
     assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
-
-
-def test_exported_file_is_drawn_like_the_run(tmp_path) -> None:
-    splat = read_ply(write_ply(tmp_path / "a.ply", two_balls(), RasterizeMode.ANTIALIASED, eps2d=0.1))
-    options = splat_options(splat)
-    assert (options.mode, options.eps2d) == (RasterizeMode.ANTIALIASED, 0.1)
-    wanted, got = (render_frame(Moment(x), cameras_around(1), options) for x in (two_balls(), splat.gaussians))
-    np.testing.assert_array_equal(got.rgb, wanted.rgb)
-    assert splat_options(SplatFile(two_balls())) == RenderOptions()
 
 
 def test_file_stems_known_answers() -> None:

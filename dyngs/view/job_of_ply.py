@@ -1,0 +1,63 @@
+"""Render jobs for .ply files of Gaussians, which hold one moment and no cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dyngs.camera import Cameras
+from dyngs.deform.trained import TrainedScene
+from dyngs.errors import DyngsError
+from dyngs.evaluate.report import evaluation_background
+from dyngs.export.ply import SplatFile, read_ply
+from dyngs.rendering import RenderOptions
+from dyngs.view.camera_paths import CameraPath, frame_orbit_for_points, read_path, spiral_path
+from dyngs.view.render_job import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJob, RenderJobOptions, path_file, resize_cameras
+
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+def job_of_ply(file: Path, options: RenderJobOptions) -> RenderJob:
+    """A path around the Gaussians of a .ply, placed by their extent; non-finite Gaussians are left out.
+
+    Raises:
+        DyngsError: not a splat file, a broken path file, or times, which a file does not have.
+    """
+    if options.path is None or options.times is not None or options.view is not None:
+        raise DyngsError(f"{file}: a .ply holds one moment and no views; leave out --time, --times and --view")
+    if options.motion is not None or options.at_rest:
+        raise DyngsError(f"{file}: a .ply has no skeleton; give the run of a person for --motion and --pose")
+    splat = read_ply(file, nonfinite="skip")
+    named = path_file(options.path)
+    if named is not None:
+        path = read_path(named, np.asarray(splat.world_offset))
+    else:
+        path = CameraPath(_around_points(splat.gaussians.means.numpy(), options))
+    if options.size is not None:
+        path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
+    _, background = evaluation_background(options.background or "black", has_alpha=False)
+    scene = TrainedScene(splat.gaussians, torch.zeros(0, dtype=torch.long))
+    return RenderJob(scene, path, splat_options(splat), background)
+
+
+def splat_options(splat: SplatFile) -> RenderOptions:
+    """How a splat file wants to be drawn: its mode, and its low-pass where it names one."""
+    options = RenderOptions(mode=splat.mode)
+    return options if splat.eps2d is None else replace(options, eps2d=splat.eps2d)
+
+
+def _around_points(means: np.ndarray, options: RenderJobOptions) -> Cameras:
+    """An orbit around the points, or a spiral before the side that an orbit shows first."""
+    axis = _AXES[options.up.lstrip("-")]
+    sign = -1.0 if options.up.startswith("-") else 1.0
+    up = (sign * axis[0], sign * axis[1], sign * axis[2])
+    size = options.size or DEFAULT_SIZE
+    if options.path == "orbit":
+        return frame_orbit_for_points(means, options.num_frames or DEFAULT_FRAMES, size, up)
+    ring = frame_orbit_for_points(means, 24, size, up)
+    front = [-1, 0, 1]
+    arc = replace(ring, cam_from_world=ring.cam_from_world[front], intrinsics=ring.intrinsics[front])
+    return spiral_path(arc, options.num_frames or DEFAULT_FRAMES)
