@@ -1,8 +1,8 @@
 """Kills, full disks and too little memory, many times over: no run may be lost, changed, or leave anything behind.
 
-    python benchmarks/soak.py [--kills 500] [--minutes 60] [--seed 0] [--jobs static,dynamic,compact,export]
+    python benchmarks/soak.py [--kills 500] [--minutes 60] [--seed 0] [--jobs static,dynamic,prune,export]
 
-Every round begins a tiny run (16 px; a static one, one with moving Gaussians, one with a size limit, the compaction or
+Every round begins a tiny run (16 px; a static one, one with moving Gaussians, one with a size limit, the pruning or
 the export of a finished one), and kills it with SIGKILL: at a random moment, right before one of its file operations,
 or within a few milliseconds of one, so that saves are hit. It is then gone on with as a person would (`train --resume`,
 or the same command where there is nothing to resume), killed again, and at last left to end. Other rounds meet a full
@@ -62,9 +62,9 @@ JOBS = {
     "static": f"{STATIC} run.dir=OUT",
     "dynamic": f"{DYNAMIC} run.dir=OUT",
     "small file": f"{STATIC} run.dir=OUT train.steps=4 budget.max_mb=0.02",
-    "compact": "compact whole --out OUT --prune 0.5 --max-loss 100 --steps 6 --threads 1 train.save_every=2",
-    "compact dynamic": "compact whole_moving --out OUT --prune 0.5 --max-loss 100 --masks 3 --steps 4 --threads 1",
-    "export": "export whole --format compact --out OUT",
+    "prune": "prune whole --out OUT --prune 0.5 --max-loss 100 --steps 6 --threads 1 train.save_every=2",
+    "prune dynamic": "prune whole_moving --out OUT --prune 0.5 --max-loss 100 --masks 3 --steps 4 --threads 1",
+    "export": "export whole --format dyngs --out OUT",
 }
 SOURCES = {
     "still": "data synth still still --size 16 --views 4",

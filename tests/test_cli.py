@@ -25,7 +25,7 @@ from dyngs.config.io import load_config, save_config
 from dyngs.errors import DyngsError, reading
 from dyngs.export.ply import read_ply
 
-VERBS = ("demo", "train", "compact", "eval", "render", "export", "data", "bench", "doctor", "predict", "tradeoff")
+VERBS = ("demo", "train", "prune", "eval", "render", "export", "data", "bench", "doctor", "predict", "tradeoff")
 ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"} | {
     "PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])
 }
@@ -163,8 +163,8 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
         ("render nowhere --out x --time nan", "'nan' is not a time"),
         ("render nowhere --out x --time noon", "'noon' is not a time; write a number from 0 to 1"),
         ("render nowhere --out x --time 0 --times 0:1:2", "not allowed with"),
-        ("render nowhere --out x --path orbit --view 3", "--view is for a camera that stands still"),
-        ("render nowhere --out x --times 0:1:2 --frames 3", "--times and --frames both say"),
+        ("render nowhere --out x --path orbit --view 3", "--view renders from a fixed camera"),
+        ("render nowhere --out x --times 0:1:2 --frames 3", "--times and --frames both set"),
         ("export nowhere", "nowhere: not a run folder"),
         ("export nowhere --times 0:1", "'0:1' is no range of times; write START:STOP:COUNT"),
         ("export nowhere --times 0:nan:3", "times must be finite"),
@@ -255,25 +255,40 @@ def test_a_full_disk_gets_no_traceback() -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        ["compact", "RUN", "model.alpha_min=0.02", "prune.mask_times=6", "--out", "RUN2"],
-        ["compact", "RUN", "--out", "RUN2", "model.alpha_min=0.02", "prune.mask_times=6"],
-        ["compact", "--out", "RUN2", "RUN", "model.alpha_min=0.02", "--prune", "0.5", "prune.mask_times=6"],
+        ["prune", "RUN", "model.alpha_min=0.02", "prune.mask_times=6", "--out", "RUN2"],
+        ["prune", "RUN", "--out", "RUN2", "model.alpha_min=0.02", "prune.mask_times=6"],
+        ["prune", "--out", "RUN2", "RUN", "model.alpha_min=0.02", "--prune", "0.5", "prune.mask_times=6"],
     ],
 )
 def test_overrides_may_stand_anywhere(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     found: list[argparse.Namespace] = []
-    monkeypatch.setattr("dyngs.cli.compact.run", lambda arguments: found.append(arguments) or 0)
+    monkeypatch.setattr("dyngs.cli.prune.run", lambda arguments: found.append(arguments) or 0)
     assert main(words) == 0
     assert found[0].overrides == ["model.alpha_min=0.02", "prune.mask_times=6"]
     assert (found[0].run_dir, found[0].out) == (Path("RUN"), Path("RUN2"))
 
 
 @pytest.mark.parametrize(
-    "words", [["compact", "RUN", "--out", "X", "a.b=1", "foo"], ["eval", "RUN", "--split", "val", "a.b=1"]]
+    "words", [["prune", "RUN", "--out", "X", "a.b=1", "foo"], ["eval", "RUN", "--split", "val", "a.b=1"]]
 )
 def test_other_words_may_not(words: list[str], capsys: Capture) -> None:
     assert main(words) == 2
     assert f"unrecognized arguments: {words[-1]} " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "new"),
+    [
+        (["compact", "RUN", "--out", "X"], "`dyngs prune`"),
+        (["export", "RUN", "--format", "compact"], "--format dyngs"),
+        (["export", "--format=compact", "RUN"], "--format dyngs"),
+    ],
+)
+def test_old_spellings_name_the_new_ones(words: list[str], new: str, capsys: Capture) -> None:
+    assert main(words) == 2
+    line = capsys.readouterr().err
+    assert new in line
+    assert line.count("\n") == 1
 
 
 def test_words_after_train() -> None:
@@ -500,7 +515,7 @@ def test_one_openmp_runtime() -> None:
 
 
 @pytest.mark.parametrize("text", ["-1", "1.5", "x", "9" * 30, "²", "2000"])
-@pytest.mark.parametrize("command", [("render", "."), ("eval", "."), ("compact", ".", "--out", "x"), ("demo",)])
+@pytest.mark.parametrize("command", [("render", "."), ("eval", "."), ("prune", ".", "--out", "x"), ("demo",)])
 def test_threads_are_counted(capsys: pytest.CaptureFixture[str], command: tuple[str, ...], text: str) -> None:
     assert "is not a number of threads" in error_line(capsys, *command, "--threads", text)
 

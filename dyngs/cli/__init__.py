@@ -21,13 +21,15 @@ from contextlib import suppress
 from typing import NoReturn, TextIO
 
 from dyngs import __version__
-from dyngs.cli import bench, compact, data, demo, doctor, evaluate, export, predict, render, tradeoff, train
+from dyngs.cli import bench, data, demo, doctor, evaluate, export, predict, prune, render, tradeoff, train
 from dyngs.errors import DyngsError, printable, require_name
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
 _OUT_OF_MEMORY = "out of memory; use smaller pictures (data.longest_side) or a smaller cache (data.cache_mb)"
 _TORCH_OUT_OF_MEMORY = "DefaultCPUAllocator: can't allocate memory"
+_RENAMED = {"compact": "prune"}
+"""Commands of earlier versions and what they are called now."""
 _OVERRIDE = re.compile(r"[a-z]\w*(\.\w+)+=.*", re.DOTALL)
 
 
@@ -71,6 +73,9 @@ def _show_any_name() -> None:
 def _dispatch(arguments: list[str]) -> int:
     for word in arguments:
         require_name(word)
+    if arguments and arguments[0] in _RENAMED:
+        new = _RENAMED[arguments[0]]
+        raise DyngsError(f"the command {arguments[0]!r} is called {new!r} now: run `dyngs {new}` with the same options")
     parser = make_parser()
     try:
         parsed = _parsed(parser, arguments)
@@ -112,7 +117,7 @@ def _add_commands(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument("--debug", action="store_true", help="before the line of an error, show where it comes from")
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for module in (demo, train, compact, predict, evaluate, render, export, tradeoff, data, bench, doctor):
+    for module in (demo, train, prune, predict, evaluate, render, export, tradeoff, data, bench, doctor):
         module.add_parser(commands)
     return parser
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dyngs.cli.render import threads
+from dyngs.cli.arguments import threads
 from dyngs.errors import DyngsError
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.render import threads
+from dyngs.cli.arguments import threads
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -1,4 +1,4 @@
-"""``dyngs export``: a run as a file for other programs."""
+"""``dyngs export``: write a run as files: .ply, tracks, an avatar, or one small .dyngs file."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.render import is_avatar, moment, say
+from dyngs.cli.arguments import is_avatar_file, print_notes, scene_time
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 _EPILOG = """\
 examples:
   dyngs export runs/bench                                         runs/bench/splats.ply
-  dyngs export runs/dance --time 0.5 --out middle.ply             one moment
+  dyngs export runs/dance --time 0.5 --out middle.ply             the scene at one time
   dyngs export runs/dance --times 0:1:30 --out frames             frame_0000.ply ... for players of sequences
-  dyngs export runs/dance --static --out stage.ply                only what never moves
+  dyngs export runs/dance --static --out stage.ply                only the Gaussians that never move
   dyngs export runs/ann --motion walk.npz --out walk              a person (model.kind=human), one file per frame
-  dyngs export runs/ann --format avatar --out ann.safetensors     the person in one file, which these commands take, too
-  dyngs export runs/dance --format tracks --dynamic               where everything that moves is, as .npz
-  dyngs export runs/dance --format compact --out small            the run in little space, for eval, render and export
+  dyngs export runs/ann --format avatar --out ann.safetensors     a person as one file, for `render` and `export`
+  dyngs export runs/dance --format tracks --dynamic               positions of all moving Gaussians over time, as .npz
+  dyngs export runs/dance --format dyngs --out dance_export       a small file, for `eval`, `render` and `export`
 """
 
 
@@ -30,28 +30,35 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``export`` to the commands."""
     parser = commands.add_parser(
         "export",
-        help="write a run as files for other programs",
-        description="Write the Gaussians of a run as the standard 3DGS .ply, which viewers and editors read, or the "
-        "tracks of their centres, or a person as one file.",
+        help="write a run as .ply, tracks, avatar or small .dyngs file",
+        description="Write the Gaussians of a run as standard 3DGS .ply files, which viewers and editors read, as "
+        "tracks of their centres, as one small .dyngs file, or a person as an avatar file.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("run_dir", type=Path, metavar="RUN", help="folder that `dyngs train` wrote, or an avatar file")
-    parser.add_argument("--format", choices=("ply", "tracks", "compact", "avatar"), default="ply")
+    parser.add_argument("run_dir", type=Path, metavar="RUN", help="run folder, or an avatar file (.safetensors)")
     parser.add_argument(
-        "--out", type=Path, metavar="PATH", help="a file, or the folder of a sequence (default: splats... in RUN)"
+        "--format",
+        type=_format,
+        choices=("ply", "tracks", "dyngs", "avatar"),
+        default="ply",
+        help="file format (default ply)",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="PATH", help="file, or folder of a sequence (default: splats... in RUN)"
     )
     when = parser.add_mutually_exclusive_group()
-    when.add_argument("--time", type=moment, metavar="T", help="this moment, from 0 to 1 (default 0)")
-    when.add_argument("--times", metavar="A:B:N", help="N moments from A to B (tracks: default those of training)")
+    when.add_argument("--time", type=scene_time, metavar="T", help="time to export, from 0 to 1 (default 0)")
+    when.add_argument("--times", metavar="A:B:N", help="N times from A to B (tracks: default the training times)")
     parser.add_argument(
-        "--motion", type=Path, metavar="FILE", help="what the person of a run does: AMASS .npz, .bvh, .glb or .gltf"
+        "--motion", type=Path, metavar="FILE", help="motion for a person: AMASS .npz, .bvh, .glb or .gltf"
     )
     parser.add_argument(
         "--max-change",
         type=float,
         metavar="X",
-        help="compact: how much pictures may change, grey levels of 255 (default: 0.025 dB on training views)",
+        help="--format dyngs: largest root-mean-square change of the pictures, in grey levels of 255 "
+        "(default: what lowers the PSNR of training views by 0.025 dB)",
     )
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--static", action="store_true", help="only the Gaussians that never move")
@@ -59,22 +66,29 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.set_defaults(run=run)
 
 
+def _format(text: str) -> str:
+    """Return the name of a format; the former name of ``dyngs`` is refused with the new one."""
+    if text == "compact":
+        raise argparse.ArgumentTypeError("the format 'compact' is called 'dyngs' now: give --format dyngs")
+    return text
+
+
 def run(arguments: argparse.Namespace) -> int:
-    """Write the files and say how large they are."""
+    """Write the files and print where they are and how large."""
     from dyngs.export.avatar import read_avatar
     from dyngs.runs.checkpoint import load_run
 
-    is_file = is_avatar(arguments.run_dir)
-    if is_file and (arguments.out is None or arguments.format in ("compact", "avatar")):
+    is_file = is_avatar_file(arguments.run_dir)
+    if is_file and (arguments.out is None or arguments.format in ("dyngs", "avatar")):
         raise DyngsError(f"{arguments.run_dir}: an avatar file is exported as --format ply or tracks, with --out PATH")
     if arguments.format == "avatar":
         return _export_avatar(arguments)
-    if arguments.format == "compact":
-        return _export_compact(arguments)
+    if arguments.format == "dyngs":
+        return _export_dyngs(arguments)
     if arguments.max_change is not None:
-        raise DyngsError("--max-change goes with --format compact")
+        raise DyngsError("--max-change goes with --format dyngs")
     if arguments.format == "tracks" and arguments.static:
-        raise DyngsError("--static goes with --format ply; what never moves has no tracks")
+        raise DyngsError("--static goes with --format ply; Gaussians that never move have no tracks")
     times = _times(arguments)
     loaded = (read_avatar if is_file else load_run)(arguments.run_dir)
     if arguments.motion is not None:
@@ -83,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
         loaded = with_motion(loaded, arguments.motion).run
         times = loaded.scene.times if times is None else times
     if loaded.scene.is_still and times is not None:
-        say(("nothing moves in this run: it is the same at all times",))
+        print_notes(("nothing moves in this run: it is the same at all times",))
     write = _export_tracks if arguments.format == "tracks" else _export_ply
     files = write(arguments, loaded, times)
     size = sum(path.stat().st_size for path in files) / 1e6
@@ -92,65 +106,67 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _export_compact(arguments: argparse.Namespace) -> int:
-    """Write the run in little space, and say what that does to it."""
+def _export_dyngs(arguments: argparse.Namespace) -> int:
+    """Write the run as a .dyngs file and print how much its pictures change."""
     from dyngs.storage.run import SMALLEST_CHANGE, write_compact
 
     options = ("time", "times", "motion", "static", "dynamic")
     given = [name for name in options if getattr(arguments, name) not in (None, False)]
     if given:
-        raise DyngsError(f"--{given[0]} does not go with --format compact, which stores all of a run")
+        raise DyngsError(f"--{given[0]} does not go with --format dyngs, which stores the whole run")
     max_change: float | None = arguments.max_change
     if max_change is not None and not SMALLEST_CHANGE <= max_change <= 64:
         raise DyngsError(f"--max-change {max_change:g}: give {SMALLEST_CHANGE:g} to 64 grey levels of 255")
     out: Path = arguments.out or arguments.run_dir
     if out.suffix == ".dyngs":
         raise DyngsError(
-            f"{out}: a compact run is a folder (config.yaml and scene.dyngs); give --out {out.with_suffix('')}"
+            f"{out}: --format dyngs writes a folder (config.yaml and scene.dyngs); give --out {out.with_suffix('')}"
         )
     written = write_compact(arguments.run_dir, out, max_change)
     change = written.precision.change
     if change is None:
-        say((), ("the run's capture cannot be read: fixed steps were taken, what they do to pictures is not measured",))
+        warning = "the capture cannot be read: quantisation steps are fixed, and the change of pictures is not measured"
+        print_notes((), (warning,))
     else:
-        say((f"pictures change by {change:.2f} grey levels of 255 (root mean square of some training views)",))
+        note = f"pictures change by {change:.2f} grey levels of 255 (root mean square over some training views)"
+        print_notes((note,))
     ratio = written.num_bytes_exact / written.num_bytes
     print(f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller than before)")
     return 0
 
 
 def _export_avatar(arguments: argparse.Namespace) -> int:
-    """Write the person of a run as one file."""
+    """Write the person of a run as an avatar file."""
     from dyngs.export.avatar import write_avatar
     from dyngs.runs.checkpoint import load_run
 
     given = ("motion", "time", "times", "static", "dynamic")
     unfit = [f"--{name}" for name in given if getattr(arguments, name) not in (None, False)]
     if unfit:
-        raise DyngsError(f"{unfit[0]} does not go with --format avatar, which holds what is the same in all poses")
+        raise DyngsError(f"{unfit[0]} does not go with --format avatar, which is the same in all poses")
     path = write_avatar(load_run(arguments.run_dir), arguments.out or arguments.run_dir / "avatar.safetensors")
     print(f"written: {path} ({path.stat().st_size / 1e6:.1f} MB)")
     return 0
 
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
-    """The times asked for, within [0, 1]; None where none is."""
+    """Return the times asked for, clamped to [0, 1], or None."""
     from dyngs.evaluate.temporal import clamped_times
     from dyngs.view.camera_paths import parse_times
 
     if arguments.times is None and arguments.time is None:
         return None
     inside, warnings = clamped_times((arguments.time,) if arguments.times is None else parse_times(arguments.times))
-    say((), warnings)
+    print_notes((), warnings)
     return inside
 
 
 def _export_ply(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...] | None) -> list[Path]:
-    """The files written: a sequence where things move at several times, one file otherwise."""
+    """Write a sequence if several times of a moving scene are asked for, else one file; return the paths."""
     from dyngs.export.run_to_ply import write_run_ply, write_run_ply_sequence
 
     if loaded.scene.colour is not None:
-        say(("the run's colours are a network; the file holds harmonics of degree 3 that are fitted to it",))
+        print_notes(("the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",))
     part: Part = "still" if arguments.static else "moving" if arguments.dynamic else "all"
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
@@ -159,7 +175,7 @@ def _export_ply(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[f
         if out is not None and out.suffix.lower() != ".ply" and (out.is_dir() or is_sequence):
             out = out / f"{stem}.ply"
         if times is None and not arguments.static and not loaded.scene.is_still:
-            say(("this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence",))
+            print_notes(("this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence",))
         time = 0.0 if times is None else times[0]
         return [write_run_ply(loaded, out or arguments.run_dir / f"{stem}.ply", time, part)]
     if out is not None and out.suffix.lower() == ".ply":
@@ -173,5 +189,5 @@ def _export_tracks(arguments: argparse.Namespace, loaded: LoadedRun, times: tupl
     part = "moving" if arguments.dynamic else "all"
     tracks = tracks_of(loaded.scene, times or loaded.scene.times or (0.0,), loaded.info.world_offset, part=part)
     count, moments, _ = tracks.positions.shape
-    say((f"{count:,} Gaussians, {int(tracks.moving.sum()):,} of them moving, at {moments} times",))
+    print_notes((f"{count:,} Gaussians, {int(tracks.moving.sum()):,} of them moving, at {moments} times",))
     return [write_tracks(arguments.out or arguments.run_dir / "tracks.npz", tracks)]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.render import threads
+from dyngs.cli.arguments import threads
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:

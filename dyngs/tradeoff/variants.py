@@ -13,7 +13,7 @@ Value = float | int | str
 SEVERAL = "several"
 """In place of a knob's name, of combinations."""
 AUTO = "auto"
-"""Storage as coarse as ``dyngs export --format compact`` takes it by itself."""
+"""Storage as coarse as ``dyngs export --format dyngs`` takes it by itself."""
 
 
 @dataclass(frozen=True)

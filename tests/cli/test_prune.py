@@ -1,4 +1,4 @@
-"""``dyngs compact`` as a user calls it."""
+"""``dyngs prune`` as a user calls it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_a_smaller_run_and_a_table(tmp_path: Path, capsys: pytest.CaptureFixture
     run = train(busy_config(write_tiny_capture(tmp_path / "capture"), tmp_path / "run", "trajectory"))
     out = tmp_path / "small"
     words = [
-        "compact",
+        "prune",
         str(run),
         "--out",
         str(out),
@@ -38,4 +38,4 @@ def test_a_smaller_run_and_a_table(tmp_path: Path, capsys: pytest.CaptureFixture
     assert load_resolved(out).prune.share == 0.5
     assert "exists already" in error_line(capsys, *words)
     assert "prune.share" in error_line(capsys, *words[:3], str(tmp_path / "x"), "--prune", "1.5")
-    assert "--out" in error_line(capsys, "compact", str(run))
+    assert "--out" in error_line(capsys, "prune", str(run))

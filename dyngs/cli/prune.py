@@ -1,4 +1,4 @@
-"""``dyngs compact``: a run with a fraction of its Gaussians."""
+"""``dyngs prune``: a run with a fraction of its Gaussians."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.render import threads
+from dyngs.cli.arguments import threads
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -15,45 +15,47 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 examples:
-  dyngs compact runs/dance --out runs/dance_small                  the best known settings
-  dyngs compact runs/dance --out runs/tiny --prune 0.95 --max-loss 20 --steps 5000
-  dyngs compact runs/dance model.alpha_min=0.02 --out runs/fast    tuned for a higher cut-off of faint Gaussians
-  dyngs train --resume runs/tiny                                   where it was interrupted
+  dyngs prune runs/dance --out runs/dance_pruned                 the recommended settings
+  dyngs prune runs/dance --out runs/tiny --prune 0.95 --max-loss 20 --steps 5000
+  dyngs prune runs/dance model.alpha_min=0.02 --out runs/fast    fine-tuned for a higher opacity cut-off
+  dyngs train --resume runs/tiny                                 continue an interrupted fine-tuning
 
-As a part of training: dyngs train CONFIG ... prune.share=0.8. What the options mean: docs/compact.md.
+As a stage of training: dyngs train CONFIG ... prune.share=0.8. All options are explained in docs/prune.md.
 """
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``compact`` to the commands."""
+    """Add ``prune`` to the commands."""
     parser = commands.add_parser(
-        "compact",
-        help="a run with a fraction of its Gaussians, nearly as good and faster to draw",
-        description="Remove the Gaussians of a run that are worth least, and train the others a little longer; writes "
-        "a new run folder and says what that costs and brings.",
+        "prune",
+        help="remove the least important Gaussians of a run and fine-tune the rest",
+        description="Remove the Gaussians of a run that contribute least to its pictures and fine-tune the others. "
+        "Writes a new run folder and prints quality, speed and size before and after.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("run_dir", type=Path, metavar="RUN", help="folder that `dyngs train` wrote")
+    parser.add_argument("run_dir", type=Path, metavar="RUN", help="run folder written by `dyngs train`")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN2", help="folder of the new run")
     parser.add_argument("--prune", default="0.8", metavar="R", help="share to remove, in [0, 1) (default 0.8)")
     parser.add_argument(
         "--score",
         choices=("variation", "sensitivity", "contribution", "temporal"),
-        help="what a Gaussian is worth (default sensitivity)",
+        help="importance score of a Gaussian (default sensitivity)",
     )
     parser.add_argument(
-        "--max-loss", metavar="DB", help="PSNR that pruning may cost before fine-tuning, else it backs off (default 10)"
+        "--max-loss",
+        metavar="DB",
+        help="remove fewer if PSNR falls by more than this before fine-tuning (default 10)",
     )
-    parser.add_argument("--masks", metavar="K", help="key times of masks of what is seen (default none)")
-    parser.add_argument("--steps", metavar="N", help="of fine-tuning (default 2000)")
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="0 = all cores")
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="any other key of the run (docs/cli.md)")
+    parser.add_argument("--masks", metavar="K", help="number of key times of visibility masks (default: no masks)")
+    parser.add_argument("--steps", metavar="N", help="fine-tuning steps (default 2000)")
+    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="other config keys of the run (docs/cli.md)")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compact, compare and print."""
+    """Prune, fine-tune, compare with the run before, and print a table."""
     from rich.console import Console
 
     from dyngs.deform.trained import TrainedScene
@@ -67,16 +69,16 @@ def run(arguments: argparse.Namespace) -> int:
     folder = compact_run(arguments.run_dir, arguments.out, overrides)
     before, after = compared(arguments.run_dir, folder, arguments.threads)
     Console().print(cost_table(before, after))
-    after_all = load_run(folder)
-    has_masks = isinstance(after_all.scene, TrainedScene) and after_all.scene.masks is not None
-    if after_all.config.prune.mask_times > 1 and not has_masks:
+    pruned = load_run(folder)
+    has_masks = isinstance(pruned.scene, TrainedScene) and pruned.scene.masks is not None
+    if pruned.config.prune.mask_times > 1 and not has_masks:
         print("note: --masks was ignored; they are for scenes in which a deformation field moves something")
     print(f"written: {folder}\nnext:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/pictures")
     return 0
 
 
 def cost_table(before: Cost, after: Cost) -> Table:
-    """What was and what is, side by side."""
+    """Return a table that compares two runs."""
     from rich.table import Table
 
     table = Table("", "before", "after", "")

@@ -1,11 +1,11 @@
-"""What pruning, masks, fine-tuning and rounding each bring to a finished run: one row per way of compacting it.
+"""What pruning, masks, fine-tuning and rounding each bring to a finished run: one row per way of pruning it.
 
-    python benchmarks/compact.py RUN FOLDER [key=value ...] [--rows stages|parts|scores] [--threads 1]
+    python benchmarks/prune.py RUN FOLDER [key=value ...] [--rows stages|parts|scores] [--threads 1]
 
-FOLDER keeps the compacted runs, which are used again. `stages` goes the whole way: pruned, fine-tuned, stored by
-`dyngs export --format compact`. `parts` compares pruning alone, masks alone and both, with and without fine-tuning (one
-step); `scores` compares the scores. Pruning does not back off here. Overrides (prune.share=0.8, ...) hold for all
-rows. Printed as a table in Markdown: Gaussians, PSNR of 20 training views and of the whole test split, how
+FOLDER keeps the pruned runs, which are used again. `stages` goes the whole way: pruned, fine-tuned, stored by
+`dyngs export --format dyngs`. `parts` compares pruning alone, masks alone and both, with and without fine-tuning (one
+step); `scores` compares the scores. Pruning does not back off here. Overrides (prune.share=0.8, prune.mask_times=6, ...)
+hold for all rows. Printed as a table in Markdown: Gaussians, PSNR of 20 training views and of the whole test split, how
 many times as fast it draws as RUN, MB as float32 and as stored.
 """
 

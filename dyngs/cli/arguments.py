@@ -1,0 +1,59 @@
+"""Types of command-line arguments, and notes printed by several commands."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+from pathlib import Path
+
+MAX_THREADS = 1024
+
+
+def threads(text: str) -> int:
+    """Return a number of threads; 0 means all cores."""
+    if not (text.isascii() and text.isdigit() and len(text) < 5 and int(text) <= MAX_THREADS):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a number of threads; write a whole number up to {MAX_THREADS}, 0 for all cores"
+        )
+    return int(text)
+
+
+def scene_time(text: str) -> float:
+    """Return a finite time; values outside [0, 1] are clamped later, with a warning."""
+    try:
+        time = float(text)
+    except ValueError:
+        time = math.nan
+    if not math.isfinite(time):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time; write a number from 0 to 1, for instance 0.5")
+    return time
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """Return width and height from ``WIDTHxHEIGHT``."""
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.lower())
+    if not match or "0" in match.groups():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size; write WIDTHxHEIGHT, for instance 1280x720")
+    return int(match[1]), int(match[2])
+
+
+def frame_count(text: str) -> int:
+    """Return a positive number of frames."""
+    if not (text.isdecimal() and len(text) < 10 and int(text)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of frames; write a whole number above 0")
+    return int(text)
+
+
+def is_avatar_file(path: Path) -> bool:
+    """Whether a path is an avatar file, as opposed to a run folder or a .ply."""
+    return path.is_file() and path.suffix.lower() == ".safetensors"
+
+
+def print_notes(notes: tuple[str, ...], warnings: tuple[str, ...] = ()) -> None:
+    """Print notes to stdout and warnings to stderr."""
+    for note in notes:
+        print(f"note: {note}")
+    for warning in warnings:
+        print(f"dyngs: warning: {warning}", file=sys.stderr)
