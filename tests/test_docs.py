@@ -1,0 +1,323 @@
+"""The commands and the Python examples of README.md and docs/*.md: none may name an option or a key that is not there.
+
+Every ``dyngs`` command in a block of shell goes through the real parser and the real configuration; those of the pages
+in ``RUN_PAGES`` are run, shortened, in a folder with a tiny capture. Commands within sentences and outlines of commands
+(blocks of text) are checked for the names of their options, and ``key=value`` for keys and values.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from moving_scene import write_moving_run
+
+import dyngs
+from dyngs.cli import main, make_parser
+from dyngs.cli.train import parse_config
+from dyngs.config.io import load_config
+from dyngs.config.schema import config_keys
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.errors import DyngsError
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+SHELL, PYTHON, OUTLINE = ("bash", "sh"), ("python",), ("", "text")
+
+RUN_PAGES = ("README.md", "storage.md")
+SHORTER = {
+    "data synth": ("--size", "16", "--views", "6"),
+    "train": ("train.steps=3", "run.threads=1", "init.kind=random", "init.num_random=80"),
+    "render": ("--threads", "1"),
+    "eval": ("--threads", "1"),
+}
+"""Appended where a command is run."""
+NOT_RUN = {
+    "demo": "trains 3,000 steps; tests/test_demo.py runs it with fewer",
+    "bench": "takes half a minute; tests/bench runs it on less",
+    "predict": "needs a trained network; tests/cli/test_predict.py has one",
+    "prune": "fine-tunes 2,000 steps; tests/cli/test_prune.py does it with fewer",
+    "tradeoff": "measures dozens of variants; tests/cli/test_tradeoff.py does it with fewer",
+}
+"""Commands that are only parsed, with the reason."""
+OTHER_PROGRAMS = {
+    "pip": "installs packages; what it asks for is compared with pyproject.toml below",
+    "pytest": "runs this test",
+    "python": "a script of the repository: its file and the names of its options are compared below",
+    "cmake": "another build; a stage of .ci/run",
+    "export": "of the shell",
+    "for": "of the shell",
+    "test_": "a program that another build makes",
+    "seq": "of the shell",
+    "done": "of the shell",
+}
+NOT_COMMANDS = {
+    "dyngs avatar": "what the header of an avatar file says",
+    "dyngs time t": "what the header of a .ply says",
+    "dyngs compact": "README.md is rewritten in a change of its own",
+    "dyngs export --format compact": "README.md is rewritten in a change of its own",
+}
+OPEN_EXAMPLES = ("picture = dyngs.render(gaussians, cameras",)
+"""How Python examples begin that use names of the reader's own program: only the names of dyngs in them are checked."""
+
+KINDS = (
+    (),
+    ("colour.kind=network",),
+    ("strategy.kind=mcmc",),
+    ("init.kind=random",),
+    *(
+        ("model.kind=dynamic", f"model.deform.kind={kind}")
+        for kind in ("mlp", "hexplane", "trajectory", "control_nodes")
+    ),
+)
+PRESETS = ("static", "dynamic", "human", "human_predictor")
+PLACEHOLDER = re.compile(r"[A-Z]|\.\.\.|start:stop:step|value|X,Y")
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of a page: the words after ``dyngs``."""
+
+    page: str
+    words: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.page}: dyngs {' '.join(self.words)}"
+
+    @property
+    def verb(self) -> str:
+        return " ".join(self.words[: 2 if self.words[0] in ("data", "bench") else 1])
+
+
+def blocks(page: Path, languages: tuple[str, ...]) -> Iterator[str]:
+    """Fenced blocks of a page in some languages."""
+    yield from (text for language, text in BLOCK.findall(page.read_text(encoding="utf-8")) if language in languages)
+
+
+def segments(block: str) -> Iterator[list[str]]:
+    """The simple commands of a block of shell, as words; comments are left out, variables stand for 1."""
+    for line in re.sub(r"\\\n\s*", " ", block).splitlines():
+        lexer = shlex.shlex(re.sub(r"\$\w+|\$\{\w+\}", "1", line), posix=True, punctuation_chars=";&|()")
+        lexer.whitespace_split = True
+        words: list[str] = []
+        for word in [*lexer, ";"]:
+            if set(word) <= set(";&|()$"):
+                if words:
+                    yield words
+                words = []
+            elif words or (word not in ("do", ".") and not re.fullmatch(r"[A-Z_]+=.*", word)):
+                words.append(word)
+
+
+def dyngs_words(words: list[str]) -> tuple[str, ...] | None:
+    """The words after ``dyngs`` or ``-m dyngs``; None where another program is called."""
+    if words[0] == "dyngs":
+        return tuple(words[1:])
+    if words[0] in ("python", "torchrun") and words[-1] != "-m" and "-m" in words:
+        at = words.index("-m")
+        return tuple(words[at + 2 :]) if words[at + 1] == "dyngs" else None
+    return None
+
+
+def commands() -> list[Command]:
+    """Every ``dyngs`` command in the blocks of shell."""
+    found = []
+    for page in PAGES:
+        for block in blocks(page, SHELL):
+            found += [Command(page.name, w) for words in segments(block) if (w := dyngs_words(words)) is not None]
+    return found
+
+
+@pytest.fixture
+def parsed(monkeypatch: pytest.MonkeyPatch) -> list[argparse.Namespace]:
+    """What commands are called with: they do nothing but note it here."""
+    found: list[argparse.Namespace] = []
+    modules = [module for name, module in sys.modules.items() if name.startswith("dyngs.cli.")]
+    for module in modules:
+        for name in [name for name in vars(module) if re.match(r"run(_|$)", name)]:
+            monkeypatch.setattr(module, name, lambda arguments: found.append(arguments) or 0)
+    return found
+
+
+def require_overrides(overrides: list[str]) -> None:
+    """Nothing, if some kind of run takes these ``key=value``. Raises DyngsError otherwise."""
+    errors = []
+    for preset in PRESETS:
+        for kinds in KINDS:
+            try:
+                load_config(Path(preset), ["data.root=x", *kinds, *overrides])
+            except DyngsError as error:
+                errors.append(error)
+            else:
+                return
+    raise errors[0]
+
+
+def require_sound(command: Command, arguments: argparse.Namespace) -> None:
+    """Nothing, if what a parsed command names besides its options can be: keys, variations, times, presets."""
+    from dyngs.tradeoff.requirements import parse_goal, parse_requirements
+    from dyngs.tradeoff.variants import parse_variations
+    from dyngs.view.camera_paths import parse_times
+    from dyngs.view.render_job import path_file
+
+    for word in command.words:
+        if word.startswith(("configs/", "benchmarks/", "examples/")):
+            assert (ROOT / word).is_file(), f"{command}: there is no {word}"
+        assert not Path(word.partition("=")[2] or word).is_absolute(), f"{command}: a path of one machine"
+    overrides = [word for word in getattr(arguments, "overrides", []) if "=" in word]
+    if command.verb == "train" and arguments.resume is None:
+        parse_config(arguments.overrides, None)
+    elif command.verb == "tradeoff":
+        is_config = arguments.target.startswith("configs/")
+        parse_variations(arguments.vary, trains=arguments.train or is_config)
+        parse_requirements(arguments.require or "psnr>=1")
+        parse_goal(arguments.minimize or arguments.maximize or "psnr", smallest=bool(arguments.minimize))
+        if is_config:
+            load_config(Path(arguments.target), overrides)
+    elif overrides:
+        require_overrides(overrides)
+    if getattr(arguments, "times", None) is not None:
+        parse_times(arguments.times)
+    if getattr(arguments, "path", None) is not None and command.verb == "render":
+        path_file(arguments.path)
+
+
+@pytest.mark.parametrize("command", commands(), ids=str)
+def test_every_command_is_parsed_with_its_configuration(
+    command: Command, parsed: list[argparse.Namespace], capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = main(list(command.words))
+    assert code == 0, capsys.readouterr().err
+    require_sound(command, parsed[0])
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["eval runs/a --splt test", "train static data.root=x trian.steps=2", "prune r --out o compact.pruen=0.1"],
+)
+def test_a_misspelt_option_or_key_is_noticed(words: str, parsed: list[argparse.Namespace]) -> None:
+    command = Command("nowhere.md", tuple(words.split()))
+    if main(list(command.words)) == 0:
+        with pytest.raises(DyngsError, match="unknown key"):
+            require_sound(command, parsed[0])
+    else:
+        assert "--splt" in command.words
+
+
+def test_other_programs_are_known_and_their_options_there() -> None:
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    for page in PAGES:
+        for words in (w for block in blocks(page, SHELL) for w in segments(block) if dyngs_words(w) is None):
+            program = Path(words[0]).name
+            reason = [why for name, why in OTHER_PROGRAMS.items() if program == name or name == program[:5]]
+            assert reason, f"{page.name}: {' '.join(words)} is neither checked nor in OTHER_PROGRAMS"
+            for extra in re.findall(r"\[([\w,]+)\]", " ".join(words)) if program == "pip" else ():
+                for name in extra.split(","):
+                    assert re.search(rf"^{name} = \[", project, re.MULTILINE), f"{page.name}: no extra {name}"
+            if program == "python" and words[1].endswith(".py"):
+                source = (ROOT / words[1]).read_text(encoding="utf-8")
+                own = words[: words.index("--")] if "--" in words else words
+                for option in (word for word in own if word.startswith("--")):
+                    assert f'"{option}"' in source, f"{page.name}: {words[1]} has no {option}"
+
+
+# ------------------------------------------------------------------------------------------ in sentences and outlines
+
+
+def options_of(verb: list[str]) -> set[str]:
+    """The options of a command and of the commands below it."""
+    parser: argparse.ArgumentParser = make_parser()
+    found: set[str] = set()
+    while True:
+        found |= {option for action in parser._actions for option in action.option_strings}
+        below = [a.choices for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+        name = next((word for word in verb if below and word in below[0]), None)
+        if name is None:
+            return found
+        parser = below[0][name]  # pyright: ignore[reportArgumentType]
+
+
+def mentions(page: Path) -> Iterator[str]:
+    """Commands in sentences and in blocks of text, which may leave words out."""
+    text = page.read_text(encoding="utf-8")
+    yield from re.findall(r"`(dyngs [^`\n]*)`", BLOCK.sub("", text))
+    for block in blocks(page, OUTLINE):
+        yield from (line.lstrip("$ ") for line in block.splitlines() if re.match(r"(\$ )?dyngs ", line))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_in_sentences_have_the_options_that_they_name(page: Path) -> None:
+    verbs = next(a.choices for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    assert verbs is not None
+    for mention in mentions(page):
+        words = mention.split()
+        if mention in NOT_COMMANDS or words[1].startswith("-"):
+            continue
+        assert words[1] in verbs, f"{page.name}: `{mention}`: no such command"
+        for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", mention):
+            assert option in options_of(words[1:3]), f"{page.name}: `{mention}`: no option {option}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_keys_in_sentences_are_keys_of_the_configuration(page: Path) -> None:
+    keys = {key.name for key in config_keys()}
+    for code in re.findall(r"`([^`\n]*)`", BLOCK.sub("", page.read_text(encoding="utf-8"))):
+        words = [word for word in code.split() if re.fullmatch(r"[a-z]\w*(\.[a-z]\w*)+=\S+", word)]
+        for word in words:
+            name = word.partition("=")[0]
+            assert name in keys or name == "section.key", f"{page.name}: `{code}`: no key {name}"
+        whole = [word for word in words if not PLACEHOLDER.search(word.partition("=")[2])]
+        if whole:
+            require_overrides(whole)
+
+
+# ------------------------------------------------------------------------------------------------------- really run
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what the pages in ``RUN_PAGES`` begin from."""
+    folder = tmp_path_factory.mktemp("docs")
+    write_still_capture(folder / "PATH", StillOptions(size=16, num_train=4, num_test=2, samples=1))
+    (folder / "runs").mkdir()
+    write_moving_run(folder / "moving").rename(folder / "runs" / "dance")
+    return folder
+
+
+def shortened(command: Command) -> list[str]:
+    """The command with less to do."""
+    words, extra = list(command.words), SHORTER.get(command.verb, ())
+    if "--times" in words:
+        at = words.index("--times") + 1
+        words[at] = re.sub(r":\d+$", ":3", words[at])
+    elif "--path" in words:
+        extra = (*extra, "--frames", "3")
+    return [*words, *extra]
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_the_commands_of_these_pages_run(
+    workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(workplace)
+    for command in (command for name in RUN_PAGES for command in commands() if command.page == name):
+        if command.words[0] not in NOT_RUN:
+            assert main(shortened(command)) == 0, f"{command}\n{capsys.readouterr().err}"
+
+
+@pytest.mark.parametrize(
+    ("page", "code"), [(page.name, code) for page in PAGES for code in blocks(page, PYTHON)], ids=lambda x: x[:20]
+)
+def test_python_examples_run(page: str, code: str, workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(workplace)
+    for name in set(re.findall(r"\bdyngs\.(\w+)\(", code)):
+        assert hasattr(dyngs, name), f"{page}: there is no dyngs.{name}"
+    if not any(example in code for example in OPEN_EXAMPLES):
+        exec(compile(code, page, "exec"), {})
