@@ -14,6 +14,7 @@ from torch import Tensor
 from dyngs.deform.learned import LearnedTensors
 from dyngs.gaussians import Gaussians
 from dyngs.ops.offsets import add_offsets_
+from dyngs.ops.registration import has_kernel
 
 MAX_KEY_TIMES = 256
 """Longer clips want a choice of their own: memory grows with it."""
@@ -106,7 +107,7 @@ def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None)
 
     No row may occur twice. Without gradients it is done in one pass.
     """
-    if not torch.is_grad_enabled() and gaussians.means.device.type == "cpu":
+    if not torch.is_grad_enabled() and has_kernel("add_offsets_", gaussians.means.device):
         return _deformed_in_one_pass(gaussians, offsets, rows)
     changes = {"means": _added(gaussians.means, offsets.means, rows)}
     if offsets.quats is not None:

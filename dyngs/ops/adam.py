@@ -1,4 +1,4 @@
-"""Adam in place on arrays of rows, for all rows or only some: one native pass over the memory in float32 on the CPU."""
+"""Adam in place on arrays of rows, for all rows or only some: in float32 on the CPU one native pass over the memory."""
 
 from __future__ import annotations
 
@@ -8,7 +8,61 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import core, num_threads
+from dyngs.ops.native import array, core, num_threads, writable
+from dyngs.ops.registration import has_kernel, register
+
+
+def _adam_step(
+    param: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    rates: Tensor,
+    rows: Tensor | None,
+    betas: list[float],
+    eps: float,
+    step: int,
+) -> Tensor:
+    moments = writable(exp_avg), writable(exp_avg_sq)
+    chosen, options = None if rows is None else array(rows), (betas[0], betas[1], eps, step)
+    skipped = core.adam_step(writable(param), array(grad), *moments, array(rates), chosen, options, num_threads())
+    return torch.tensor(skipped, dtype=torch.int64, device="cpu")
+
+
+def _fake_adam_step(
+    param: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    rates: Tensor,
+    rows: Tensor | None,
+    betas: list[float],
+    eps: float,
+    step: int,
+) -> Tensor:
+    return param.new_empty((), dtype=torch.int64)
+
+
+adam_step_op = register(
+    "adam_step_",
+    _adam_step,
+    fake=_fake_adam_step,
+    mutates=("param", "exp_avg", "exp_avg_sq"),
+)
+"""Update (N, C) arrays in place, with rates (C,) and rows (N,) bool; returns the number () int64 of rows skipped."""
+
+
+def _seen_rows(grads: Tensor) -> Tensor:
+    seen = torch.empty(len(grads), dtype=torch.bool, device="cpu")
+    core.seen_rows(array(grads), array(seen), num_threads())
+    return seen
+
+
+def _fake_seen_rows(grads: Tensor) -> Tensor:
+    return grads.new_empty(len(grads), dtype=torch.bool)
+
+
+seen_rows_op = register("seen_rows", _seen_rows, fake=_fake_seen_rows)
 
 
 @torch.no_grad()
@@ -24,10 +78,10 @@ def adam_step_(
     betas: tuple[float, float] = (0.9, 0.999),
     rows: Tensor | None = None,
 ) -> int:
-    """Number of rows left out for a gradient that cannot be used; updates ``param`` and its two moments in place.
+    """Update ``param`` and its two moments in place; return the number of rows skipped for an unusable gradient.
 
     The update of Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global ``step``
-    also for rows that were left out before. Rows left out keep their value and moments unchanged. A gradient cannot be
+    also for rows that were skipped before. Rows skipped keep their value and moments unchanged. A gradient cannot be
     used if it is NaN, infinite, or so large that its square is not safely finite (2^63 = 9.2e18 in float32, 2^511 in
     float64): an infinite second moment would hold the value for ever.
 
@@ -52,40 +106,33 @@ def adam_step_(
         return 0
     row_size = param.numel() // len(param)
     rates = _column_rates(lr, row_size, param)
-    arrays = [x.detach().view(len(param), row_size) for x in (param, grad.contiguous(), exp_avg, exp_avg_sq)]
-    if param.dtype != torch.float32 or param.device.type != "cpu":
-        return _torch_step(*arrays, rates=rates, step=step, eps=eps, betas=betas, rows=rows)
-    chosen = None if rows is None else rows.contiguous()
-    options = (betas[0], betas[1], eps, step)
-    return core.adam_step(*arrays, rates, chosen, options, num_threads())
+    p, g, m, v = (x.detach().view(len(param), row_size) for x in (param, grad.contiguous(), exp_avg, exp_avg_sq))
+    native = param.dtype == torch.float32 and has_kernel("adam_step_", param.device)
+    return int((adam_step_op if native else _torch_adam_step)(p, g, m, v, rates, rows, list(betas), eps, step))
 
 
 @torch.no_grad()
 def seen_rows(grads: Tensor) -> Tensor:
-    """(N,) bool: the rows of ``grads`` (N, ...) with an element other than zero; NaN counts as such."""
+    """Return (N,) bool: the rows of ``grads`` (N, ...) with an element other than zero; NaN counts as one."""
     if grads.numel() == 0:
         return torch.zeros(len(grads), dtype=torch.bool, device=grads.device)
     flat = grads.detach().reshape(len(grads), -1)
-    if flat.dtype != torch.float32 or flat.device.type != "cpu":
-        return (flat != 0).any(dim=1)
-    seen = torch.empty(len(flat), dtype=torch.bool)
-    core.seen_rows(flat.contiguous(), seen, num_threads())
-    return seen
+    native = flat.dtype == torch.float32 and has_kernel("seen_rows", flat.device)
+    return seen_rows_op(flat) if native else (flat != 0).any(dim=1)
 
 
-def _torch_step(
+def _torch_adam_step(
     param: Tensor,
     grad: Tensor,
     exp_avg: Tensor,
     exp_avg_sq: Tensor,
-    *,
     rates: Tensor,
-    step: int,
-    eps: float,
-    betas: tuple[float, float],
     rows: Tensor | None,
-) -> int:
-    """`adam_step_` on (N, C) arrays in plain torch, for other dtypes and devices."""
+    betas: list[float],
+    eps: float,
+    step: int,
+) -> Tensor:
+    """Return the number of rows skipped, as ``adam_step_op``, in plain torch: for other dtypes and devices."""
     too_large = 2.0 ** (math.frexp(torch.finfo(grad.dtype).max)[1] // 2 - 1)
     usable = (grad.abs() < too_large).all(dim=1)  # NaN is not
     wanted = torch.ones_like(usable) if rows is None else rows
@@ -96,7 +143,7 @@ def _torch_step(
     new_param = param - rates / (1 - betas[0] ** step) * new_avg / denominator
     for old, new in ((param, new_param), (exp_avg, new_avg), (exp_avg_sq, new_avg_sq)):
         old.copy_(torch.where(active, new, old))
-    return int((wanted & ~usable).sum())
+    return (wanted & ~usable).sum()
 
 
 def _column_rates(lr: float | Tensor, row_size: int, param: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Looking for NaN and infinity, fast enough to do it on every render."""
+"""Checks for NaN and infinity that are fast enough for every render."""
 
 from __future__ import annotations
 
@@ -10,24 +10,37 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError
 from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.registration import has_kernel, register
+
+
+def _count_nonfinite(x: Tensor) -> Tensor:
+    return torch.tensor(core.count_nonfinite(array(x), num_threads()), device=x.device)
+
+
+def _fake_count_nonfinite(x: Tensor) -> Tensor:
+    return x.new_empty((), dtype=torch.int64)
+
+
+count_nonfinite_op = register("count_nonfinite", _count_nonfinite, fake=_fake_count_nonfinite)
 
 
 def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input") -> None:
-    """Nothing, if every element is finite.
+    """Raise an error unless every element of the ``tensors`` (float32 or float64) is finite.
 
     Raises:
         DyngsError: naming the tensor, how many elements and how many rows are not finite, and the ``remedy``.
     """
     for name, x in tensors.items():
-        count = core.count_nonfinite(array(x), num_threads())
+        native = has_kernel("count_nonfinite", x.device)
+        count = int(count_nonfinite_op(x.detach()) if native else (~x.isfinite()).sum())
         if count:
             rows = int((~finite_rows([x])).sum())
             raise DyngsError(f"{name} holds {count} NaN or infinite value(s) in {rows} of {len(x)} rows; {remedy}")
 
 
 def finite_rows(tensors: Sequence[Tensor]) -> Tensor:
-    """(N,) bool: rows that are finite in all of the tensors (N, ...)."""
-    keep = torch.ones(len(tensors[0]), dtype=torch.bool)
+    """Return (N,) bool: the rows that are finite in all of the tensors (N, ...)."""
+    keep = torch.ones(len(tensors[0]), dtype=torch.bool, device=tensors[0].device)
     for x in tensors:
         keep &= torch.isfinite(x.detach()).reshape(len(x), math.prod(x.shape[1:])).all(dim=1)
     return keep

@@ -1,19 +1,21 @@
 """Fused L1 + SSIM loss of one picture, and SSIM as a measure.
 
-On the CPU in float32 the value and its gradient come from one native call; elsewhere from the plain torch formula,
-which is also the reference of the tests.
+In float32 the value and its gradient come from one native call; in other dtypes, and on devices without an
+implementation, from the plain torch formula, which is also the reference of the tests.
 """
 
 from __future__ import annotations
 
 from functools import reduce
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import core, num_threads
+from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.registration import Gradient, has_kernel, register
 
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
@@ -21,8 +23,47 @@ SSIM_RADIUS = 5
 SSIM_SIGMA = 1.5
 
 
+def _l1_ssim(
+    rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, with_gradient: bool
+) -> tuple[Tensor, Tensor]:
+    gradient = torch.empty_like(rendered) if with_gradient else None
+    loss = core.l1_ssim(
+        array(rendered),
+        array(target),
+        None if mask is None else array(mask),
+        None if gradient is None else array(gradient),
+        ssim_weight,
+        num_threads(),
+    )
+    return rendered.new_tensor(loss), rendered.new_empty(0) if gradient is None else gradient
+
+
+def _fake_l1_ssim(
+    rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, with_gradient: bool
+) -> tuple[Tensor, Tensor]:
+    gradient = torch.empty_like(rendered) if with_gradient else rendered.new_empty(0)
+    return rendered.new_empty(()), gradient
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+    _, gradient = output
+    ctx.mark_non_differentiable(gradient)
+    ctx.save_for_backward(gradient)
+
+
+def _backward(ctx: Any, grad_loss: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
+    (gradient,) = ctx.saved_tensors
+    if gradient.numel() == 0:
+        raise RuntimeError("dyngs::l1_ssim was called without with_gradient, so it has no gradient")
+    return grad_loss * gradient, None, None, None, None
+
+
+l1_ssim_op = register("l1_ssim", _l1_ssim, fake=_fake_l1_ssim, gradient=Gradient(_save, _backward))
+"""The loss () and its gradient by ``rendered`` (H, W, 3), which is empty if not asked for; float32, contiguous."""
+
+
 def l1_ssim_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
-    """Training loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)``: a scalar, differentiable in ``rendered``.
+    """Return the training loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)``, differentiable in ``rendered``.
 
     L1 is the mean of ``|x - y|``; SSIM is the mean over pixels and channels of the SSIM map with an 11x11 Gaussian
     window of sigma 1.5, zero padding and data range 1, as in 3DGS. With a mask both pictures are multiplied by it, and
@@ -41,19 +82,19 @@ def l1_ssim_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mas
     """
     _check(rendered, target, mask)
     x, y, m = _in_common_precision(rendered, target, mask)
-    if x.dtype != torch.float32 or x.device.type != "cpu":
+    if x.dtype != torch.float32 or not has_kernel("l1_ssim", x.device):
         return reference_l1_ssim(x, y, ssim_weight, m)
     with_gradient = torch.is_grad_enabled() and x.requires_grad
-    return _l1_ssim(x, y, m, ssim_weight, with_gradient)[0]
+    return l1_ssim_op(x, y, m, ssim_weight, with_gradient)[0]
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Mean SSIM of two (H, W, 3) pictures in [0, 1] as a scalar, differentiable in ``a``; see `l1_ssim_loss`."""
+    """Return the mean SSIM () of two (H, W, 3) pictures in [0, 1], differentiable in ``a``; see `l1_ssim_loss`."""
     return 1 - l1_ssim_loss(a, b, ssim_weight=1.0)
 
 
 def reference_l1_ssim(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
-    """The value of `l1_ssim_loss` in plain torch: any floating dtype and device, differentiable in every tensor."""
+    """Return `l1_ssim_loss` computed in plain torch: any floating dtype and device, differentiable in every tensor."""
     weight = torch.ones_like(rendered[..., 0]) if mask is None else mask
     total = 3 * weight.sum()
     total = torch.where(total == 0, 1, total)
@@ -65,7 +106,10 @@ def reference_l1_ssim(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2
 
 
 def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
-    """(H, W, 3) structural similarity of two pictures, Wang et al. 2004; in float64, as variances of E[x^2] cancel."""
+    """Return the (H, W, 3) structural similarity of two pictures (Wang et al. 2004).
+
+    Computed in float64, because the difference of second moments that gives a variance cancels.
+    """
     dtype, x, y = x.dtype, x.double(), y.double()
     taps = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=x.dtype, device=x.device)
     taps = torch.exp(-(taps**2) / (2 * SSIM_SIGMA**2))
@@ -91,50 +135,9 @@ def _check(rendered: Tensor, target: Tensor, mask: Tensor | None) -> None:
 
 
 def _in_common_precision(rendered: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The inputs contiguous and in one dtype, at least float32; target and mask cut off from autograd."""
+    """Return the inputs contiguous and in one dtype, at least float32; target and mask cut off from autograd."""
     given = [rendered.dtype, target.dtype, torch.float32]
     dtype = reduce(torch.promote_types, given)
     constants = [None if x is None else x.detach().to(dtype).contiguous() for x in (target, mask)]
     assert constants[0] is not None
     return rendered.to(dtype).contiguous(), constants[0], constants[1]
-
-
-@torch.library.custom_op("dyngs::l1_ssim", mutates_args=(), device_types="cpu")
-def _l1_ssim(
-    rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, with_gradient: bool
-) -> tuple[Tensor, Tensor]:
-    """The loss () and its gradient by ``rendered`` (H, W, 3), which is empty if not asked for. Float32, contiguous."""
-    gradient = torch.empty_like(rendered) if with_gradient else None
-    loss = core.l1_ssim(
-        rendered.detach(),
-        target.detach(),
-        None if mask is None else mask.detach(),
-        gradient,
-        ssim_weight,
-        num_threads(),
-    )
-    return rendered.new_tensor(loss), rendered.new_empty(0) if gradient is None else gradient
-
-
-@_l1_ssim.register_fake
-def _(
-    rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, with_gradient: bool
-) -> tuple[Tensor, Tensor]:
-    gradient = torch.empty_like(rendered) if with_gradient else rendered.new_empty(0)
-    return rendered.new_empty(()), gradient
-
-
-def _save_gradient(ctx, inputs, output) -> None:
-    _, gradient = output
-    ctx.mark_non_differentiable(gradient)
-    ctx.save_for_backward(gradient)
-
-
-def _scale_gradient(ctx, grad_loss: Tensor, _: Tensor | None):
-    (gradient,) = ctx.saved_tensors
-    if gradient.numel() == 0:
-        raise RuntimeError("dyngs::l1_ssim was called without with_gradient, so it has no gradient")
-    return grad_loss * gradient, None, None, None, None
-
-
-_l1_ssim.register_autograd(_scale_gradient, setup_context=_save_gradient)

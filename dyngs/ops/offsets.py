@@ -1,4 +1,4 @@
-"""Adds what a deformation field says to rows of Gaussians, in one pass."""
+"""Offsets of a deformation field added to rows of Gaussians, in one pass."""
 
 from __future__ import annotations
 
@@ -6,25 +6,75 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.native import array, core, num_threads, writable
+from dyngs.ops.registration import register
+
+
+def _add_offsets(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    logit_opacities: Tensor,
+    sh: Tensor,
+    rows: Tensor | None,
+    by_means: Tensor,
+    by_quats: Tensor | None,
+    by_log_scales: Tensor | None,
+    by_logit_opacities: Tensor | None,
+    by_colors: Tensor | None,
+) -> None:
+    offsets = (by_means, by_quats, by_log_scales, by_logit_opacities, by_colors)
+    core.add_offsets(
+        tuple(writable(x) for x in (means, quats, log_scales, logit_opacities, sh)),
+        None if rows is None else array(rows),
+        tuple(None if x is None else array(x) for x in offsets),
+        num_threads(),
+    )
+
+
+def _fake_add_offsets(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    logit_opacities: Tensor,
+    sh: Tensor,
+    rows: Tensor | None,
+    by_means: Tensor,
+    by_quats: Tensor | None,
+    by_log_scales: Tensor | None,
+    by_logit_opacities: Tensor | None,
+    by_colors: Tensor | None,
+) -> None:
+    return None
+
+
+add_offsets_op = register(
+    "add_offsets_",
+    _add_offsets,
+    fake=_fake_add_offsets,
+    mutates=("means", "quats", "log_scales", "logit_opacities", "sh"),
+)
 
 
 def add_offsets_(gaussians: Sequence[Tensor], rows: Tensor | None, offsets: Sequence[Tensor | None]) -> None:
     """Move M of N Gaussians in place, as ``dyngs.deform.field.deformed`` defines it; no gradient.
 
     Args:
-        gaussians: (N, 3) means, (N, 4) quats, (N, 3) log scales, (N,) opacity logits, (N, K, 3) harmonics; contiguous,
-            on the CPU.
+        gaussians: (N, 3) means, (N, 4) quats, (N, 3) log scales, (N,) opacity logits, (N, K, 3) harmonics; contiguous
+            where there are offsets.
         rows: (M,) int64 without repetition; None: the first M.
-        offsets: (M, ...) of each in this order, of the base colour in place of harmonics; the first is there.
+        offsets: (M, ...) of each in this order, of the base colour in place of harmonics; None but for the first: none.
 
     Raises:
         IndexError: a row that does not exist.
+        DyngsError: Gaussians that are not contiguous.
     """
-    dtype = gaussians[0].dtype
-    core.add_offsets(
-        tuple(array(x) for x in gaussians),
-        None if rows is None else array(rows),
-        tuple(None if x is None else array(x.to(dtype)) for x in offsets),
-        num_threads(),
+    by_means, by_quats, by_log_scales, by_logits, by_colors = (
+        None if x is None else x.detach().to(gaussians[0].dtype) for x in offsets
     )
+    assert by_means is not None
+    # .data where nothing is added: a tensor that stays as it is must not count as changed for autograd
+    means, quats, log_scales, logits, sh = (
+        x.data.contiguous() if offset is None else x.detach() for x, offset in zip(gaussians, offsets, strict=True)
+    )
+    add_offsets_op(means, quats, log_scales, logits, sh, rows, by_means, by_quats, by_log_scales, by_logits, by_colors)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from torch.nn.functional import linear
 
 from dyngs.errors import DyngsError
 from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.registration import Gradient, has_kernel, register
 
 KEPT_BYTES = 2**30
 """The backward pass computes the activations again where keeping them would take more memory than this."""
@@ -30,8 +32,82 @@ class Layer:
     bias: Tensor
 
 
+def _empty_kept(x: Tensor, widths: list[int], skip: int, keep: bool) -> Tensor:
+    """Return room for the activations between the layers; empty unless asked for, and if they would take too much."""
+    size = x.shape[0] * core.perceptron_kept_per_row(widths, skip)
+    return x.new_empty(size if keep and size * x.element_size() <= KEPT_BYTES else 0)
+
+
+def _perceptron(x: Tensor, params: Tensor, widths: list[int], skip: int, keep: bool) -> tuple[Tensor, Tensor]:
+    y = x.new_empty(x.shape[0], widths[-1])
+    kept = _empty_kept(x, widths, skip, keep)
+    arrays = (array(t) for t in (x, params, y))
+    core.perceptron_forward(*arrays, array(kept) if kept.numel() else None, widths, skip, num_threads())
+    return y, kept
+
+
+def _fake_perceptron(x: Tensor, params: Tensor, widths: list[int], skip: int, keep: bool) -> tuple[Tensor, Tensor]:
+    return x.new_empty(x.shape[0], widths[-1]), _empty_kept(x, widths, skip, keep)
+
+
+def _perceptron_backward(
+    inputs: list[Tensor], grad: Tensor, widths: list[int], skip: int, with_x: bool
+) -> tuple[Tensor, Tensor]:
+    x, params, kept = inputs
+    grad_x = x.new_empty(x.shape if with_x else (0,))
+    grad_params = params.new_empty(params.shape)
+    core.perceptron_backward(
+        *(array(t) for t in (x, params, grad)),
+        array(kept) if kept.numel() else None,
+        array(grad_x) if with_x else None,
+        array(grad_params),
+        widths,
+        skip,
+        num_threads(),
+    )
+    return grad_x, grad_params
+
+
+def _fake_perceptron_backward(
+    inputs: list[Tensor], grad: Tensor, widths: list[int], skip: int, with_x: bool
+) -> tuple[Tensor, Tensor]:
+    x, params, _ = inputs
+    return x.new_empty(x.shape if with_x else (0,)), params.new_empty(params.shape)
+
+
+perceptron_backward_op = register(
+    "perceptron_backward",
+    _perceptron_backward,
+    fake=_fake_perceptron_backward,
+)
+"""Gradients by x, empty unless asked for, and by the parameters; ``inputs`` are x, params and kept."""
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+    x, params, ctx.widths, ctx.skip, _ = inputs
+    _, kept = output
+    ctx.mark_non_differentiable(kept)
+    ctx.save_for_backward(x, params, kept)
+
+
+def _backward(ctx: Any, grad: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
+    with_x = ctx.needs_input_grad[0]
+    grad_x, grad_params = perceptron_backward_op(list(ctx.saved_tensors), grad, ctx.widths, ctx.skip, with_x)
+    return grad_x if with_x else None, grad_params, None, None, None
+
+
+perceptron_op = register(
+    "perceptron",
+    _perceptron,
+    fake=_fake_perceptron,
+    gradient=Gradient(_save, _backward),
+)
+"""Outputs (M, out), and the activations between the layers in the kernel's layout or an empty tensor. ``params`` holds
+weight and bias of each layer, flat; ``skip`` 0 means none."""
+
+
 def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
-    """(M, out) outputs of linear layers with a ReLU after each but the last, differentiable in ``x`` and the layers.
+    """Return (M, out) outputs of linear layers with a ReLU after each but the last, differentiable in all of them.
 
     Only first derivatives exist on the CPU. A row with NaN gives an output row of NaN and leaves the other rows alone;
     gradients by the layers are sums over all rows, so a NaN in one reaches them.
@@ -48,17 +124,17 @@ def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -
     widths = _checked_widths(x, layers, skip)
     dtype = reduce(torch.promote_types, (t.dtype for layer in layers for t in (layer.weight, layer.bias)), x.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
-    if x.device.type != "cpu":
+    if not has_kernel("perceptron", x.device):
         return reference_perceptron(x, layers, skip=skip)
     params = torch.cat([t.to(dtype).reshape(-1) for layer in layers for t in (layer.weight, layer.bias)])
     x = x.to(dtype)
     at = 0 if skip is None else skip
     with_gradient = torch.is_grad_enabled() and (x.requires_grad or params.requires_grad)
-    return _perceptron(x, params, widths, at, with_gradient)[0]
+    return perceptron_op(x, params, widths, at, with_gradient)[0]
 
 
 def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
-    """The value of `perceptron` in plain torch: any floating dtype and device, any order of derivatives."""
+    """Return the value of `perceptron` in plain torch: any floating dtype and device, any order of derivatives."""
     h = x
     for i, layer in enumerate(layers):
         h = linear(torch.cat([h, x], dim=1) if i == skip else h, layer.weight, layer.bias)
@@ -68,7 +144,7 @@ def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None
 
 
 def _checked_widths(x: Tensor, layers: Sequence[Layer], skip: int | None) -> list[int]:
-    """Widths of the input and of every layer's output."""
+    """Return the widths of the input and of every layer's output, once all shapes, types and devices are checked."""
     if x.ndim != 2 or x.shape[1] == 0:
         raise DyngsError(f"perceptron: the inputs must be (M, K) with K at least 1, got {tuple(x.shape)}")
     if not layers:
@@ -92,66 +168,3 @@ def _checked_widths(x: Tensor, layers: Sequence[Layer], skip: int | None) -> lis
                 raise DyngsError(f"perceptron: the inputs are on {x.device}, but layer {i} on {tensor.device}")
         widths.append(weight.shape[0])
     return widths
-
-
-def _empty_kept(x: Tensor, widths: list[int], skip: int, keep: bool) -> Tensor:
-    """Room for the activations between the layers; empty unless asked for, and if they would take too much."""
-    size = x.shape[0] * core.perceptron_kept_per_row(widths, skip)
-    return x.new_empty(size if keep and size * x.element_size() <= KEPT_BYTES else 0)
-
-
-@torch.library.custom_op("dyngs::perceptron", mutates_args=(), device_types="cpu")
-def _perceptron(x: Tensor, params: Tensor, widths: list[int], skip: int, keep: bool) -> tuple[Tensor, Tensor]:
-    """Outputs (M, out), and the activations between the layers in the kernel's layout or an empty tensor."""
-    y = x.new_empty(x.shape[0], widths[-1])
-    kept = _empty_kept(x, widths, skip, keep)
-    arrays = (array(t) for t in (x, params, y))
-    core.perceptron_forward(*arrays, array(kept) if kept.numel() else None, widths, skip, num_threads())
-    return y, kept
-
-
-@_perceptron.register_fake
-def _(x: Tensor, params: Tensor, widths: list[int], skip: int, keep: bool) -> tuple[Tensor, Tensor]:
-    return x.new_empty(x.shape[0], widths[-1]), _empty_kept(x, widths, skip, keep)
-
-
-@torch.library.custom_op("dyngs::perceptron_backward", mutates_args=(), device_types="cpu")
-def _perceptron_backward(
-    inputs: list[Tensor], grad: Tensor, widths: list[int], skip: int, with_x: bool
-) -> tuple[Tensor, Tensor]:
-    """Gradients by ``x``, empty unless asked for, and by the parameters. ``inputs`` are x, params and kept."""
-    x, params, kept = inputs
-    grad_x = x.new_empty(x.shape if with_x else (0,))
-    grad_params = params.new_empty(params.shape)
-    core.perceptron_backward(
-        *(array(t) for t in (x, params, grad)),
-        array(kept) if kept.numel() else None,
-        array(grad_x) if with_x else None,
-        array(grad_params),
-        widths,
-        skip,
-        num_threads(),
-    )
-    return grad_x, grad_params
-
-
-@_perceptron_backward.register_fake
-def _(inputs: list[Tensor], grad: Tensor, widths: list[int], skip: int, with_x: bool) -> tuple[Tensor, Tensor]:
-    x, params, _ = inputs
-    return x.new_empty(x.shape if with_x else (0,)), params.new_empty(params.shape)
-
-
-def _setup_context(ctx, inputs, output) -> None:
-    x, params, ctx.widths, ctx.skip, _ = inputs
-    _, kept = output
-    ctx.mark_non_differentiable(kept)
-    ctx.save_for_backward(x, params, kept)
-
-
-def _backward(ctx, grad: Tensor, _: Tensor | None):
-    with_x = ctx.needs_input_grad[0]
-    grad_x, grad_params = _perceptron_backward(list(ctx.saved_tensors), grad, ctx.widths, ctx.skip, with_x)
-    return grad_x if with_x else None, grad_params, None, None, None
-
-
-_perceptron.register_autograd(_backward, setup_context=_setup_context)

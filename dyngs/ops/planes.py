@@ -13,10 +13,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from dyngs.errors import DyngsError
 from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.registration import Gradient, register
 
 MAX_POINTS = 2**31 - 1
 
@@ -34,17 +34,122 @@ class PlaneLevel:
     time: Tensor
 
 
+def _pairs(planes: Sequence[Tensor]) -> list[tuple[object, object]]:
+    """Return the space and time planes of each level, as the kernels take them."""
+    return [(array(space), array(time)) for space, time in zip(planes[::2], planes[1::2], strict=True)]
+
+
+def _empty_like(planes: Sequence[Tensor]) -> list[Tensor]:
+    return [torch.empty_like(x, memory_format=torch.contiguous_format) for x in planes]
+
+
+def _hexplane(coords: Tensor, planes: list[Tensor], time: float) -> tuple[Tensor, Tensor]:
+    features, order = _fake_hexplane(coords, planes, time)
+    core.hexplane_forward(array(coords), _pairs(planes), time, array(features), array(order), num_threads())
+    return features, order
+
+
+def _fake_hexplane(coords: Tensor, planes: list[Tensor], time: float) -> tuple[Tensor, Tensor]:
+    features = coords.new_empty(len(coords), len(planes) // 2 * planes[0].shape[3])
+    return features, coords.new_empty(len(coords), dtype=torch.int32)
+
+
+def _hexplane_backward(
+    coords: Tensor, planes: list[Tensor], order: Tensor, grad: Tensor, time: float, with_coords: bool
+) -> tuple[Tensor, list[Tensor]]:
+    g_coords, g_planes = _fake_hexplane_backward(coords, planes, order, grad, time, with_coords)
+    core.hexplane_backward(
+        array(coords),
+        _pairs(planes),
+        time,
+        array(order),
+        array(grad),
+        _pairs(g_planes),
+        array(g_coords) if with_coords else None,
+        num_threads(),
+    )
+    return g_coords, g_planes
+
+
+def _fake_hexplane_backward(
+    coords: Tensor, planes: list[Tensor], order: Tensor, grad: Tensor, time: float, with_coords: bool
+) -> tuple[Tensor, list[Tensor]]:
+    return coords.new_empty(coords.shape if with_coords else (0,)), _empty_like(planes)
+
+
+hexplane_backward_op = register("hexplane_backward", _hexplane_backward, fake=_fake_hexplane_backward)
+"""Gradients by the coordinates, empty unless asked for, and by the planes."""
+
+
+def _save_hexplane(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+    coords, planes, ctx.time = inputs
+    _, order = output
+    ctx.mark_non_differentiable(order)
+    ctx.save_for_backward(order, coords, *planes)
+
+
+def _hexplane_gradient(ctx: Any, grad: Tensor, _: Tensor | None) -> tuple[Tensor | None, list[Tensor], None]:
+    order, coords, *planes = ctx.saved_tensors
+    with_coords = ctx.needs_input_grad[0]
+    g_coords, g_planes = hexplane_backward_op(coords, planes, order, grad, ctx.time, with_coords)
+    return g_coords if with_coords else None, g_planes, None
+
+
+hexplane_op = register(
+    "hexplane", _hexplane, fake=_fake_hexplane, gradient=Gradient(_save_hexplane, _hexplane_gradient)
+)
+"""Features (M, L * C), and the order (M,) int32 in which the backward pass visits the points. ``planes`` holds those of
+space and those of time of each level in turn."""
+
+
+def _plane_penalty(planes: list[Tensor], weights: list[float], with_gradient: bool) -> tuple[Tensor, list[Tensor]]:
+    grads = _empty_like(planes) if with_gradient else []
+    pairs = _pairs(grads) if with_gradient else None
+    penalty = core.plane_penalty(_pairs(planes), pairs, tuple(weights), num_threads())
+    return planes[0].new_tensor(penalty), grads
+
+
+def _fake_plane_penalty(planes: list[Tensor], weights: list[float], with_gradient: bool) -> tuple[Tensor, list[Tensor]]:
+    return planes[0].new_empty(()), _empty_like(planes) if with_gradient else []
+
+
+def _save_penalty(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, list[Tensor]]) -> None:
+    planes, ctx.weights, with_gradient = inputs
+    _, grads = output
+    ctx.mark_non_differentiable(*grads)
+    # The gradient is kept outside save_for_backward: autograd takes over a gradient that nobody else holds, and
+    # otherwise copies it.
+    ctx.grads = grads if with_gradient else None
+    ctx.save_for_backward(*planes)
+
+
+def _penalty_gradient(ctx: Any, grad: Tensor, _: object) -> tuple[list[Tensor], None, None]:
+    grads, ctx.grads = ctx.grads, None
+    if grads is None:  # a second backward pass through a retained graph
+        _, grads = plane_penalty_op(list(ctx.saved_tensors), ctx.weights, True)
+    if grad != 1:
+        for g in grads:
+            g.mul_(grad)
+    return grads, None, None
+
+
+plane_penalty_op = register(
+    "plane_penalty", _plane_penalty, fake=_fake_plane_penalty, gradient=Gradient(_save_penalty, _penalty_gradient)
+)
+"""The penalty () and its gradients by the planes, an empty list unless asked for."""
+
+
 def hexplane_features(coords: Tensor, time: float, levels: Sequence[PlaneLevel]) -> Tensor:
-    """(M, L * C) features of points at one time: the product of the six planes, level after level.
+    """Return (M, L * C) features of points at one time: the product of the six planes, level after level.
 
     Each plane is interpolated bilinearly. Sample 0 lies at coordinate -1 or time 0, the last one at coordinate 1 or
     time 1. What lies outside is clamped, infinity too, and has no gradient there; NaN coordinates give NaN features.
     Differentiable once, in coordinates and planes. Results are the same bits on any number of threads.
 
     Args:
-        coords: (M, 3) float32 or float64 on the CPU, within [-1, 1] where the planes reach.
+        coords: (M, 3) float32 or float64, within [-1, 1] where the planes reach.
         time: in [0, 1], the same for all points.
-        levels: at least one; dtype of the coordinates, and all of the same C.
+        levels: at least one; dtype and device of the coordinates, and all of the same C.
 
     Raises:
         DyngsError: shapes or dtypes that do not fit each other, no levels, or a time that is no number.
@@ -52,25 +157,26 @@ def hexplane_features(coords: Tensor, time: float, levels: Sequence[PlaneLevel])
     _check_levels(levels)
     if coords.ndim != 2 or coords.shape[1] != 3 or len(coords) > MAX_POINTS:
         raise DyngsError(f"hexplane: coordinates must be (M, 3) with M < 2^31, got {tuple(coords.shape)}")
-    if coords.dtype != levels[0].space.dtype or coords.device.type != "cpu":
+    first = levels[0].space
+    if coords.dtype != first.dtype or coords.device != first.device:
         raise DyngsError(
-            f"hexplane: coordinates must be {levels[0].space.dtype} on the CPU like the planes, "
+            f"hexplane: coordinates must be {first.dtype} on {first.device} like the planes, "
             f"got {coords.dtype} on {coords.device}"
         )
     if math.isnan(time):
         raise DyngsError("hexplane: the time must be a number in [0, 1], got NaN")
-    return _Features.apply(time, coords, *_tensors(levels))  # pyright: ignore[reportReturnType]
+    return hexplane_op(coords, _tensors(levels), time)[0]
 
 
 def plane_penalty(levels: Sequence[PlaneLevel], weights: tuple[float, float, float]) -> Tensor:
-    """``w_space R_space + w_time R_time + w_one R_one``, the regularizers of 4DGS: a scalar, differentiable once.
+    """Return ``w_space R_space + w_time R_time + w_one R_one``, the regularizers of 4DGS: (), differentiable once.
 
     R_space is the mean squared second difference along both axes of a space plane, averaged over the two axes; R_time
     that along the time axis of a time plane; R_one the mean of ``|1 - plane|`` of a time plane; each summed over planes
     and levels. An axis of fewer than 3 samples counts 0. The gradient is computed along with the value.
 
     Args:
-        levels: at least one, float32 or float64 on the CPU, all of the same C.
+        levels: at least one, float32 or float64, all of the same C and on one device.
         weights: ``(w_space, w_time, w_one)``, finite.
 
     Raises:
@@ -81,7 +187,7 @@ def plane_penalty(levels: Sequence[PlaneLevel], weights: tuple[float, float, flo
         raise DyngsError(f"plane_penalty: the three weights must be finite, got {weights}")
     planes = _tensors(levels)
     with_gradient = torch.is_grad_enabled() and any(x.requires_grad for x in planes)
-    return _Penalty.apply(weights, with_gradient, *planes)  # pyright: ignore[reportReturnType]
+    return plane_penalty_op(planes, list(weights), with_gradient)[0]
 
 
 def _check_levels(levels: Sequence[PlaneLevel]) -> None:
@@ -100,75 +206,9 @@ def _check_levels(levels: Sequence[PlaneLevel]) -> None:
                 f"planes: level {number} must have space (3, R, R, {channels}) and time (3, T, R, {channels}), "
                 f"none empty, got {space} and {time}"
             )
-        if {(x.dtype, x.device.type) for x in (level.space, level.time)} != {(first.dtype, "cpu")}:
-            raise DyngsError(f"planes: level {number} must be {first.dtype} on the CPU like the first")
+        if {(x.dtype, x.device) for x in (level.space, level.time)} != {(first.dtype, first.device)}:
+            raise DyngsError(f"planes: level {number} must be {first.dtype} on {first.device} like the first")
 
 
 def _tensors(levels: Sequence[PlaneLevel]) -> list[Tensor]:
     return [x for level in levels for x in (level.space, level.time)]
-
-
-def _pairs(planes: Sequence[Tensor]) -> list[tuple[object, object]]:
-    """Space and time planes of each level, as the kernels take them."""
-    return [(array(space), array(time)) for space, time in zip(planes[::2], planes[1::2], strict=True)]
-
-
-def _empty_like(planes: Sequence[Tensor]) -> list[Tensor]:
-    return [torch.empty_like(x, memory_format=torch.contiguous_format) for x in planes]
-
-
-class _Features(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, time: float, coords: Tensor, *planes: Tensor) -> Tensor:
-        features = coords.new_empty(len(coords), len(planes) // 2 * planes[0].shape[3])
-        order = torch.empty(len(coords), dtype=torch.int32)
-        core.hexplane_forward(array(coords), _pairs(planes), time, array(features), array(order), num_threads())
-        ctx.time = time
-        ctx.save_for_backward(order, coords, *planes)
-        return features
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        order, coords, *planes = ctx.saved_tensors
-        g_coords = torch.empty(coords.shape, dtype=coords.dtype) if ctx.needs_input_grad[1] else None
-        g_planes = _empty_like(planes)
-        core.hexplane_backward(
-            array(coords),
-            _pairs(planes),
-            ctx.time,
-            array(order),
-            array(grad),
-            _pairs(g_planes),
-            None if g_coords is None else array(g_coords),
-            num_threads(),
-        )
-        return None, g_coords, *g_planes
-
-
-class _Penalty(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, weights: tuple[float, float, float], with_gradient: bool, *planes: Tensor) -> Tensor:
-        # The gradient is kept outside save_for_backward: autograd takes over a gradient that nobody else holds, and
-        # otherwise copies it.
-        ctx.grads = _empty_like(planes) if with_gradient else None
-        ctx.weights = weights
-        ctx.save_for_backward(*planes)
-        return planes[0].new_tensor(_penalty(planes, ctx.grads, weights))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        grads, ctx.grads = ctx.grads, None
-        if grads is None:  # a second backward pass through a retained graph
-            planes = ctx.saved_tensors
-            grads = _empty_like(planes)
-            _penalty(planes, grads, ctx.weights)
-        if grad != 1:
-            for g in grads:
-                g.mul_(grad)
-        return None, None, *grads
-
-
-def _penalty(planes: Sequence[Tensor], grads: Sequence[Tensor] | None, weights: tuple[float, float, float]) -> float:
-    return core.plane_penalty(_pairs(planes), None if grads is None else _pairs(grads), weights, num_threads())

@@ -1,8 +1,9 @@
-"""Projection of 3D Gaussians to image planes as a differentiable torch op."""
+"""Projection of 3D Gaussians to image planes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from dyngs.camera import Cameras
 from dyngs.ops.limits import check_memory, check_size
 from dyngs.ops.native import array, core, num_threads
 from dyngs.ops.options import check_near_and_far, check_number
+from dyngs.ops.registration import Gradient, register
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,6 @@ def _arrays(*tensors: Tensor):
     return kind(*(array(x) for x in tensors))
 
 
-@torch.library.custom_op("dyngs::project", mutates_args=(), device_types="cpu")
 def _project(
     means: Tensor,
     quats: Tensor,
@@ -96,25 +97,29 @@ def _project(
     check_memory(rows[0] * rows[1] * per_splat, f"the splats of {rows[1]} Gaussians in {rows[0]} view(s)")
     means2d, depths = means.new_empty(*rows, 2), means.new_empty(rows)
     factors, compensations = means.new_empty(*rows, 3), means.new_empty(rows)
-    radii = torch.empty(*rows, 2, dtype=torch.int32)
+    radii = means.new_empty(*rows, 2, dtype=torch.int32)
     arrays = _arrays(means, quats, scales, opacities, viewmats, intrinsics)
     core.project_forward(arrays, settings, *(array(x) for x in (means2d, depths, factors, compensations, radii)))
     return means2d, depths, factors, compensations, radii
 
 
-@_project.register_fake
-def _(means, quats, scales, opacities, viewmats, intrinsics, size, limits, antialiased):
+def _fake_project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmats: Tensor,
+    intrinsics: Tensor,
+    size: list[int],
+    limits: list[float],
+    antialiased: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     rows = (viewmats.shape[0], means.shape[0])
-    return (
-        means.new_empty(*rows, 2),
-        means.new_empty(rows),
-        means.new_empty(*rows, 3),
-        means.new_empty(rows),
-        means.new_empty(*rows, 2, dtype=torch.int32),
-    )
+    means2d, depths = means.new_empty(*rows, 2), means.new_empty(rows)
+    factors, compensations = means.new_empty(*rows, 3), means.new_empty(rows)
+    return means2d, depths, factors, compensations, means.new_empty(*rows, 2, dtype=torch.int32)
 
 
-@torch.library.custom_op("dyngs::project_backward", mutates_args=(), device_types="cpu")
 def _project_backward(
     gaussians: list[Tensor],
     radii: Tensor,
@@ -138,32 +143,43 @@ def _project_backward(
     return out[0], out[1], out[2], g_viewmats
 
 
-@_project_backward.register_fake
-def _(gaussians, radii, grads, size, limits, antialiased, with_viewmats):
-    return tuple(torch.empty_like(gaussians[i], memory_format=torch.contiguous_format) for i in (0, 1, 2, 4))
+def _fake_project_backward(
+    gaussians: list[Tensor],
+    radii: Tensor,
+    grads: list[Tensor],
+    size: list[int],
+    limits: list[float],
+    antialiased: bool,
+    with_viewmats: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    g_means, g_quats, g_scales, g_viewmats = (
+        torch.empty_like(gaussians[i], memory_format=torch.contiguous_format) for i in (0, 1, 2, 4)
+    )
+    return g_means, g_quats, g_scales, g_viewmats
 
 
-def _setup_context(ctx, inputs, output) -> None:
+project_backward_op = register("project_backward", _project_backward, fake=_fake_project_backward)
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
     *tensors, ctx.size, ctx.limits, ctx.antialiased = inputs
     ctx.save_for_backward(*tensors, output[4])
     ctx.mark_non_differentiable(output[4])
 
 
-def _backward(ctx, g_means2d, g_depths, g_factors, g_compensations, _g_radii):
+def _backward(
+    ctx: Any, g_means2d: Tensor, g_depths: Tensor, g_factors: Tensor, g_compensations: Tensor, _: Tensor | None
+) -> tuple[Tensor | None, ...]:
     *gaussians, radii = ctx.saved_tensors
-    g_means, g_quats, g_scales, g_viewmats = _project_backward(
-        gaussians,
-        radii,
-        [g_means2d, g_depths, g_factors, g_compensations],
-        ctx.size,
-        ctx.limits,
-        ctx.antialiased,
-        ctx.needs_input_grad[4],
+    with_viewmats = ctx.needs_input_grad[4]
+    grads = [g_means2d, g_depths, g_factors, g_compensations]
+    *out, g_viewmats = project_backward_op(
+        gaussians, radii, grads, ctx.size, ctx.limits, ctx.antialiased, with_viewmats
     )
-    return g_means, g_quats, g_scales, None, g_viewmats if ctx.needs_input_grad[4] else None, None, None, None, None
+    return *out, None, g_viewmats if with_viewmats else None, None, None, None, None
 
 
-torch.library.register_autograd("dyngs::project", _backward, setup_context=_setup_context)
+project_op = register("project", _project, fake=_fake_project, gradient=Gradient(_save, _backward))
 
 
 def project(
@@ -174,7 +190,7 @@ def project(
     cameras: Cameras,
     options: ProjectionOptions = ProjectionOptions(),
 ) -> Projection:
-    """Splats of the Gaussians in every camera (EWA splatting; Zwicker et al. 2001, Kerbl et al. 2023).
+    """Return the splats of the Gaussians in every camera (EWA splatting; Zwicker et al. 2001, Kerbl et al. 2023).
 
     Differentiable in means, quats, scales and ``cameras.cam_from_world``.
 
@@ -191,7 +207,7 @@ def project(
     """
     check_size(cameras.width, cameras.height)  # before torch, which takes no integers from 2^63 on
     limits = [options.eps2d, options.near, options.far, options.alpha_min, options.radius_clip]
-    outputs = _project(
+    outputs = project_op(
         means,
         quats,
         scales,

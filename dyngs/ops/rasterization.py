@@ -1,4 +1,4 @@
-"""Tile binning and alpha blending of splats as a differentiable torch op."""
+"""Tile binning and alpha blending of splats."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from dyngs.ops.limits import REMEDY, check_memory, check_size
 from dyngs.ops.native import array, core, num_threads
 from dyngs.ops.options import check_number
 from dyngs.ops.projection import Projection
+from dyngs.ops.registration import Gradient, register
 
 TILE = 16
 MAX_CHANNELS = 40
@@ -76,17 +78,17 @@ class TileEntries:
     def tensors(self) -> list[Tensor]:
         return [self.tile_offsets, self.slot_ranges, self.gaussians, self.slots]
 
-    def check(self) -> None:
-        """Nothing, if the tensors are what the kernels take; those look at lengths and indices themselves.
+    def check(self, device: torch.device) -> None:
+        """Raise an error unless the tensors are what the kernels take; those check lengths and indices themselves.
 
         Raises:
             DyngsError: another dtype, device or number of axes.
         """
         for name, x in vars(self).items():
             dtype = torch.int64 if name == "tile_offsets" else torch.int32
-            if x.dtype != dtype or x.ndim != 1 or x.device.type != "cpu":
+            if x.dtype != dtype or x.ndim != 1 or x.device != device:
                 got = f"{x.dtype} {tuple(x.shape)} on {x.device}"
-                raise DyngsError(f"rasterize: entries.{name} must be {dtype} with one axis on the CPU, got {got}")
+                raise DyngsError(f"rasterize: entries.{name} must be {dtype} with one axis on {device}, got {got}")
 
     @property
     def tiles_per_gaussian(self) -> Tensor:
@@ -97,11 +99,11 @@ class TileEntries:
 
 @dataclass(frozen=True)
 class Blended:
-    """What the splats leave on the image plane.
+    """V blended images of D channels.
 
     Attributes:
         color: (V, H, W, D), background composited.
-        transmittance: (V, H, W) what remains of the background; alpha is 1 minus it.
+        transmittance: (V, H, W) in [0, 1], the share of the background that is seen; alpha is 1 minus it.
     """
 
     color: Tensor
@@ -120,14 +122,13 @@ def _arrays(means2d: Tensor, factors: Tensor, opacities: Tensor, radii: Tensor):
 
 @contextmanager
 def _refusals(kernel: str) -> Iterator[None]:
-    """What the kernels say of lengths and indices, as the one line that users see."""
+    """Turn what the kernels say of lengths and indices into a ``DyngsError``."""
     try:
         yield
     except ValueError as error:
         raise DyngsError(f"{kernel}: {error}") from None
 
 
-@torch.library.custom_op("dyngs::bin_tiles", mutates_args=(), device_types="cpu")
 def _bin_tiles(
     splats: list[Tensor], depths: Tensor, size: list[int], thresholds: list[float], max_entries: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -141,8 +142,9 @@ def _bin_tiles(
     return tile_offsets, slot_ranges, gaussians, slots
 
 
-@_bin_tiles.register_fake
-def _(splats, depths, size, thresholds, max_entries):
+def _fake_bin_tiles(
+    splats: list[Tensor], depths: Tensor, size: list[int], thresholds: list[float], max_entries: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     entries = torch.library.get_ctx().new_dynamic_size()
     tiles = ((size[0] + TILE - 1) // TILE) * ((size[1] + TILE - 1) // TILE)
     views, n = depths.shape
@@ -154,17 +156,24 @@ def _(splats, depths, size, thresholds, max_entries):
     )
 
 
+bin_tiles_op = register("bin_tiles", _bin_tiles, fake=_fake_bin_tiles)
+
+
 def _picture(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Room for colours, transmittances and stops of V pictures."""
+    """Return uninitialised colours, transmittances and stops of V pictures."""
     check_size(*size)
     views, channels = colors.shape[0], colors.shape[2]
     needed = views * size[0] * size[1] * ((channels + 1) * colors.element_size() + 4)
     check_memory(needed, f"{views} picture(s) of {size[0]}x{size[1]} px with {channels} channels")
-    shape = (views, size[1], size[0])
-    return colors.new_empty(*shape, channels), colors.new_empty(shape), torch.empty(shape, dtype=torch.int32)
+    return _empty_picture(colors, size)
 
 
-@torch.library.custom_op("dyngs::blend", mutates_args=(), device_types="cpu")
+def _empty_picture(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    shape = (colors.shape[0], size[1], size[0])
+    picture = colors.new_empty(*shape, colors.shape[2])
+    return picture, colors.new_empty(shape), colors.new_empty(shape, dtype=torch.int32)
+
+
 def _blend(
     means2d: Tensor,
     factors: Tensor,
@@ -173,7 +182,10 @@ def _blend(
     background: Tensor | None,
     probe: Tensor | None,
     radii: Tensor,
-    entries: list[Tensor],
+    tile_offsets: Tensor,
+    slot_ranges: Tensor,
+    gaussians: Tensor,
+    slots: Tensor,
     size: list[int],
     thresholds: list[float],
     absgrad: bool,
@@ -184,7 +196,7 @@ def _blend(
             _arrays(means2d, factors, opacities, radii),
             array(colors),
             None if background is None else array(background),
-            tuple(array(x) for x in entries),
+            tuple(array(x) for x in (tile_offsets, slot_ranges, gaussians, slots)),
             _settings(size, thresholds),
             (array(color), array(transmittance), array(stop), None),
             0,
@@ -192,17 +204,25 @@ def _blend(
     return color, transmittance, stop
 
 
-@_blend.register_fake
-def _(means2d, factors, opacities, colors, background, probe, radii, entries, size, thresholds, absgrad):
-    shape = (colors.shape[0], size[1], size[0])
-    return (
-        colors.new_empty(*shape, colors.shape[2]),
-        colors.new_empty(shape),
-        colors.new_empty(shape, dtype=torch.int32),
-    )
+def _fake_blend(
+    means2d: Tensor,
+    factors: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    background: Tensor | None,
+    probe: Tensor | None,
+    radii: Tensor,
+    tile_offsets: Tensor,
+    slot_ranges: Tensor,
+    gaussians: Tensor,
+    slots: Tensor,
+    size: list[int],
+    thresholds: list[float],
+    absgrad: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    return _empty_picture(colors, size)
 
 
-@torch.library.custom_op("dyngs::blend_backward", mutates_args=(), device_types="cpu")
 def _blend_backward(
     splats: list[Tensor],
     background: Tensor | None,
@@ -233,15 +253,29 @@ def _blend_backward(
     return out[0], out[1], out[2], out[3], probe
 
 
-@_blend_backward.register_fake
-def _(splats, background, entries, image, grads, size, thresholds, absgrad, with_probe):
-    means2d, factors, opacities, colors, _ = splats
-    out = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means2d, factors, opacities, colors)]
-    return (*out, means2d.new_empty(*opacities.shape, 4) if with_probe else means2d.new_empty(0))
+def _fake_blend_backward(
+    splats: list[Tensor],
+    background: Tensor | None,
+    entries: list[Tensor],
+    image: list[Tensor],
+    grads: list[Tensor],
+    size: list[int],
+    thresholds: list[float],
+    absgrad: bool,
+    with_probe: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    g_means2d, g_factors, g_opacities, g_colors = (
+        torch.empty_like(x, memory_format=torch.contiguous_format) for x in splats[:4]
+    )
+    probe = splats[0].new_empty(*splats[2].shape, 4) if with_probe else splats[0].new_empty(0)
+    return g_means2d, g_factors, g_opacities, g_colors, probe
 
 
-def _setup_context(ctx, inputs, output) -> None:
-    means2d, factors, opacities, colors, background, _, radii, entries, ctx.size, ctx.thresholds, ctx.absgrad = inputs
+blend_backward_op = register("blend_backward", _blend_backward, fake=_fake_blend_backward)
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    means2d, factors, opacities, colors, background, _, radii, *entries, ctx.size, ctx.thresholds, ctx.absgrad = inputs
     _, transmittance, stop = output
     ctx.mark_non_differentiable(stop)
     ctx.has_background = background is not None
@@ -249,12 +283,12 @@ def _setup_context(ctx, inputs, output) -> None:
     ctx.save_for_backward(means2d, factors, opacities, colors, radii, transmittance, stop, *entries, *kept)
 
 
-def _backward(ctx, g_color, g_transmittance, _g_stop):
+def _backward(ctx: Any, g_color: Tensor, g_transmittance: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
     saved = ctx.saved_tensors
     splats, image, entries = list(saved[:5]), list(saved[5:7]), list(saved[7:11])
     background = saved[11] if ctx.has_background else None
     with_probe = ctx.needs_input_grad[5]
-    *out, probe = _blend_backward(
+    *out, probe = blend_backward_op(
         splats,
         background,
         entries,
@@ -268,21 +302,60 @@ def _backward(ctx, g_color, g_transmittance, _g_stop):
     g_background = None
     if ctx.needs_input_grad[4]:
         g_background = torch.einsum("vhw,vhwd->vd", image[0], g_color)
-    return *out, g_background, probe if with_probe else None, None, [None] * 4, None, None, None
+    return *out, g_background, probe if with_probe else None, *[None] * 8
 
 
-torch.library.register_autograd("dyngs::blend", _backward, setup_context=_setup_context)
+blend_op = register("blend", _blend, fake=_fake_blend, gradient=Gradient(_save, _backward))
+
+
+def _tally(
+    splats: list[Tensor],
+    colors: Tensor,
+    background: Tensor | None,
+    entries: list[Tensor],
+    size: list[int],
+    thresholds: list[float],
+    kind: int,
+) -> Tensor:
+    sums = torch.empty_like(splats[2], memory_format=torch.contiguous_format)
+    image = (*_picture(colors, size), sums)
+    with _refusals("tally"):
+        core.rasterize_forward(
+            _arrays(*splats),
+            array(colors),
+            None if background is None else array(background),
+            tuple(array(x) for x in entries),
+            _settings(size, thresholds),
+            tuple(array(x) for x in image),
+            kind,
+        )
+    return sums
+
+
+def _fake_tally(
+    splats: list[Tensor],
+    colors: Tensor,
+    background: Tensor | None,
+    entries: list[Tensor],
+    size: list[int],
+    thresholds: list[float],
+    kind: int,
+) -> Tensor:
+    return torch.empty_like(splats[2], memory_format=torch.contiguous_format)
+
+
+tally_op = register("tally", _tally, fake=_fake_tally)
 
 
 def bin_tiles(
     projection: Projection, opacities: Tensor, size: tuple[int, int], options: BlendOptions = BlendOptions()
 ) -> TileEntries:
-    """Which splats each 16x16 tile shows, nearest first; arguments as for ``rasterize``."""
+    """Return the splats of each 16x16 tile, nearest first; arguments as for ``rasterize``."""
     check_size(*size)  # before torch, which takes no integers from 2^63 on
     with torch.no_grad():
         splats = [projection.means2d, projection.factors, opacities, projection.radii]
         thresholds = options.thresholds
-        return TileEntries(*_bin_tiles(splats, projection.depths, list(size), thresholds, options.max_entries))
+        return TileEntries(*bin_tiles_op(splats, projection.depths, list(size), thresholds, options.max_entries))
 
 
 def rasterize(
@@ -296,7 +369,7 @@ def rasterize(
     options: BlendOptions = BlendOptions(),
     entries: TileEntries | None = None,
 ) -> Blended:
-    """Splats blended front to back into V images of D channels.
+    """Return the splats blended front to back into V images of D channels.
 
     Differentiable in means2d, factors, opacities, colors and background.
 
@@ -321,8 +394,8 @@ def rasterize(
     check_size(*size)
     if entries is None:
         entries = bin_tiles(projection, opacities, size, options)
-    entries.check()
-    color, transmittance, _ = _blend(
+    entries.check(opacities.device)
+    color, transmittance, _ = blend_op(
         projection.means2d,
         projection.factors,
         opacities,
@@ -330,7 +403,10 @@ def rasterize(
         background,
         probe,
         projection.radii,
-        entries.tensors(),
+        entries.tile_offsets,
+        entries.slot_ranges,
+        entries.gaussians,
+        entries.slots,
         list(size),
         options.thresholds,
         options.absgrad,
@@ -339,7 +415,7 @@ def rasterize(
 
 
 class Tally(IntEnum):
-    """What ``tally`` sums per Gaussian; numbers as in csrc/core/api.hpp."""
+    """Quantities that ``tally`` sums per Gaussian; numbers as in csrc/core/api.hpp."""
 
     WEIGHTS = 1
     """alpha times transmittance: its share of the picture"""
@@ -362,17 +438,12 @@ def tally(
     colors: Tensor | None = None,
     background: Tensor | None = None,
 ) -> Tensor:
-    """(V, N) sums over pixels of what ``kind`` says, for every Gaussian; not differentiable.
+    """Return (V, N) sums over pixels of the quantity ``kind``, for every Gaussian; not differentiable.
 
     Other arguments as for ``rasterize``; colours and background matter to ``SQUARED_SLOPES`` only.
     """
     entries = bin_tiles(projection, opacities, size, options)
     colors = torch.zeros_like(opacities)[..., None] if colors is None else colors
-    sums = torch.empty_like(opacities, memory_format=torch.contiguous_format)
-    image = (*_picture(colors, list(size)), sums)
-    splats = _arrays(projection.means2d, projection.factors, opacities, projection.radii)
-    lists = tuple(array(x) for x in entries.tensors())
-    settings = _settings(list(size), options.thresholds)
-    behind = None if background is None else array(background)
-    core.rasterize_forward(splats, array(colors), behind, lists, settings, tuple(array(x) for x in image), int(kind))
-    return sums
+    splats = [projection.means2d, projection.factors, opacities, projection.radii]
+    with torch.no_grad():
+        return tally_op(splats, colors, background, entries.tensors(), list(size), options.thresholds, int(kind))

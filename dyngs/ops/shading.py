@@ -1,4 +1,4 @@
-"""What a colour network is told about each Gaussian that an eye sees, put together in one pass on the CPU.
+"""Inputs of a colour network about each Gaussian that a camera sees, computed in one pass.
 
 In plain torch this takes three times as long as the network itself: some thirty operations on narrow arrays.
 """
@@ -10,26 +10,26 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from dyngs.ops.native import array, core, num_threads
 from dyngs.ops.quaternions import unit_quats
+from dyngs.ops.registration import Gradient, register
 
 
 @dataclass(frozen=True)
 class Sight:
-    """N Gaussians and an eye; no gradient reaches any of it.
+    """N Gaussians and a camera centre; no gradient reaches any of them.
 
     Attributes:
-        means: (N, 3) where they are, world units.
+        means: (N, 3) world units.
         quats: (N, 4) rotations wxyz, of any length.
         log_scales: (N, 3).
-        rows: (M,) int64, those of them that are seen.
-        eye: (3,) world units.
+        rows: (M,) int64, the Gaussians that are seen.
+        eye: (3,) camera centre, world units.
         box: (2, 3) centre and half sides of the scene.
-        rest: (N, 3) places at rest and the (3, 3) rotation from rest to the world; None: where they are, as they are.
-        time: in [0, 1]; None: not told.
-        normals: whether it is told how the shortest axis lies.
+        rest: (N, 3) means at rest and the (3, 3) rotation from rest to the world; None: ``means``, no rotation.
+        time: in [0, 1]; None: not an input.
+        normals: whether the shortest axis of each Gaussian is an input.
     """
 
     means: Tensor
@@ -44,25 +44,87 @@ class Sight:
 
 
 def num_inputs(*, sees_time: bool, sees_normals: bool) -> int:
-    """K, width of a network's input: place, direction and base colour, and what it sees beside them."""
+    """Return K, the width of the network's input: place, direction, base colour, and what else it sees."""
     return 9 + 4 * sees_normals + sees_time
 
 
+def _shading(
+    base: Tensor,
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    rows: Tensor,
+    eye: Tensor,
+    box: Tensor,
+    rest: Tensor | None,
+    turn: Tensor | None,
+    time: float | None,
+    normals: bool,
+) -> Tensor:
+    out = base.new_empty(len(base), num_inputs(sees_time=time is not None, sees_normals=normals))
+    core.shading_inputs(
+        (array(means), array(quats), array(log_scales)),
+        array(rows),
+        array(base),
+        array(eye[None]),
+        array(box),
+        None if rest is None or turn is None else (array(rest), array(turn)),
+        None if time is None else 2 * time - 1,
+        normals,
+        array(out),
+        num_threads(),
+    )
+    return out
+
+
+def _fake_shading(
+    base: Tensor,
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    rows: Tensor,
+    eye: Tensor,
+    box: Tensor,
+    rest: Tensor | None,
+    turn: Tensor | None,
+    time: float | None,
+    normals: bool,
+) -> Tensor:
+    return base.new_empty(len(base), num_inputs(sees_time=time is not None, sees_normals=normals))
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    ctx.begin = 6 + 4 * inputs[-1]
+
+
+def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+    return grad[:, ctx.begin : ctx.begin + 3], *[None] * 10
+
+
+shading_op = register("shading_inputs", _shading, fake=_fake_shading, gradient=Gradient(_save, _backward))
+"""Inputs (M, K) of a colour network; ``rest`` and ``turn`` are both there or both None."""
+
+
 def shading_inputs(sight: Sight, base: Tensor) -> Tensor:
-    """(M, K) inputs of a colour network, differentiable in ``base`` alone: see ``reference_inputs``.
+    """Return (M, K) inputs of a colour network, differentiable in ``base`` alone; see ``reference_inputs``.
 
     Args:
-        sight: on the CPU, all of the dtype of ``base``.
+        sight: all of the dtype and on the device of ``base``.
         base: (M, 3) base colours of the rows that are seen.
 
     Raises:
         IndexError: a row that does not exist.
     """
-    return _Inputs.apply(base, sight)  # pyright: ignore[reportReturnType]
+    rest, turn = (None, None) if sight.rest is None else (x.detach() for x in sight.rest)
+    means, quats, log_scales, eye, box = (
+        x.detach() for x in (sight.means, sight.quats, sight.log_scales, sight.eye, sight.box)
+    )
+    rows, time, normals = sight.rows, sight.time, sight.normals
+    return shading_op(base, means, quats, log_scales, rows, eye, box, rest, turn, time, normals)
 
 
 def reference_inputs(sight: Sight, base: Tensor) -> Tensor:
-    """The value of ``shading_inputs`` in plain torch.
+    """Return the value of ``shading_inputs``, computed in plain torch.
 
     Place in the box (contracted), direction from the eye, |cosine| between the shortest axis and the direction, the
     direction mirrored at that axis, base colour less 1/2, time in [-1, 1]. A body at rest knows places, directions and
@@ -87,7 +149,7 @@ def reference_inputs(sight: Sight, base: Tensor) -> Tensor:
 
 
 def contracted(points: Tensor) -> Tensor:
-    """(M, 3) ``points`` as they are in the unit ball, and what lies outside drawn into one of radius 2.
+    """Return ``points`` (M, 3) with all of space contracted into a ball of radius 2; the unit ball stays as it is.
 
     (2 - 1 / |x|) x / |x|, the contraction of Barron et al. 2022 (mip-NeRF 360): far things stay bounded inputs.
     """
@@ -96,7 +158,7 @@ def contracted(points: Tensor) -> Tensor:
 
 
 def shortest_axes(quats: Tensor, log_scales: Tensor) -> Tensor:
-    """(M, 3) unit vectors along the shortest axis of each Gaussian: the normal of what is flat, up to its sign."""
+    """Return (M, 3) unit vectors along the shortest axis of each Gaussian: the normal of a flat one, up to its sign."""
     w, x, y, z = unit_quats(quats).unbind(-1)
     columns = (
         (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
@@ -105,29 +167,3 @@ def shortest_axes(quats: Tensor, log_scales: Tensor) -> Tensor:
     )
     axes = torch.stack([torch.stack(column, dim=1) for column in columns], dim=1)
     return axes[torch.arange(len(axes)), log_scales.argmin(dim=1)]
-
-
-class _Inputs(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, base: Tensor, sight: Sight) -> Tensor:
-        width = num_inputs(sees_time=sight.time is not None, sees_normals=sight.normals)
-        out = base.new_empty(len(base), width)
-        core.shading_inputs(
-            tuple(array(x.detach()) for x in (sight.means, sight.quats, sight.log_scales)),
-            array(sight.rows),
-            array(base.detach()),
-            array(sight.eye.detach()[None]),
-            array(sight.box),
-            None if sight.rest is None else tuple(array(x.detach()) for x in sight.rest),
-            None if sight.time is None else 2 * sight.time - 1,
-            sight.normals,
-            array(out),
-            num_threads(),
-        )
-        ctx.begin = 6 + 4 * sight.normals
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        return grad[:, ctx.begin : ctx.begin + 3], None

@@ -10,16 +10,87 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from dyngs.errors import DyngsError
 from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.registration import Gradient, register
+
+
+def _skinning(
+    points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    offset, blended, weights = _fake_skinning(points, positions, radii, followed, motion, values)
+    nodes = tuple(array(x) for x in (positions, radii, motion, values))
+    outputs = (array(x) for x in (offset, blended, weights))
+    try:
+        core.skinning_forward(nodes, (array(points), array(followed)), *outputs, num_threads())
+    except IndexError:
+        raise DyngsError(
+            f"blend_skinning: followed must be in [0, {len(positions)}), the nodes there are, "
+            f"got {int(followed.min())} to {int(followed.max())}"
+        ) from None
+    return offset, blended, weights
+
+
+def _fake_skinning(
+    points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    count = len(points)
+    return points.new_empty(count, 3), points.new_empty(count, values.shape[1]), points.new_empty(followed.shape)
+
+
+def _skinning_backward(
+    nodes: list[Tensor], points: Tensor, followed: Tensor, weights: Tensor, grads: list[Tensor], with_points: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    g_points, g_motion, g_values = _fake_skinning_backward(nodes, points, followed, weights, grads, with_points)
+    core.skinning_backward(
+        tuple(array(x) for x in nodes),
+        (array(points), array(followed)),
+        tuple(array(x) for x in (*grads, weights)),
+        array(g_points) if with_points else None,
+        array(g_motion),
+        array(g_values),
+        num_threads(),
+    )
+    return g_points, g_motion, g_values
+
+
+def _fake_skinning_backward(
+    nodes: list[Tensor], points: Tensor, followed: Tensor, weights: Tensor, grads: list[Tensor], with_points: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    _, _, motion, values = nodes
+    g_points = points.new_empty(points.shape if with_points else (0,))
+    return g_points, points.new_empty(motion.shape), points.new_empty(values.shape)
+
+
+skinning_backward_op = register("skinning_backward", _skinning_backward, fake=_fake_skinning_backward)
+"""Gradients by the points, empty unless asked for, and by motion and values of the nodes; ``nodes`` are positions,
+radii, motion and values, ``grads`` those by offsets and blended values."""
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    points, positions, radii, followed, motion, values = inputs
+    ctx.mark_non_differentiable(output[2])
+    ctx.save_for_backward(points, positions, radii, followed, motion, values, output[2])
+
+
+def _backward(ctx: Any, g_offset: Tensor, g_blended: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
+    points, positions, radii, followed, motion, values, weights = ctx.saved_tensors
+    with_points, nodes = ctx.needs_input_grad[0], [positions, radii, motion, values]
+    g_points, g_motion, g_values = skinning_backward_op(
+        nodes, points, followed, weights, [g_offset, g_blended], with_points
+    )
+    return g_points if with_points else None, None, None, None, g_motion, g_values
+
+
+skinning_op = register("skinning", _skinning, fake=_fake_skinning, gradient=Gradient(_save, _backward))
+"""Offsets (M, 3), blended values (M, D), and the weights (M, B) of the nodes."""
 
 
 def blend_skinning(
     points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Offsets (M, 3) of points that follow moving nodes, and the nodes' values (M, D) blended alike.
+    """Return offsets (M, 3) of points that follow moving nodes, and the nodes' values (M, D) blended alike.
 
     A node turns what follows it about its own place p_b and shifts it, so that x is offset by
     sum_b w_b (R_b (x - p_b) - (x - p_b) + d_b) with w = softmax_b(-|x - p_b|^2 / (2 radius_b^2)). Differentiable, once,
@@ -37,13 +108,14 @@ def blend_skinning(
 
     Raises:
         DyngsError: shapes that do not fit each other, integers where floating point is needed or the reverse, tensors
-            that are not on the CPU, or an index of a node that does not exist.
+            on different devices, or an index of a node that does not exist.
     """
     _check(points, positions, radii, followed, motion, values)
     floats = (points, positions, radii, motion, values)
     dtype = reduce(torch.promote_types, (x.dtype for x in floats), torch.float32)
     points, positions, radii, motion, values = (x.to(dtype) for x in floats)
-    return _Skinning.apply(points, positions.detach(), radii.detach(), followed, motion, values)  # pyright: ignore[reportReturnType]
+    offset, blended, _ = skinning_op(points, positions.detach(), radii.detach(), followed, motion, values)
+    return offset, blended
 
 
 def _check(points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor) -> None:
@@ -58,54 +130,13 @@ def _check(points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, m
     for name, (tensor, shape) in expected.items():
         if tuple(tensor.shape) != shape:
             raise DyngsError(f"blend_skinning: {name} must be {shape}, got {tuple(tensor.shape)}")
-        if not tensor.is_floating_point() or tensor.device.type != "cpu":
-            raise DyngsError(
-                f"blend_skinning: {name} must be floating point on the CPU, got {tensor.dtype} on {tensor.device}"
-            )
-    if followed.dtype != torch.int64 or followed.device.type != "cpu":
-        raise DyngsError(
-            f"blend_skinning: followed must be int64 on the CPU, got {followed.dtype} on {followed.device}"
-        )
+        if not tensor.is_floating_point() or tensor.device != points.device:
+            wanted = f"floating point on {points.device} like the points"
+            raise DyngsError(f"blend_skinning: {name} must be {wanted}, got {tensor.dtype} on {tensor.device}")
+    if followed.dtype != torch.int64 or followed.device != points.device:
+        wanted = f"int64 on {points.device} like the points"
+        raise DyngsError(f"blend_skinning: followed must be {wanted}, got {followed.dtype} on {followed.device}")
     if followed.ndim != 2 or len(followed) != len(points) or followed.shape[1] == 0:
         raise DyngsError(
             f"blend_skinning: followed must be ({len(points)}, B) with B at least 1, got {tuple(followed.shape)}"
         )
-
-
-class _Skinning(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        offset = points.new_empty(len(points), 3)
-        blended = points.new_empty(len(points), values.shape[1])
-        weights = points.new_empty(followed.shape)
-        nodes = tuple(array(x) for x in (positions, radii, motion, values))
-        outputs = (array(x) for x in (offset, blended, weights))
-        try:
-            core.skinning_forward(nodes, (array(points), array(followed)), *outputs, num_threads())
-        except IndexError:
-            raise DyngsError(
-                f"blend_skinning: followed must be in [0, {len(positions)}), the nodes there are, "
-                f"got {int(followed.min())} to {int(followed.max())}"
-            ) from None
-        ctx.save_for_backward(points, positions, radii, followed, motion, values, weights)
-        return offset, blended
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, g_offset: Tensor, g_blended: Tensor) -> tuple[Tensor | None, ...]:
-        points, positions, radii, followed, motion, values, weights = ctx.saved_tensors
-        g_points = torch.empty(points.shape, dtype=points.dtype) if ctx.needs_input_grad[0] else None
-        g_motion = torch.empty(motion.shape, dtype=points.dtype)
-        g_values = torch.empty(values.shape, dtype=points.dtype)
-        core.skinning_backward(
-            tuple(array(x) for x in (positions, radii, motion, values)),
-            (array(points), array(followed)),
-            tuple(array(x) for x in (g_offset, g_blended, weights)),
-            None if g_points is None else array(g_points),
-            array(g_motion),
-            array(g_values),
-            num_threads(),
-        )
-        return g_points, None, None, None, g_motion, g_values

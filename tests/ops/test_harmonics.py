@@ -10,7 +10,7 @@ from scenes import Scene, random_scene, relative_error, weights
 from torch import Tensor
 
 from dyngs.ops import reference
-from dyngs.ops.harmonics import evaluate_harmonics
+from dyngs.ops.harmonics import evaluate_harmonics, harmonics_backward_op, harmonics_op
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -120,10 +120,10 @@ def test_degree_must_be_stored(degree: int) -> None:
 
 def test_opcheck(scene: Scene) -> None:
     means, centers, sh = (x.requires_grad_() for x in (scene.means, scene.cameras.centers, scene.sh))
-    torch.library.opcheck(torch.ops.dyngs.harmonics.default, (means, centers, sh, all_visible(scene), 1))
+    torch.library.opcheck(harmonics_op, (means, centers, sh, all_visible(scene), 1))
 
 
 def test_opcheck_backward(scene: Scene) -> None:
     colors = colours(scene, 1)
     args = ([scene.means, scene.cameras.centers, scene.sh, all_visible(scene)], colors, weights(colors), 1, True)
-    torch.library.opcheck(torch.ops.dyngs.harmonics_backward.default, args)
+    torch.library.opcheck(harmonics_backward_op, args)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.loss import _l1_ssim, _ssim_map, l1_ssim_loss, reference_l1_ssim, ssim
+from dyngs.ops.loss import _ssim_map, l1_ssim_loss, l1_ssim_op, reference_l1_ssim, ssim
 
 # Two blurs along two axes, of 11 additions of half a unit each, for the value and again for its gradient; the pictures
 # have contrast everywhere, so nothing cancels after that. Of 3,300 draws none had more than 4 units.
@@ -253,8 +253,8 @@ def test_gradcheck_in_float64() -> None:
 
 def test_opcheck() -> None:
     rendered, target, mask = make_pictures(13, 14)
-    torch.library.opcheck(_l1_ssim, (rendered.clone().requires_grad_(), target, mask, 0.2, True))
-    torch.library.opcheck(_l1_ssim, (rendered, target, None, 0.2, False))
+    torch.library.opcheck(l1_ssim_op, (rendered.clone().requires_grad_(), target, mask, 0.2, True))
+    torch.library.opcheck(l1_ssim_op, (rendered, target, None, 0.2, False))
 
 
 def test_compiles_to_one_graph() -> None:

@@ -190,9 +190,7 @@ def test_entries_changed_between_the_passes_are_refused() -> None:
 def test_entries_of_another_kind_are_refused() -> None:
     entries = tiny_render()
     tiny_render(entries, backward=True)
-    with pytest.raises(
-        DyngsError, match=r"entries.slots must be torch.int32 with one axis on the CPU, got torch.int64"
-    ):
+    with pytest.raises(DyngsError, match=r"entries.slots must be torch.int32 with one axis on cpu, got torch.int64"):
         tiny_render(replace(entries, slots=entries.slots.long()))
     with pytest.raises(DyngsError, match=r"entries.gaussians must be .* got torch.int32 \(2, 4\) on cpu"):
         tiny_render(replace(entries, gaussians=entries.gaussians.view(2, 4)))

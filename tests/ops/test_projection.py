@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.ops import reference
-from dyngs.ops.projection import Projection, ProjectionOptions, project
+from dyngs.ops.projection import Projection, ProjectionOptions, project, project_backward_op, project_op
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -244,7 +244,7 @@ def test_opcheck(with_poses: bool, scene: Scene) -> None:
     poses = leaves.cam_from_world if with_poses else scene.cam_from_world
     tensors = (leaves.means, leaves.quats, leaves.scales, scene.opacities, poses, scene.intrinsics)
     args = (*tensors, list(scene.size), [0.3, 0.2, 1e10, 0.0, 0.0], False)
-    torch.library.opcheck(torch.ops.dyngs.project.default, args)
+    torch.library.opcheck(project_op, args)
 
 
 def test_opcheck_backward(scene: Scene) -> None:
@@ -252,7 +252,7 @@ def test_opcheck_backward(scene: Scene) -> None:
     tensors = [scene.means, scene.quats, scene.scales, scene.opacities, scene.cam_from_world, scene.intrinsics]
     grads = [weights(getattr(p, name)) for name in OUTPUTS]
     args = (tensors, p.radii, grads, list(scene.size), [0.3, 0.2, 1e10, 0.0, 0.0], False, True)
-    torch.library.opcheck(torch.ops.dyngs.project_backward.default, args)
+    torch.library.opcheck(project_backward_op, args)
 
 
 def test_single_and_empty_batches_of_cameras(scene: Scene) -> None:

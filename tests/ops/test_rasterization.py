@@ -27,7 +27,18 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 from dyngs.ops import reference
 from dyngs.ops.projection import Projection
-from dyngs.ops.rasterization import MAX_CHANNELS, Blended, BlendOptions, Tally, rasterize, tally
+from dyngs.ops.rasterization import (
+    MAX_CHANNELS,
+    Blended,
+    BlendOptions,
+    Tally,
+    bin_tiles_op,
+    blend_backward_op,
+    blend_op,
+    rasterize,
+    tally,
+    tally_op,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -373,40 +384,44 @@ def blend_arguments(scene: Scene, absgrad: bool = True) -> tuple:
     projection, opacities, colors, background = with_channels(scene, 3)
     splats = [projection.means2d, projection.factors, opacities, projection.radii]
     size, thresholds = list(scene.size), [1 / 255, 0.99, 1e-4]
-    entries = list(torch.ops.dyngs.bin_tiles(splats, projection.depths, size, thresholds, 10**6))
+    entries = list(bin_tiles_op(splats, projection.depths, size, thresholds, 10**6))
     leaves = [x.detach().requires_grad_() for x in (*splats[:3], colors, background)]
     probe = torch.zeros(2, 20, 4, dtype=torch.float64, requires_grad=True)
-    return (*leaves, probe, projection.radii, entries, size, thresholds, absgrad)
+    return (*leaves, probe, projection.radii, *entries, size, thresholds, absgrad)
 
 
 def test_opcheck_blend(scene: Scene) -> None:
-    torch.library.opcheck(torch.ops.dyngs.blend.default, blend_arguments(scene))
+    torch.library.opcheck(blend_op, blend_arguments(scene))
 
 
 def test_opcheck_blend_without_background_and_probe(scene: Scene) -> None:
     given = list(blend_arguments(scene, absgrad=False))
     given[4] = given[5] = None
-    torch.library.opcheck(torch.ops.dyngs.blend.default, tuple(given))
+    torch.library.opcheck(blend_op, tuple(given))
 
 
 def test_opcheck_blend_backward(scene: Scene) -> None:
-    means2d, factors, opacities, colors, background, _, radii, entries, size, thresholds, absgrad = blend_arguments(
-        scene
-    )
-    splats = [x.detach() for x in (means2d, factors, opacities, colors)]
-    color, transmittance, stop = torch.ops.dyngs.blend(
-        *splats, background, None, radii, entries, size, thresholds, absgrad
-    )
+    *leaves, background, _, radii, a, b, c, d, size, thresholds, absgrad = blend_arguments(scene)
+    splats, entries = [x.detach() for x in leaves], [a, b, c, d]
+    color, transmittance, stop = blend_op(*splats, background, None, radii, *entries, size, thresholds, absgrad)
     grads = [weights(color), weights(transmittance)]
     given = ([*splats, radii], background.detach(), entries, [transmittance.detach(), stop], grads, size, thresholds)
-    torch.library.opcheck(torch.ops.dyngs.blend_backward.default, (*given, absgrad, True))
+    torch.library.opcheck(blend_backward_op, (*given, absgrad, True))
 
 
 def test_opcheck_bin_tiles(scene: Scene) -> None:
     projection, opacities, _, _ = with_channels(scene, 1)
     splats = [projection.means2d, projection.factors, opacities, projection.radii]
     given = (splats, projection.depths, list(scene.size), [1 / 255, 0.99, 1e-4], 10**6)
-    torch.library.opcheck(torch.ops.dyngs.bin_tiles.default, given)
+    torch.library.opcheck(bin_tiles_op, given)
+
+
+@pytest.mark.parametrize("kind", list(Tally))
+def test_opcheck_tally(kind: Tally, scene: Scene) -> None:
+    *leaves, background, _, radii, a, b, c, d, size, thresholds, _ = blend_arguments(scene)
+    means2d, factors, opacities, colors = (x.detach() for x in leaves)
+    splats = [means2d, factors, opacities, radii]
+    torch.library.opcheck(tally_op, (splats, colors, background.detach(), [a, b, c, d], size, thresholds, int(kind)))
 
 
 def test_gradcheck() -> None:

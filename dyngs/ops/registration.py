@@ -1,0 +1,146 @@
+"""Registration of the native ops with torch's dispatcher, under the namespace ``dyngs``.
+
+One call of ``register`` holds all that an op is: its implementation on the CPU (whose type hints are the schema), the
+shapes of its results without any data (for ``torch.compile``), and the formula of its gradient. Callers call the op
+and never ask where a tensor lies; the dispatcher picks the implementation. A back end for another device adds its
+implementations with ``implement`` and changes nothing here.
+
+``torch.library.custom_op`` would do the same, but imports ``torch._dynamo`` when the first op is made: 2 s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, ParamSpec, TypeVar, cast
+
+import torch
+from torch import Tensor
+
+from dyngs.errors import DyngsError
+
+NAMESPACE = "dyngs"
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_LIBRARY = torch.library.Library(NAMESPACE, "FRAGMENT")
+_kernels: dict[str, set[str]] = {}
+"""Devices of each op's implementations."""
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """Formula of the first derivatives of an op, as of a ``torch.autograd.Function``.
+
+    Attributes:
+        save: called as ``save(ctx, inputs, output)`` after the forward pass, keeps what the formula needs.
+        backward: called as ``backward(ctx, *gradients of the outputs)``, returns one gradient per input; for an input
+            that is a list of tensors, a list.
+    """
+
+    save: Callable[[Any, tuple[Any, ...], Any], None]
+    backward: Callable[..., Any]
+
+
+def register(
+    name: str,
+    cpu: Callable[P, R],
+    *,
+    fake: Callable[P, R],
+    mutates: tuple[str, ...] = (),
+    gradient: Gradient | None = None,
+) -> Callable[P, R]:
+    """Return the op ``torch.ops.dyngs.NAME``, called with positional arguments.
+
+    On a device without an implementation it raises ``DyngsError``, which names the device.
+
+    Args:
+        name: of the op.
+        cpu: implementation on the CPU; its type hints give the schema. No result may share memory with an input.
+        fake: results of the right shape, dtype and device for inputs without data.
+        mutates: arguments that ``cpu`` writes to.
+        gradient: None: not differentiable.
+    """
+    schema = torch.library.infer_schema(cpu, mutates_args=mutates)
+    qualified = f"{NAMESPACE}::{name}"
+    _LIBRARY.define(name + schema)
+    torch.library.register_fake(qualified, fake, lib=_LIBRARY)
+    _LIBRARY.impl(name, _refusal(name), "CompositeExplicitAutograd")  # for every device that has none of its own
+    _kernels[name] = {"meta"}
+    implement(name, "cpu", cpu)
+    if gradient is not None:
+        formula = _first_order(qualified, gradient.backward)
+        torch.library.register_autograd(qualified, formula, setup_context=gradient.save, lib=_LIBRARY)
+    return cast(Callable[P, R], getattr(getattr(torch.ops, NAMESPACE), name).default)
+
+
+def implement(name: str, device: str, kernel: Callable[..., object]) -> None:
+    """Make ``kernel`` the implementation of the op ``name`` for tensors on ``device``, for example ``"cuda"``."""
+    _LIBRARY.impl(name, kernel, device.upper())
+    _kernels[name].add(device)
+
+
+def has_kernel(name: str, device: torch.device) -> bool:
+    """Return whether the op ``name`` is implemented on ``device``; where it is not, plain torch may do."""
+    return device.type in _kernels[name]
+
+
+def _refusal(name: str) -> Callable[..., Any]:
+    def refuse(*arguments: object) -> None:
+        devices = sorted({str(x.device) for x in _tensors(arguments)})
+        raise DyngsError(
+            f"{NAMESPACE}::{name} has no implementation for tensors on {' and '.join(devices)}; "
+            "move all of them to the CPU with .to('cpu')"
+        )
+
+    return refuse
+
+
+def _tensors(values: Iterable[object]) -> list[Tensor]:
+    """Return the tensors among ``values`` and in its lists and tuples."""
+    found: list[Tensor] = []
+    for value in values:
+        if isinstance(value, Tensor):
+            found.append(value)
+        elif isinstance(value, (list, tuple)):
+            found += _tensors(cast(Iterable[object], value))
+    return found
+
+
+def _first_order(qualified: str, backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the formula ``backward`` made one whose results raise an error when they are differentiated again.
+
+    Why: the native backward ops have no derivative, and without this their second derivatives would count as zero.
+    """
+
+    def formula(ctx: Any, *grads: Tensor | None) -> Any:
+        if not torch.is_grad_enabled():
+            return backward(ctx, *grads)
+        with torch.no_grad():
+            results = backward(ctx, *grads)
+        sources = [x for x in (*_tensors(grads), *ctx.saved_tensors) if x.requires_grad]
+        return _guarded(qualified, results, sources) if sources else results
+
+    return formula
+
+
+def _guarded(qualified: str, results: Any, sources: list[Tensor]) -> Any:
+    """Return ``results`` (a tensor, None, or a tuple or list of such) with an error as the gradient of each tensor."""
+    if isinstance(results, (list, tuple)):
+        guarded = [_guarded(qualified, x, sources) for x in cast(Iterable[object], results)]
+        return guarded if isinstance(results, list) else tuple(guarded)
+    return _Undifferentiable.apply(qualified, results, *sources) if isinstance(results, Tensor) else results
+
+
+class _Undifferentiable(torch.autograd.Function):
+    """A tensor as it is, whose gradient by ``sources`` is an error."""
+
+    @staticmethod
+    def forward(ctx: Any, qualified: str, x: Tensor, *sources: Tensor) -> Tensor:
+        ctx.qualified = qualified
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> None:
+        raise DyngsError(f"{ctx.qualified} is differentiable once; a second derivative was asked for")
