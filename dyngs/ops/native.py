@@ -132,11 +132,12 @@ def array(x: Tensor) -> object:
 
 
 def writable(x: Tensor) -> object:
-    """``x`` as ``array``, for a kernel that writes to it.
+    """Return ``x`` as ``array`` does, for a kernel that writes to it; autograd then counts ``x`` as changed.
 
     Raises:
         DyngsError: ``x`` is not contiguous, so that the kernel would write to a copy.
     """
     if not x.is_contiguous():
         raise DyngsError("a tensor that is updated in place must be contiguous; call .contiguous() first")
+    torch.autograd.graph.increment_version(x)
     return to_dlpack(x.detach())

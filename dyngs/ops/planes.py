@@ -127,6 +127,8 @@ def _penalty_gradient(ctx: Any, grad: Tensor, _: object) -> tuple[list[Tensor], 
     grads, ctx.grads = ctx.grads, None
     if grads is None:  # a second backward pass through a retained graph
         _, grads = plane_penalty_op(list(ctx.saved_tensors), ctx.weights, True)
+    if type(grad) is not Tensor:  # torch traces a graph, which cannot branch on a value
+        return [g * grad for g in grads], None, None
     if grad != 1:
         for g in grads:
             g.mul_(grad)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.adam import adam_step_, seen_rows
+from dyngs.ops.adam import adam_step_, adam_step_op, seen_rows, seen_rows_op
 
 # Rows shorter and longer than a vector, tails, several blocks of 2048 floats, and one row longer than a block.
 SHAPES = [(1,), (700,), (5000,), (701, 3), (1, 4), (90, 15, 3), (130, 16, 3), (3, 2500)]
@@ -227,3 +227,21 @@ def test_arguments_that_do_not_fit() -> None:
     for betas in ((1.0, 0.9), (0.9, -0.1), (math.nan, 0.9)):
         with pytest.raises(DyngsError, match="betas must"):
             adam_step_(param, grad, exp_avg, exp_avg_sq, lr=0.1, step=1, betas=betas)
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_is_a_well_behaved_torch_op(masked: bool) -> None:
+    param, grad, exp_avg, exp_avg_sq = make_state((6, 3))
+    rows = torch.tensor([True, False] * 3) if masked else None
+    rates = torch.full((3,), 0.1)
+    torch.library.opcheck(adam_step_op, (param, grad, exp_avg, exp_avg_sq, rates, rows, [0.9, 0.999], 1e-15, 3))
+    torch.library.opcheck(seen_rows_op, (grad,))
+
+
+def test_the_parameter_counts_as_changed_for_autograd() -> None:
+    param, grad, exp_avg, exp_avg_sq = make_state((6, 3))
+    param.requires_grad_()
+    square = param.square().sum()
+    adam_step_(param, grad, exp_avg, exp_avg_sq, lr=0.1, step=1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        square.backward()

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.errors import DyngsError
-from dyngs.ops.finite import check_finite, finite_rows
+from dyngs.ops.finite import check_finite, count_nonfinite_op, finite_rows
 
 BAD = [float("nan"), float("inf"), -float("inf")]
 DTYPES = [torch.float32, torch.float64]
@@ -59,3 +59,10 @@ def test_rows_are_finite_only_if_they_are_in_every_tensor() -> None:
 def test_nothing_is_finite() -> None:
     check_finite({"x": torch.zeros(0, 3)})
     assert finite_rows([torch.zeros(0, 3)]).shape == (0,)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_is_a_well_behaved_torch_op(dtype: torch.dtype) -> None:
+    x = torch.tensor([1.0, float("nan"), float("inf")], dtype=dtype)
+    assert count_nonfinite_op(x).item() == 2
+    torch.library.opcheck(count_nonfinite_op, (x,))

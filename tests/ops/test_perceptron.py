@@ -14,7 +14,7 @@ from torch import Tensor
 import dyngs.ops.perceptron as ops
 from dyngs.errors import DyngsError
 from dyngs.ops.native import kernel_threads
-from dyngs.ops.perceptron import Layer, perceptron, reference_perceptron
+from dyngs.ops.perceptron import Layer, perceptron, perceptron_backward_op, perceptron_op, reference_perceptron
 
 
 def make_layers(widths: list[int], skip: int | None, seed: int = 0) -> list[Layer]:
@@ -217,7 +217,9 @@ def test_is_a_well_behaved_torch_op() -> None:
     layers = make_layers([5, 7, 3], None)
     params = torch.cat([p.detach().reshape(-1) for p in parameters(layers)]).requires_grad_()
     # Activations are not kept here: opcheck would compare the padding between them, which nobody writes or reads.
-    torch.library.opcheck(torch.ops.dyngs.perceptron.default, (make_rows(9, 5), params, [5, 7, 3], 0, False))
+    torch.library.opcheck(perceptron_op, (make_rows(9, 5), params, [5, 7, 3], 0, False))
+    inputs, grad = [make_rows(9, 5).detach(), params.detach(), torch.empty(0)], make_rows(9, 3).detach()
+    torch.library.opcheck(perceptron_backward_op, (inputs, grad, [5, 7, 3], 0, True))
 
 
 def test_compiles_in_one_graph() -> None:

@@ -15,7 +15,14 @@ from torch.nn.functional import grid_sample
 
 from dyngs.errors import DyngsError
 from dyngs.ops.native import core, kernel_threads
-from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
+from dyngs.ops.planes import (
+    PlaneLevel,
+    hexplane_backward_op,
+    hexplane_features,
+    hexplane_op,
+    plane_penalty,
+    plane_penalty_op,
+)
 
 AXES = ((0, 1), (0, 2), (1, 2))
 WEIGHTS = (0.3, 0.7, 0.2)
@@ -383,3 +390,32 @@ def test_the_kernels_refuse_arrays_that_do_not_fit() -> None:
         core.hexplane_forward(torch.zeros(7, 3), arrays, 0.5, torch.zeros(6, 5), torch.zeros(7, dtype=torch.int32), 1)
     with pytest.raises(ValueError, match="another size than the planes"):
         core.plane_penalty(arrays, [(level.time, level.time)], WEIGHTS, 1)
+
+
+@pytest.mark.parametrize("with_coords", [True, False])
+def test_features_are_a_well_behaved_torch_op(with_coords: bool) -> None:
+    levels = with_gradients(make_levels((4, 6), 3, 2))
+    coords = make_coords(9).requires_grad_(with_coords)
+    torch.library.opcheck(hexplane_op, (coords, leaves(levels), 0.3))
+    planes = [x.detach() for x in leaves(levels)]
+    features, order = hexplane_op(coords.detach(), planes, 0.3)
+    # The gradient by the coordinates is asked for, because opcheck refuses results without elements that are not new.
+    torch.library.opcheck(
+        hexplane_backward_op, (coords.detach(), planes, order, torch.ones_like(features), 0.3, with_coords)
+    )
+
+
+@pytest.mark.parametrize("with_gradient", [True, False])
+def test_the_penalty_is_a_well_behaved_torch_op(with_gradient: bool) -> None:
+    levels = make_levels((4, 6), 3, 2)
+    planes = leaves(with_gradients(levels) if with_gradient else levels)
+    torch.library.opcheck(plane_penalty_op, (planes, list(WEIGHTS), with_gradient))
+
+
+def test_features_and_penalty_compile_in_one_graph() -> None:
+    def run(coords: Tensor, time: float, levels: list[PlaneLevel]) -> Tensor:
+        return hexplane_features(coords, time, levels).sum() + plane_penalty(levels, WEIGHTS)
+
+    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
+    coords, levels = make_coords(9), make_levels((4, 6), 3, 2)
+    assert_equal(run_features(compiled, coords, 0.3, levels), run_features(run, coords, 0.3, levels))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dyngs.human.pose.covariance import rotations_of
 from dyngs.ops.native import kernel_threads
-from dyngs.ops.shading import Sight, contracted, num_inputs, reference_inputs, shading_inputs, shortest_axes
+from dyngs.ops.shading import Sight, contracted, num_inputs, reference_inputs, shading_inputs, shading_op, shortest_axes
 
 
 def sight(seed: int, *, normals: bool, timed: bool, on_body: bool, dtype: torch.dtype = torch.float64) -> Sight:
@@ -108,3 +108,19 @@ def test_the_shortest_axis_is_the_normal() -> None:
     log_scales = torch.randn(30, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     expected = rotations_of(quats).gather(2, log_scales.argmin(1)[:, None, None].expand(30, 3, 1))[..., 0]
     torch.testing.assert_close(shortest_axes(quats, log_scales), expected)
+
+
+@pytest.mark.parametrize("on_body", [True, False])
+def test_is_a_well_behaved_torch_op(on_body: bool) -> None:
+    seen = sight(0, normals=on_body, timed=on_body, on_body=on_body)
+    base = torch.rand(7, 3, dtype=torch.float64).requires_grad_()
+    rest, turn = seen.rest or (None, None)
+    placed = (seen.means, seen.quats, seen.log_scales, seen.rows, seen.eye, seen.box, rest, turn)
+    torch.library.opcheck(shading_op, (base, *placed, seen.time, seen.normals))
+
+
+def test_compiles_in_one_graph() -> None:
+    seen = sight(0, normals=True, timed=True, on_body=True)
+    base = torch.rand(7, 3, dtype=torch.float64)
+    compiled = torch.compile(shading_inputs, fullgraph=True, backend="aot_eager")
+    assert torch.equal(compiled(seen, base), shading_inputs(seen, base))

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError
 from dyngs.ops.native import core, kernel_threads
-from dyngs.ops.skinning import blend_skinning
+from dyngs.ops.skinning import blend_skinning, skinning_backward_op, skinning_op
 
 IDENTITY = torch.tensor([0, 0, 0, 1.0, 0, 0, 0], dtype=torch.float64)
 NAN = float("nan")
@@ -295,3 +295,22 @@ def test_bad_input_is_refused(change: dict[str, Tensor], message: str) -> None:
     with pytest.raises(DyngsError, match=message) as caught:
         blend_skinning(*case.arguments())
     assert "\n" not in str(caught.value)
+
+
+def test_is_a_well_behaved_torch_op() -> None:
+    case = random_case(9, 4, 2, 3)
+    torch.library.opcheck(skinning_op, case.arguments())
+    points, positions, radii, followed, motion, values = (x.detach() for x in case.arguments())
+    offset, blended, weights = skinning_op(points, positions, radii, followed, motion, values)
+    nodes, grads = [positions, radii, motion, values], [torch.ones_like(offset), torch.ones_like(blended)]
+    torch.library.opcheck(skinning_backward_op, (nodes, points, followed, weights, grads, True))
+
+
+def test_compiles_in_one_graph() -> None:
+    compiled = torch.compile(blend_skinning, fullgraph=True, backend="aot_eager")
+    case = random_case(9, 4, 2, 3)
+    found, expected = (
+        torch.autograd.grad(sum(x.sum() for x in f(*case.arguments())), case.leaves())
+        for f in (compiled, blend_skinning)
+    )
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
