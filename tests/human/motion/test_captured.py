@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from dyngs.data.readers.people import BodyFrames, body_frames
 
 from dyngs.data.body_frames import BodyFrames, body_frames
 from dyngs.data.capture import View
