@@ -30,9 +30,9 @@ from dyngs.human.prediction.predict import predict_gaussians
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.load import load_template
 from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at
-from dyngs.train.predictor import filmed, human_options, load_network, new_network
-from dyngs.train.predictor_run import network_config, predict_person, write_run
-from dyngs.train.trainer import train
+from dyngs.training.prediction import filmed, human_options, load_network, new_network
+from dyngs.api.predict import network_config, predict_person, write_run
+from dyngs.api.train import train
 
 FIRST_HELD_OUT = 101
 """Seed of the first person that is not trained on."""

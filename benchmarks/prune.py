@@ -15,9 +15,9 @@ import argparse
 from pathlib import Path
 
 from dyngs.evaluate.report import evaluate_run
-from dyngs.prune.run import Cost, compact_run, compared
+from dyngs.api.prune import Cost, prune_run, compared
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.storage.run import write_compact
+from dyngs.export.scene_file import write_scene_file
 
 ONCE = "prune.steps=1"
 NO_MASKS, NO_PRUNING = "prune.mask_times=0", "prune.share=0"
@@ -45,7 +45,7 @@ def line(name: str, run: Path, cost: Cost, before: Cost, threads: int) -> str:
 def stored(run: Path, threads: int) -> str:
     """What the file of a run costs, its last column."""
     folder = run / "stored"
-    size = 1e-6 * write_compact(run, folder).num_bytes
+    size = 1e-6 * write_scene_file(run, folder).num_bytes
     return f" {size:.3f}, {evaluate_run(folder, threads=threads).psnr:.2f} dB |"
 
 
@@ -62,7 +62,7 @@ def main() -> None:
         out = given.folder / name.replace(", ", "_").replace(" ", "_")
         if not checkpoint_paths(out):
             common = ("prune.share=0.8", "prune.max_loss=1000", f"run.threads={given.threads}")
-            compact_run(given.run_dir, out, (*common, *given.overrides, *asked))
+            prune_run(given.run_dir, out, (*common, *given.overrides, *asked))
         before, after = compared(given.run_dir, out, given.threads)
         print(line(name, out, after, before, given.threads), end="", flush=True)
         print(stored(out, given.threads), flush=True)

@@ -42,7 +42,7 @@ import torch
 
 from dyngs.cli import main as dyngs
 from dyngs.config.io import RESOLVED_NAME
-from dyngs.runs.checkpoint import checkpoint_paths, is_compact, load_run
+from dyngs.runs.checkpoint import checkpoint_paths, has_only_scene_file, load_run
 
 OPERATIONS = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "fcntl.flock", "shutil.rmtree")
 WRITES = os.O_WRONLY | os.O_RDWR
@@ -176,7 +176,7 @@ def _be_child(words: str, out: Path, files: tuple[Path, int], prepare: Callable[
         nowhere = os.open(os.devnull, os.O_RDWR)
         for source, target in ((nowhere, 0), (nowhere, 1), (error_file, 2), (files[1], 3)):
             os.dup2(source, target)
-        if checkpoint_paths(out) or is_compact(out):
+        if checkpoint_paths(out) or has_only_scene_file(out):
             load_run(out)
         trap = prepare()
         code = dyngs([word.replace("OUT", str(out)) for word in words.split()])

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
@@ -16,7 +17,6 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.report import EvalReport, evaluate_run
 from dyngs.export.run_to_ply import export_ply
 from dyngs.runs.lock import LOCK_NAME, InUseError, writing
-from dyngs.train.trainer import train
 from dyngs.view.image_files import OutputOptions, write_job_images, write_split_images
 from dyngs.view.job_of_run import job_of_run
 from dyngs.view.render_job import RenderJobOptions

@@ -1,91 +1,287 @@
-"""What can be drawn: anything trained, of whatever kind."""
+"""What can be trained and drawn: N Gaussians, how they move, and how they are coloured.
+
+There is one class per kind of model: ``static.scene.StaticScene``, ``deform.scene.DynamicScene`` and
+``human.avatar.scene.HumanScene``. In training, loaded from a file or watched half-way it is the same class. How a kind
+of scene is trained is the business of a ``SceneTraining``.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Protocol, TypeVar
 
+import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.colour.network import ColourNetwork
-from dyngs.gaussians import Gaussians
+from dyngs.colour.network import ColourNetwork, Frame
+from dyngs.config import SceneModel
+from dyngs.data.loader import Picture
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.rendering import Rendering, RenderOptions, Shader, render
+from dyngs.state import Role, State, moved_to, prefixed, with_role
+from dyngs.visibility import VisibilityMasks
 
-
-class Scene(Protocol):
-    """Gaussians at any time, as ``TrainedScene`` and ``AvatarScene``."""
-
-    @property
-    def gaussians(self) -> Gaussians:
-        """The N Gaussians that are stored."""
-        ...
-
-    @property
-    def rows(self) -> Tensor:
-        """(M,) indices of those that move, ascending."""
-        ...
-
-    @property
-    def times(self) -> tuple[float, ...]:
-        """Distinct moments of training, or of the clip that is played, in [0, 1], ascending."""
-        ...
-
-    @property
-    def is_still(self) -> bool:
-        """``at`` returns the same at every time."""
-        ...
-
-    @property
-    def moving_share(self) -> float:
-        """M / N, 0 where nothing moves."""
-        ...
-
-    @property
-    def num_field_values(self) -> int:
-        """How many numbers are stored beside the Gaussians and their colours."""
-        ...
-
-    @property
-    def colour(self) -> ColourNetwork | None:
-        """What colours them; None: their harmonics."""
-        ...
-
-    def __len__(self) -> int: ...
-
-    def at(self, time: float | None) -> Gaussians:
-        """The N Gaussians at ``time``, clamped; None is the first moment."""
-        ...
-
-    def shader_at(self, time: float | None) -> Shader | None:
-        """What colours the Gaussians of ``at(time)``; None: their harmonics."""
-        ...
-
-    def part(self, which: Literal["moving", "still"]) -> Scene:
-        """Only the Gaussians that move, or only those that do not."""
-        ...
-
-
-def num_colour_values(scene: Scene) -> int:
-    """How many numbers the colours take: base, network, and harmonics but for Gaussians that have none but zeros."""
-    sh = scene.gaussians.sh
-    with_rest = int((sh[:, 1:] != 0).flatten(1).any(1).sum())
-    network = 0 if scene.colour is None else scene.colour.num_values
-    return 3 * len(sh) + 3 * (sh.shape[1] - 1) * with_rest + network
+S = TypeVar("S", bound="Scene")
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A scene at one time: what cameras see."""
+    """A scene at one time.
+
+    Attributes:
+        gaussians: as they are drawn; differentiable where gradients are enabled.
+        time: in [0, 1], for colours that depend on it.
+        frame: where the Gaussians are at rest, if colours follow a body.
+        penalties: differentiable regularizers, weighted, by name; empty outside training.
+    """
 
     gaussians: Gaussians
-    shader: Shader | None = None
-
-    def seen_by(self, cameras: Cameras, options: RenderOptions, background: Tensor | None = None) -> Rendering:
-        """Pictures of it, as ``render`` makes them."""
-        return render(self.gaussians, cameras, options, background=background, shader=self.shader)
+    time: float | None = None
+    frame: Frame | None = None
+    penalties: dict[str, Tensor] = field(default_factory=dict)
 
 
-def moment_of(scene: Scene, time: float | None) -> Moment:
-    """``scene`` at ``time``, clamped; None is the first moment."""
-    return Moment(scene.at(time), scene.shader_at(time))
+@dataclass(frozen=True, kw_only=True)
+class Scene(ABC):
+    """N Gaussians at any time.
+
+    Attributes:
+        gaussians: as stored: canonical, or at rest. In training they are the optimizer's leaf tensors.
+        colour: network that colours them; None: their harmonics do.
+        options: how they are drawn unless ``render`` is told otherwise.
+        background: (3,) colour behind them unless ``render`` is told otherwise; None is black.
+        masks: which Gaussians are seen around a time; None: all may be, at all times. Only where a field moves some.
+    """
+
+    gaussians: Gaussians
+    colour: ColourNetwork | None = None
+    options: RenderOptions = RenderOptions()
+    background: Tensor | None = None
+    masks: VisibilityMasks | None = None
+    _derived: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    @property
+    @abstractmethod
+    def times(self) -> tuple[float, ...]:
+        """Distinct times of training, or of the motion that is played, in [0, 1], ascending; empty without times."""
+
+    @property
+    @abstractmethod
+    def is_still(self) -> bool:
+        """Whether ``at`` returns the same at every time."""
+
+    @property
+    @abstractmethod
+    def rows(self) -> Tensor:
+        """(M,) ascending indices of the Gaussians that move."""
+
+    @property
+    def num_moving(self) -> int:
+        """M."""
+        return len(self.rows)
+
+    @property
+    def moving_share(self) -> float:
+        """M / N, 0 where nothing moves."""
+        return 0.0 if self.is_still else self.num_moving / max(len(self), 1)
+
+    @property
+    def offset_rows(self) -> Tensor:
+        """(M',) ascending indices of the Gaussians whose axes or attributes a field changes one by one."""
+        return torch.zeros(0, dtype=torch.long, device=self.gaussians.means.device)
+
+    @property
+    def num_motion_values(self) -> int:
+        """Numbers stored for motion, beside the Gaussians and their colours."""
+        return 0
+
+    @property
+    def num_colour_values(self) -> int:
+        """Numbers stored for colours: base, network, and harmonics but for Gaussians that have none but zeros."""
+        sh = self.gaussians.sh
+        with_rest = int((sh[:, 1:] != 0).flatten(1).any(1).sum())
+        network = 0 if self.colour is None else self.colour.num_values
+        return 3 * len(sh) + 3 * (sh.shape[1] - 1) * with_rest + network
+
+    @property
+    def num_mask_bytes(self) -> int:
+        """Bytes of the masks; 0 without any."""
+        return 0 if self.masks is None else self.masks.bits.numel()
+
+    @abstractmethod
+    def moment(self, time: float | None) -> Moment:
+        """Return the scene at ``time``, clamped to [0, 1]; None is the first moment.
+
+        Raises:
+            DyngsError: the time is NaN.
+        """
+
+    def at(self, time: float | None) -> Gaussians:
+        """Return the Gaussians at ``time``, as ``moment`` has them, without gradients."""
+        with torch.no_grad():
+            return self.moment(time).gaussians
+
+    def shader(self, moment: Moment) -> Shader | None:
+        """Return the colours of the Gaussians of ``moment``; None: their harmonics."""
+        return None if self.colour is None else self.colour.shader(moment.time, moment.frame)
+
+    def render(
+        self,
+        cameras: Cameras,
+        time: float | Moment | None = None,
+        *,
+        options: RenderOptions | None = None,
+        background: Tensor | None = None,
+        probe: Tensor | None = None,
+    ) -> Rendering:
+        """Return pictures of the scene; differentiable where gradients are enabled.
+
+        Args:
+            cameras: V cameras.
+            time: in [0, 1], or the moment itself, so that it is not computed again.
+            options: how to draw; None: as the scene wants to be drawn.
+            background: (3,) or (V, 3) colour; None: that of the scene.
+            probe: (V, N, 4) zeros whose gradient is the densification signal.
+
+        Raises:
+            DyngsError: as ``dyngs.rendering.render``.
+        """
+        moment = time if isinstance(time, Moment) else self.moment(time)
+        behind = self.background if background is None else background
+        how = self.options if options is None else options
+        return render(moment.gaussians, cameras, how, background=behind, probe=probe, shader=self.shader(moment))
+
+    @abstractmethod
+    def edited(self: S, edit: TopologyEdit) -> S:
+        """Return the scene after a change of the set of Gaussians; everything stored per Gaussian follows it."""
+
+    def select(self: S, index: Tensor) -> S:
+        """Return the scene with only the Gaussians at ``index`` (long or bool)."""
+        return self.edited(TopologyEdit.select(index))
+
+    def part(self, which: Literal["moving", "still"]) -> Scene:
+        """Return only the Gaussians that move, or only those that do not."""
+        moves = torch.zeros(len(self), dtype=torch.bool, device=self.gaussians.means.device)
+        if not self.is_still:
+            moves[self.rows] = True
+        return self.unmasked().select(moves if which == "moving" else ~moves)
+
+    def unmasked(self: S) -> S:
+        """Return the scene with all Gaussians drawn at all times."""
+        return replace(self, masks=None)
+
+    def with_gaussians(self: S, gaussians: Gaussians) -> S:
+        """Return the scene with other values, or other leaf tensors, for the same Gaussians."""
+        return replace(self, gaussians=gaussians)
+
+    def changed(self) -> None:
+        """Forget what was derived from tensors that have been changed in place since."""
+        self._derived.clear()
+
+    def state(self) -> State:
+        """Return everything that is stored, by name, with its role."""
+        return prefixed("gaussians", with_role(self.gaussians.detach().tensors(), Role.PER_GAUSSIAN)) | prefixed(
+            "model", self._model_state() | ({} if self.colour is None else prefixed("colour", self.colour.state()))
+        )
+
+    def drawing_state(self) -> State:
+        """Return the part of ``state`` that drawing needs, in an equivalent form where that is smaller."""
+        return {name: x for name, x in self.state().items() if x.role is not Role.TRAINING}
+
+    def to(self: S, device: torch.device | str) -> S:
+        """Return the scene with its tensors on ``device``."""
+        return moved_to(self, device)
+
+    @abstractmethod
+    def _model_state(self) -> State:
+        """Return what the kind of scene stores beside its Gaussians and colours."""
+
+
+def render_options(model: SceneModel) -> RenderOptions:
+    """Return how a model wants to be drawn."""
+    return RenderOptions(
+        near=model.near,
+        eps2d=model.eps2d,
+        mode=model.rasterize_mode,
+        alpha_min=model.alpha_min,
+        transmittance_min=model.transmittance_min,
+    )
+
+
+class SceneTraining(Protocol[S]):
+    """How a kind of scene is trained: on which pictures, what it learns beside its Gaussians, what is frozen when."""
+
+    @property
+    def moves_by(self) -> tuple[str, str]:
+        """What moves the Gaussians, in words, and the configuration section of its learning rates, for messages."""
+        ...
+
+    def trains_on(self, time: float | None, step: int) -> bool:
+        """Return whether a picture of ``time`` may be trained on in ``step``; at each step some may."""
+        ...
+
+    def moment(self, scene: S, picture: Picture, step: int) -> Moment:
+        """Return what is drawn for ``picture`` in ``step``, and the penalties."""
+        ...
+
+    def optimize(self, scene: S, step: int) -> int:
+        """Update, in place, what the scene learns beside its Gaussians and colours.
+
+        Returns:
+            the number of rows left out because their gradient was not finite.
+        """
+        ...
+
+    def after_step(self, scene: S, step: int, edited: bool) -> S:
+        """Return the scene for the next step: filters brought up to date, motion extended, still Gaussians frozen.
+
+        Args:
+            scene: after the optimizers and the strategy.
+            step: that was done.
+            edited: the set of Gaussians has just changed.
+        """
+        ...
+
+    def grown(self, scene: S, step: int) -> tuple[S, EditResult] | None:
+        """Return the scene with Gaussians that its kind adds after ``step``, and the edit that adds them; None: none."""
+        ...
+
+    def window(self, step: int) -> tuple[float, float]:
+        """Return the first and last time that are trained on at ``step``."""
+        ...
+
+    def extend(self, scene: S, seen: tuple[float, float], step: int) -> None:
+        """Continue motion learned for the times in ``seen`` to those that are trained on at ``step``."""
+        ...
+
+    def all_moving(self, scene: S, extent: float) -> S:
+        """Return ``scene`` as expensive to draw as it may become: all Gaussians moved, by an untrained field if need be.
+
+        Args:
+            scene: N Gaussians.
+            extent: of the scene, world units.
+        """
+        ...
+
+    def follow(self, edit: TopologyEdit) -> None:
+        """Let what the training itself keeps per Gaussian follow a change of the set."""
+        ...
+
+    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> S:
+        """Return the scene of a checkpoint, with colours and options of ``like``, and take over the training's state.
+
+        Raises:
+            KeyError: a tensor is missing.
+            ValueError: the tensors do not fit together.
+        """
+        ...
+
+    def state(self) -> State:
+        """Return what a checkpoint must hold beside the scene."""
+        ...

@@ -308,7 +308,7 @@ READERS: dict[str, Reader] = {
     "gltf": Reader({"linear": files.write_walk_glb, "cubic": files.write_cubic_glb}, read_a_motion),
     "ply": Reader({"splats": files.write_splats}, read_splats),
     "checkpoints": Reader({"still": files.write_still_run, **_RUNS}, read_a_run),
-    "scenes": Reader({"still": files.write_compact_still, "moving": files.write_compact_moving}, read_a_run),
+    "scenes": Reader({"still": files.write_scene_file_still, "moving": files.write_scene_file_moving}, read_a_run),
     "avatars": Reader({"person": files.write_person}, read_a_person),
     "presets": Reader({"preset": files.write_preset}, read_a_preset),
     "overrides": Reader({"lines": files.write_overrides}, read_override_lines, names_file=False),

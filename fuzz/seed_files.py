@@ -148,14 +148,14 @@ def write_moving_runs(kind: str, root: Path) -> None:
     save_checkpoint(root, Checkpoint(_INFO, tensors), 1.0)
 
 
-def write_compact_still(root: Path) -> None:
+def write_scene_file_still(root: Path) -> None:
     """A run that is only ``scene.dyngs``."""
     model = StaticModel()
     save_config(Config(data=DataConfig.model_validate({"root": "capture"}), model=model), root / RESOLVED_NAME)
     (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _gaussians(), model, {}))
 
 
-def write_compact_moving(root: Path) -> None:
+def write_scene_file_moving(root: Path) -> None:
     """The same of a scene that moves, with steps."""
     config, tensors = _moving("trajectory")
     save_config(config, root / RESOLVED_NAME)

@@ -16,7 +16,7 @@ from torch import Tensor
 from dyngs.colour.colours import NetworkColours
 from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.deform.fields import field_state
-from dyngs.deform.masks import KeyMasks
+from dyngs.visibility import VisibilityMasks
 from dyngs.rendering import RenderOptions
 from dyngs.scene import Scene, moment_of
 from dyngs.storage.coding import compressed
@@ -142,7 +142,7 @@ def contents(kind: str) -> tuple[Tensors, SceneModel]:
         state |= {f"field.{name}": x for name, x in stored.items()}
         state |= {"rows": torch.tensor(_ROWS), "times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)}
     if kind == "masked":
-        masks = KeyMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])
+        masks = VisibilityMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])
         state |= {f"masks.{name}": x for name, x in masks.state().items()}
     tensors = {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
     return {name: x.contiguous() for name, x in (tensors | {f"model.{n}": x for n, x in state.items()}).items()}, model

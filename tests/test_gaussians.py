@@ -85,7 +85,7 @@ def test_replace_leaves_the_rest() -> None:
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.booleans(), min_size=5, max_size=5))
 def test_keep_is_the_mask(mask: list[bool]) -> None:
-    edit = TopologyEdit.keep(torch.tensor(mask))
+    edit = TopologyEdit.select(torch.tensor(mask))
     x = torch.arange(10).view(5, 2)
     assert torch.equal(edit.apply(x), x[torch.tensor(mask)])
     assert torch.equal(edit.apply_moments(x), edit.apply(x))

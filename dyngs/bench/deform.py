@@ -6,22 +6,23 @@ import json
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 
 from dyngs.build import assemble
-from dyngs.config import Config, DataConfig, DynamicModel, RandomInit
+from dyngs.config import Config, DataConfig, DeformField, RandomInit
+from dyngs.config.kinds import field_of
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
-from dyngs.deform.model import NOBODY, DynamicScene
+from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_text
 from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
-from dyngs.train.step import Trainer
+from dyngs.training.trainer import Trainer
 
 VARIANTS = ("nothing moves", "what moves, moves", "everything moves")
 STEPS_PER_ROUND = 5
@@ -70,7 +71,7 @@ class DeformReport:
 def load_of_run(run_dir: Path) -> DeformLoad:
     """The load of a trained dynamic run. Raises DyngsError if it has no field."""
     run = load_run(run_dir)
-    if not isinstance(run.config.model, DynamicModel) or run.scene.is_still:
+    if field_of(run.config) is None or run.scene.is_still:
         raise DyngsError(f"{run_dir}: nothing moves in this run; give one of a dynamic model, or none")
     return DeformLoad(run.config, run_dir)
 
@@ -104,13 +105,13 @@ def bench_deform(load: DeformLoad, threads: int, rounds: int) -> DeformReport:
                     if number:  # the first round warms up
                         samples[name].append(seconds)
         trainer = trainers[VARIANTS[1]]
-        num_gaussians = len(trainer.optimizer.parameters)
+        num_gaussians = trainer.num_gaussians
         return DeformReport(
             isa=active_isa(),
             threads=threads,
-            kind=_options(load.config).deform.kind,
+            kind=_field(load.config).kind,
             num_gaussians=num_gaussians,
-            num_moving=trainer.model.num_moving(num_gaussians),
+            num_moving=trainer.num_moving,
             steps={name: 1e3 * statistics.median(samples[name]) for name in VARIANTS},
             stages=_field_stages(trainer, rounds),
         )
@@ -138,39 +139,46 @@ def write_report(report: DeformReport, path: Path) -> None:
     write_text(path, json.dumps(asdict(report) | {"field_share": report.field_share}, indent=2) + "\n")
 
 
-def _options(config: Config) -> DynamicModel:
-    if not isinstance(config.model, DynamicModel):
+def _field(config: Config) -> DeformField:
+    field = field_of(config)
+    if field is None:
         raise DyngsError("bench deform needs model.kind=dynamic")
-    return config.model
+    return field
 
 
 def _trainer(load: DeformLoad, variant: str) -> Trainer:
-    """A trainer at the end of its run, its schedules over, in which the right Gaussians move."""
+    """Return a trainer at the end of its run, its schedules over, in which the right Gaussians move."""
     trainer = assemble(load.config)
-    model = trainer.model
-    if not isinstance(model, DynamicScene):
-        raise DyngsError(f"{load.config.data.root}: a capture without times; nothing can move in it")
     if load.run_dir is not None:
         trainer.restore(latest_checkpoint(load.run_dir))
     trainer.done = load.config.train.steps
-    num_gaussians = len(trainer.optimizer.parameters)
+    scene = _dynamic(trainer)
     if variant == VARIANTS[0]:
-        model.field, model.rows = None, NOBODY
+        trainer.scene = replace(scene, field=None, moving=scene.moving[:0])
     elif variant == VARIANTS[2] or load.run_dir is None:
         share = 1.0 if variant == VARIANTS[2] else load.moving_share
-        model.rows = torch.arange(round(share * num_gaussians))
-        setup = FieldSetup(torch.zeros(3), torch.ones(3), len(model.times), len(model.rows), trainer.extent)
-        model.field = new_field(_options(load.config).deform, setup, torch.Generator().manual_seed(0))
+        rows = torch.arange(round(share * len(scene)))
+        setup = FieldSetup(torch.zeros(3), torch.ones(3), len(scene.times), len(rows), trainer.extent)
+        field = new_field(_field(load.config), setup, torch.Generator().manual_seed(0))
+        trainer.scene = replace(scene, field=field, moving=rows)
     return trainer
+
+
+def _dynamic(trainer: Trainer) -> DynamicScene:
+    match trainer.scene:
+        case DynamicScene():
+            return trainer.scene
+        case _:
+            raise DyngsError(f"{trainer.config.data.root}: a capture without times; nothing can move in it")
 
 
 def _field_stages(trainer: Trainer, rounds: int) -> dict[str, float]:
     """Milliseconds of the field's own stages."""
-    model = trainer.model
-    if not isinstance(model, DynamicScene) or model.field is None:
+    scene = _dynamic(trainer)
+    field = scene.field
+    if field is None:
         return dict.fromkeys(FIELD_STAGES, 0.0)
-    field = model.field
-    means = trainer.optimizer.parameters.means.detach()[model.rows]
+    means = scene.gaussians.means.detach()[scene.moving]
     samples: dict[str, list[float]] = {name: [] for name in FIELD_STAGES}
     for number in range(rounds + 1):
         start = time.perf_counter()
@@ -179,7 +187,7 @@ def _field_stages(trainer: Trainer, rounds: int) -> dict[str, float]:
         forward = time.perf_counter() - start
         backward = _seconds(lambda o=outputs: torch.autograd.backward(o, [torch.ones_like(x) for x in o]))
         penalty = _seconds(lambda: [p.backward() for p in field.penalties(0.37).values()])
-        adam = _seconds(lambda: field.learned.step(10**6, 1.0))
+        adam = _seconds(lambda: field.parameters.step(10**6, 1.0))
         if number:
             for name, seconds in zip(FIELD_STAGES, (forward, backward, penalty, adam), strict=True):
                 samples[name].append(seconds)

@@ -9,22 +9,20 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dyngs.config import PruneConfig
+from dyngs.build import restored_scene
 from dyngs.config.io import RESOLVED_NAME, save_config
-from dyngs.data.frame_selection import evenly_spaced
-from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
-from dyngs.prune.score import worth
 from dyngs.prune.selection import best
-from dyngs.prune.stage import PROBED_VIEWS, quality_of, scores_of, survey_of
-from dyngs.runs.checkpoint import COMPACT_NAME, Checkpoint, stored_scene
+from dyngs.prune.stage import default_scores, probe_pictures, quality_of
+from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.folder import SMALL_FOLDER
+from dyngs.scene import Scene
 from dyngs.storage.drawable import drawable
 from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
+from dyngs.storage.measure import storage_plan
 from dyngs.storage.quantize import step_below
-from dyngs.storage.run import precision_of
-from dyngs.storage.tensors import COARSENESS
-from dyngs.train.step import Trainer
+from dyngs.training.state import Checkpoint
+from dyngs.training.trainer import Trainer
 
 KEPT = 0.7
 """Share of the Gaussians that each further trial keeps of those of the one before."""
@@ -57,7 +55,7 @@ class SizeReport:
         if self.num_kept < self.num_gaussians:
             how += [f"{self.num_kept:,} of {self.num_gaussians:,} Gaussians"]
         return (
-            f"budget.max_mb: asked {self.asked:g}, got {self.megabytes:.3g} ({SMALL_FOLDER}/{COMPACT_NAME}"
+            f"budget.max_mb: asked {self.asked:g}, got {self.megabytes:.3g} ({SMALL_FOLDER}/{SCENE_FILE}"
             f"{''.join(f', {x}' for x in how)}); {self.after - self.before:+.2f} dB on training views "
             f"({self.before:.2f} -> {self.after:.2f})"
         )
@@ -76,73 +74,66 @@ class _File:
 def has_file(run_dir: Path) -> bool:
     """Whether the file of a run was written already."""
     folder = run_dir / SMALL_FOLDER
-    return (folder / COMPACT_NAME).is_file() and (folder / RESOLVED_NAME).is_file()
+    return (folder / SCENE_FILE).is_file() and (folder / RESOLVED_NAME).is_file()
 
 
 @torch.no_grad()
 def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeReport:
-    """What became of the file ``small/scene.dyngs`` in ``run_dir``, which is at most ``megabytes`` large.
+    """Write ``scene.dyngs``, at most ``megabytes`` large, into a folder of ``run_dir``, and return what became of it.
 
     Stored as exactly as is usual if that fits. Otherwise more coarsely, and with fewer Gaussians, as long as the latter
     makes training pictures better than the former alone.
 
     Args:
-        trainer: at the end of its run; its Gaussians are left as they are.
+        trainer: at the end of its run; it is left as it is.
         run_dir: of the run.
         megabytes: 1e6 bytes.
 
     Raises:
         DyngsError: no way that was tried fits; the run itself is complete.
     """
-    whole = trainer.checkpoint()
-    scene = stored_scene(whole, trainer.config.model)
-    pictures = [trainer.pictures[i] for i in evenly_spaced(len(trainer.pictures), PROBED_VIEWS)]
-    before = quality_of(trainer, scene, pictures, None)
-    tensors, precision = precision_of(trainer.config, whole, None)
+    whole, scene, config = trainer.checkpoint(), trainer.scene, trainer.config
+    pictures = probe_pictures(trainer)
+    before = quality_of(trainer, scene, pictures)
+    plan = storage_plan(config, whole, scene, None)
+    info = SceneInfo(**asdict(whole.info))
 
-    def stored(checkpoint: Checkpoint, coarseness: Tensor | None, num_kept: int) -> _File | None:
-        state = checkpoint.tensors | ({} if coarseness is None else {COARSENESS: coarseness})
-        info = SceneInfo(**asdict(checkpoint.info))
-        found = _fitted(trainer, info, state, precision.steps, int(1e6 * megabytes))
+    def stored(kept: Scene, coarseness: Tensor | None) -> _File | None:
+        found = _fitted(info, kept, coarseness, plan.precision.steps, int(1e6 * megabytes))
         if found is None:
             return None
         data, coarser = found
-        read = stored_scene(Checkpoint(checkpoint.info, decoded(data).tensors), trainer.config.model)
-        return _File(data, quality_of(trainer, read, pictures, None), num_kept, coarser)
+        read = restored_scene(Checkpoint(whole.info, decoded(data).tensors), config.model)
+        return _File(data, quality_of(trainer, read, pictures), len(kept), coarser)
 
-    chosen = stored(whole, tensors.get(COARSENESS), len(scene))
+    chosen = stored(scene, plan.coarseness)
     if chosen is None or chosen.coarser > 1:
-        unmasked = scene.unmasked() if isinstance(scene, TrainedScene) else scene
-        scores = scores_of(worth(survey_of(trainer, unmasked), slopes=True), PruneConfig())
-        share = KEPT
+        scores, share = default_scores(trainer), KEPT
         while share * len(scene) >= 1:
             kept = best(scores, 1 - share)
-            trainer.keep(kept)
-            coarseness = tensors[COARSENESS][kept] if COARSENESS in tensors else None
-            found = stored(trainer.checkpoint(), coarseness, int(kept.sum()))
-            trainer.restore(whole)
+            found = stored(scene.select(kept), None if plan.coarseness is None else plan.coarseness[kept])
             if chosen is not None and (found is None or found.psnr <= chosen.psnr):
                 break
             chosen, share = found, share * KEPT
     if chosen is None:
         raise DyngsError(f"budget.max_mb={megabytes:g}: what is trained does not fit; the run itself is in {run_dir}")
-    write_scene(run_dir / SMALL_FOLDER / COMPACT_NAME, chosen.data)
-    save_config(trainer.config, run_dir / SMALL_FOLDER / RESOLVED_NAME)
+    write_scene(run_dir / SMALL_FOLDER / SCENE_FILE, chosen.data)
+    save_config(config, run_dir / SMALL_FOLDER / RESOLVED_NAME)
     got = 1e-6 * len(chosen.data)
     return SizeReport(megabytes, got, before, chosen.psnr, len(scene), chosen.num_kept, chosen.coarser)
 
 
 def _fitted(
-    trainer: Trainer, info: SceneInfo, tensors: Mapping[str, Tensor], steps: Mapping[str, float], most: int
+    info: SceneInfo, scene: Scene, coarseness: Tensor | None, steps: Mapping[str, float], most: int
 ) -> tuple[bytes, float] | None:
-    """The bytes of a file of at most ``most``, and the factor on ``steps`` that this took; None: none was found."""
-    num_values = sum(x.numel() for x in drawable(tensors).values())
+    """Return the bytes of a file of at most ``most``, and the factor on ``steps`` that this took; None: none fits."""
+    num_values = sum(x.numel() for x in drawable(scene).values())
     factor, tried = 1.0, set()
     fits: tuple[bytes, float] | None = None
     too_fine = 0.0
     while factor <= COARSEST and factor not in tried and len(tried) < _TRIALS:
         tried.add(factor)
-        data = encoded(info, tensors, trainer.config.model, {n: step_below(factor * s) for n, s in steps.items()})
+        data = encoded(info, scene, {n: step_below(factor * s) for n, s in steps.items()}, coarseness)
         if len(data) <= most:
             fits = data, factor
         else:

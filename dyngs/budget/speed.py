@@ -10,28 +10,26 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from statistics import median
 
 import torch
 from torch import Tensor
 
-from dyngs.budget.count import scene_now, scores_now, stage, training_quality
-from dyngs.budget.limits import CLOSE
-from dyngs.build import training_cameras
-from dyngs.config import Config, DynamicModel
+from dyngs.budget.run import LimitedRun
+from dyngs.config import Config
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.deform.field import FieldSetup
-from dyngs.deform.fields import new_field
-from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
-from dyngs.evaluate.metrics import flip, ssim
-from dyngs.evaluate.report import render_options
 from dyngs.evaluate.temporal import Drawing
+from dyngs.metrics import flip, ssim
 from dyngs.prune.selection import best
-from dyngs.scene import Scene
-from dyngs.train.schedule import scaled
-from dyngs.train.step import Trainer
+from dyngs.prune.stage import default_scores, training_quality
+from dyngs.scene import Scene, render_options
+from dyngs.training.events import Event, StepDone
+from dyngs.training.limits import CLOSE
+from dyngs.training.schedule import scaled
+from dyngs.training.trainer import Trainer
+from dyngs.training.views import training_cameras
 
 FEW = 300
 """Gaussians that say how long drawing takes with hardly any."""
@@ -60,11 +58,10 @@ MAYBE = 0.6
 
 
 @dataclass
-class SpeedLimit:
-    """The speed that a run owes, and what was measured and done for it.
+class Measured:
+    """What was measured and done for a speed.
 
     Attributes:
-        fps: asked for.
         base: seconds of a drawing with hardly any Gaussians.
         seconds: of a drawing when that was measured last.
         cap: Gaussians that there may be by what was measured; 0: as many as are wanted.
@@ -76,7 +73,6 @@ class SpeedLimit:
         removing: seconds that the last removal took; 0: there was none.
     """
 
-    fps: float
     base: float = 0.0
     seconds: float = 0.0
     cap: int = 0
@@ -87,124 +83,146 @@ class SpeedLimit:
     measuring: float = 0.0
     removing: float = 0.0
 
-    def begin(self, trainer: Trainer, stored: Mapping[str, Tensor]) -> None:
-        """Go on from what ``state`` returned, or, without that, measure what is possible; ``trainer`` is as it was.
+
+class SpeedLimit:
+    """Listener that keeps drawing fast enough.
+
+    Args:
+        run: what is limited.
+        fps: training views per second that it owes.
+    """
+
+    def __init__(self, run: LimitedRun, fps: float) -> None:
+        self.run, self.fps, self.found = run, fps, Measured()
+
+    def begin(self) -> None:
+        """Measure what is possible, unless a checkpoint says it, and let the trainer add no more Gaussians than that.
 
         Raises:
             DyngsError: even a few Gaussians take too long; says what is possible.
         """
-        for name in self.state().keys() & stored.keys():
-            setattr(self, name, stored[name].item())
-        if not self.base:
+        found, trainer = self.found, self.run.trainer
+        if not found.base:
             scene = _few(trainer)
             drawing_seconds(trainer, scene, 1)  # what is loaded at first does not count
             start = time.perf_counter()
-            self.base = self.seconds = least_seconds(trainer, scene, POSSIBLE / self.fps)
-            self.measuring = time.perf_counter() - start
-            if self.base > POSSIBLE / self.fps:
-                possible = _rounded_down(ACCEPTED * POSSIBLE / self.base)
+            found.base = found.seconds = least_seconds(trainer, scene, POSSIBLE / self.fps)
+            found.measuring = time.perf_counter() - start
+            if found.base > POSSIBLE / self.fps:
+                possible = _rounded_down(ACCEPTED * POSSIBLE / found.base)
                 raise DyngsError(
-                    f"budget.min_fps={self.fps:g}: {FEW} Gaussians alone are drawn at {1 / self.base:.3g} per second "
+                    f"budget.min_fps={self.fps:g}: {FEW} Gaussians alone are drawn at {1 / found.base:.3g} per second "
                     f"here; {possible:g} would be possible, more with smaller pictures (data.longest_side)"
                 )
-        self.hold(trainer)
+        self.hold()
 
     def state(self) -> dict[str, Tensor]:
-        """What a checkpoint must hold."""
-        measured = {name: value for name, value in asdict(self).items() if name != "fps"}
+        """Return what a checkpoint must hold."""
         return {
-            name: torch.tensor(x, dtype=torch.float64 if isinstance(x, float) else None) for name, x in measured.items()
+            name: torch.tensor(x, dtype=torch.float64 if isinstance(x, float) else None)
+            for name, x in asdict(self.found).items()
         }
 
-    def hold(self, trainer: Trainer) -> None:
-        """Let ``trainer`` add no more Gaussians than measured before."""
-        if self.cap:
-            trainer.densifier.limit(self.cap)
+    def restore(self, stored: Mapping[str, Tensor]) -> None:
+        """Take over what ``state`` returned."""
+        for name in self.state().keys() & stored.keys():
+            setattr(self.found, name, stored[name].item())
 
-    def reserve(self) -> float:
-        """Seconds that measuring at the end, and removing Gaussians then, may take."""
-        measuring = ATTEMPTS * (self.measuring + VIEWS * ROUNDS * (self.seconds - self.base))
-        if self.seconds < MAYBE / self.fps:
-            return measuring
-        return SAFETY * (self.removing or (1 + TRIALS) * measuring + SCORING_DRAWINGS * self.seconds)
+    def hold(self) -> None:
+        """Let the trainer add no more Gaussians than measured before."""
+        if self.found.cap:
+            self.run.trainer.densifier.limit(self.found.cap)
+        self.run.reserve = self._reserve()
 
-    def after_step(self, trainer: Trainer, used: float = 0.0, given: float = math.inf) -> str | None:
-        """A line about what was done to ``trainer`` so that it is drawn fast enough; None: nothing.
+    def __call__(self, event: Event) -> None:
+        """Measure the speed while Gaussians are added; remove some in a late stage, if drawing is too slow."""
+        match event:
+            case StepDone():
+                now = self.run.stage
+                if now > self.found.passed:
+                    self.found.passed = now
+                    # Before the end nothing is removed if the time that is left is not enough to do it twice.
+                    if event.is_last or self.run.given - self.run.used > 2 * self._reserve():
+                        self._remove()
+                elif self._is_growing(event.step):
+                    trainer = self.run.trainer
+                    self.found.seconds = drawing_seconds(trainer, trainer.scene, GROWTH_VIEWS)
+                    self.found.cap = self._allowed(trainer.num_gaussians)
+                    self.hold()
 
-        Args:
-            trainer: after each step.
-            used, given: seconds of the run; before its end nothing is removed if what is left is not enough to do it
-                twice.
-        """
-        config, step, count = trainer.config, trainer.done, len(trainer.optimizer.parameters)
-        steps, strategy = config.train.steps, config.strategy
-        now = stage(config, step, used / given)
-        if now > self.passed:
-            self.passed, last = now, step == config.total_steps
-            return self._slimmed(trainer) if last or given - used > 2 * self.reserve() else None
-        grows = scaled(strategy.start, steps) <= step < scaled(strategy.stop, steps) and count < strategy.growth_limit
-        if grows and (not self.cap or step % max(steps // CHECKS, 1) == 0):
-            self.seconds = drawing_seconds(trainer, scene_now(trainer), GROWTH_VIEWS)
-            self.cap = allowed(self, count, config)
-            self.hold(trainer)
-        return None
-
-    def reached(self, trainer: Trainer) -> str:
-        """The line about ``budget.min_fps`` after a run.
+    def reached(self) -> str:
+        """Return the line about ``budget.min_fps`` after a run.
 
         Raises:
             DyngsError: it is too slow after all.
         """
-        got, count = 1 / self.seconds, len(trainer.optimizer.parameters)
+        found, trainer = self.found, self.run.trainer
+        got, count = 1 / found.seconds, trainer.num_gaussians
         if got < self.fps:
             raise DyngsError(
                 f"budget.min_fps={self.fps:g}: drawn at {got:.3g} per second, and no fewer Gaussians were fast enough; "
                 "the run itself is complete"
             )
         cost = "it cost nothing"
-        if self.before:
-            now = training_quality(trainer)
+        if found.before:
+            now = training_quality(trainer, trainer.scene)
             cost = (
-                f"{self.before:,} -> {count:,} Gaussians; {-self.lost:+.2f} dB on training views when that was done "
-                f"({self.quality:.2f} before, {now:.2f} at the end)"
+                f"{found.before:,} -> {count:,} Gaussians; {-found.lost:+.2f} dB on training views when that was done "
+                f"({found.quality:.2f} before, {now:.2f} at the end)"
             )
-        elif CLOSE * self.cap <= count and 0 < self.cap < trainer.config.strategy.growth_limit:
+        elif CLOSE * found.cap <= count and 0 < found.cap < self.run.trainer.config.strategy.growth_limit:
             cost = f"{count:,} Gaussians; it held growth back; what more would bring is not known"
         return f"budget.min_fps: asked {self.fps:g}, got {got:.3g}; {cost}"
 
-    def _slimmed(self, trainer: Trainer) -> str | None:
-        """A line about the Gaussians that were removed because drawing was too slow; None: it was not."""
-        start, scene = time.perf_counter(), scene_now(trainer)
-        count = len(scene)
-        self.seconds = least_seconds(trainer, scene, ACCEPTED / self.fps)
-        if self.seconds <= ACCEPTED / self.fps:
-            return None
-        quality = training_quality(trainer)
-        found = self._fastest(trainer, scores_now(trainer))
-        if found is None:
-            return None
-        kept, self.seconds = found
-        if not self.before:
-            self.before, self.quality = count, quality
-        trainer.keep(kept)
-        left = int(kept.sum())
-        self.cap = min(left, trainer.config.strategy.growth_limit)
-        self.hold(trainer)
-        now = training_quality(trainer)
-        self.lost += quality - now
-        self.removing = time.perf_counter() - start
-        return (
-            f"step {trainer.done}: budget.min_fps: {count:,} -> {left:,} Gaussians, {1 / self.seconds:.3g} per "
-            f"second; {now - quality:+.2f} dB on training views"
+    def _is_growing(self, step: int) -> bool:
+        """Return whether the speed is to be measured after ``step`` because Gaussians are being added."""
+        steps, strategy = self.run.trainer.config.train.steps, self.run.trainer.config.strategy
+        grows = scaled(strategy.start, steps) <= step < scaled(strategy.stop, steps)
+        due = not self.found.cap or step % max(steps // CHECKS, 1) == 0
+        return grows and due and self.run.trainer.num_gaussians < strategy.growth_limit
+
+    def _reserve(self) -> float:
+        """Return the seconds that measuring at the end, and removing Gaussians then, may take."""
+        found = self.found
+        measuring = ATTEMPTS * (found.measuring + VIEWS * ROUNDS * (found.seconds - found.base))
+        if found.seconds < MAYBE / self.fps:
+            return measuring
+        return SAFETY * (found.removing or (1 + TRIALS) * measuring + SCORING_DRAWINGS * found.seconds)
+
+    def _remove(self) -> None:
+        """Remove Gaussians if drawing is too slow."""
+        found, trainer, start = self.found, self.run.trainer, time.perf_counter()
+        count = trainer.num_gaussians
+        found.seconds = least_seconds(trainer, trainer.scene, ACCEPTED / self.fps)
+        self.run.reserve = self._reserve()
+        if found.seconds <= ACCEPTED / self.fps:
+            return
+        fastest = self._fastest(default_scores(trainer))
+        if fastest is None:
+            return
+        kept, found.seconds = fastest
+        before, after = self.run.remove(kept)
+        if not found.before:
+            found.before, found.quality = count, before
+        left = trainer.num_gaussians
+        found.cap = min(left, self.run.trainer.config.strategy.growth_limit)
+        found.lost += before - after
+        found.removing = time.perf_counter() - start
+        self.hold()
+        self.run.say(
+            f"step {trainer.done}: budget.min_fps: {count:,} -> {left:,} Gaussians, {1 / found.seconds:.3g} per "
+            f"second; {after - before:+.2f} dB on training views"
         )
 
-    def _fastest(self, trainer: Trainer, scores: Tensor) -> tuple[Tensor, float] | None:
-        """Which of the Gaussians (N,) may stay, those of highest score, and the seconds of a drawing; None: none found.
+    def _fastest(self, scores: Tensor) -> tuple[Tensor, float] | None:
+        """Return which of the Gaussians (N,) may stay, those of highest score, and the seconds of a drawing.
 
         Their number is looked for between one that is fast enough and one that is not, as if time were linear in it.
+        None: no number is fast enough.
         """
-        whole, goal = trainer.checkpoint(), GOAL / self.fps
-        (fine, fine_seconds), (slow, slow_seconds) = (0, min(self.base, POSSIBLE * goal)), (len(scores), self.seconds)
+        trainer, goal = self.run.trainer, GOAL / self.fps
+        fine, fine_seconds = 0, min(self.found.base, POSSIBLE * goal)
+        slow, slow_seconds = len(scores), self.found.seconds
         found = None
         for _ in range(TRIALS):
             wanted = (1 + CLOSE_ENOUGH) / 2 * goal
@@ -213,9 +231,7 @@ class SpeedLimit:
             if count <= fine:
                 break
             kept = best(scores, 1 - count / len(scores))
-            trainer.keep(kept)
-            seconds = least_seconds(trainer, scene_now(trainer), goal)
-            trainer.restore(whole)
+            seconds = least_seconds(trainer, trainer.scene.select(kept), goal)
             if seconds > goal:
                 slow, slow_seconds = count, seconds
                 continue
@@ -224,11 +240,15 @@ class SpeedLimit:
                 break
         return found
 
+    def _allowed(self, count: int) -> int:
+        """Return how many Gaussians there may be before pruning, if ``count`` are drawn in ``found.seconds``."""
+        return allowed(self.found, self.fps, count, self.run.trainer.config)
 
-def allowed(limit: SpeedLimit, count: int, config: Config) -> int:
-    """How many Gaussians there may be before ``prune.share``, if ``count`` are drawn in ``limit.seconds``."""
-    most, left = config.strategy.growth_limit, GOAL / limit.fps - limit.base
-    each = (limit.seconds - limit.base) / max(count, 1)
+
+def allowed(found: Measured, fps: float, count: int, config: Config) -> int:
+    """Return how many Gaussians there may be before pruning, if ``count`` are drawn in ``found.seconds``."""
+    most, left = config.strategy.growth_limit, GOAL / fps - found.base
+    each = (found.seconds - found.base) / max(count, 1)
     if each <= 0:
         return most
     return max(1, min(most, int(left / each / (1 - config.prune.share))))
@@ -268,21 +288,9 @@ def least_seconds(trainer: Trainer, scene: Scene, limit: float) -> float:
 
 
 def _few(trainer: Trainer) -> Scene:
-    """``FEW`` of the Gaussians of ``trainer``, which a new field moves where times differ."""
-    whole, count = trainer.checkpoint(), len(trainer.optimizer.parameters)
-    kept = torch.zeros(count, dtype=torch.bool)
-    kept[list(evenly_spaced(count, FEW))] = True
-    trainer.keep(kept)
-    scene = scene_now(trainer)
-    trainer.restore(whole)
-    model = trainer.config.model
-    if isinstance(scene, TrainedScene) and scene.is_still and isinstance(model, DynamicModel) and scene.times:
-        moving = len(scene)
-        center, size = scene.gaussians.means.mean(0), torch.full((3,), trainer.extent)
-        setup = FieldSetup(center, size, len(scene.times), moving, trainer.extent)
-        field = new_field(model.deform, setup, torch.Generator())
-        scene = replace(scene, rows=torch.arange(moving), field=field)
-    return scene
+    """Return ``FEW`` of the Gaussians of ``trainer``, all of them moving if any will move."""
+    kept = torch.tensor(evenly_spaced(trainer.num_gaussians, FEW))
+    return trainer.training.all_moving(trainer.scene.select(kept), trainer.extent)
 
 
 def _rounded_down(x: float) -> float:

@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from statistics import fmean
 
+from torch import Tensor
+
+from dyngs.budget.run import LimitedRun
 from dyngs.build import assemble
-from dyngs.config import AutoColour, Config, DynamicModel
-from dyngs.deform.model import DynamicScene
+from dyngs.config import Config
+from dyngs.config.io import RESOLVED_NAME, save_config
+from dyngs.config.kinds import harmonics_measured_after
 from dyngs.errors import DyngsError
-from dyngs.static.rates import Rates
-from dyngs.train.schedule import deform_schedule, picture_divisor, scaled
-from dyngs.train.step import Trainer
+from dyngs.training.events import Event, StepDone
+from dyngs.training.schedule import motion_begins_after, picture_divisor, scaled
+from dyngs.training.trainer import Trainer
 
 FEWEST_STEPS = 200
 """Where not even so many fit, the run is refused."""
@@ -34,68 +38,105 @@ GROWTH, MOTION = 1.25, 2.0
 _SAMPLES = 64
 
 
-@dataclass
 class Deadline:
-    """The time that a run has, and how fast it goes.
+    """Listener that ends a run in time.
 
-    Attributes:
-        seconds: that it has.
+    Args:
+        run: what is limited.
         most_steps: that are wanted if they fit.
         fits: the number of steps may change; otherwise only the end of the time ends the run.
         refit_seconds: what preparing the run anew took last.
+        save: writes a checkpoint.
+        on_refit: called with the new trainer, after the run goes on with it.
+
+    Attributes:
         save_seconds: what saving took last.
-        reserve: seconds that are needed for something else than steps before the end.
     """
 
-    seconds: float
-    most_steps: int
-    fits: bool
-    refit_seconds: float = 0.0
-    save_seconds: float = 0.0
-    reserve: float = 0.0
-    _since: tuple[int, float] | None = None
+    def __init__(
+        self,
+        run: LimitedRun,
+        most_steps: int,
+        *,
+        fits: bool,
+        refit_seconds: float,
+        save: Callable[[], None],
+        on_refit: Callable[[], None],
+    ) -> None:
+        self.run, self.most_steps, self.fits = run, most_steps, fits
+        self.refit_seconds, self.save_seconds = refit_seconds, 0.0
+        self._save, self._on_refit = save, on_refit
+        self._since: tuple[int, float] | None = None
+
+    def __call__(self, event: Event) -> None:
+        """Go on, after a step, with as many steps as fit into the time; with none where it is over."""
+        match event:
+            case StepDone():
+                config, done = self.run.config, event.step
+                if done >= config.train.steps:
+                    return
+                found = self.steps(config, done, self.run.used)
+                if found != config.train.steps:
+                    self._go_on(found, done)
 
     def begin(self, done: int, now: float) -> None:
         """Measure the rate from here on: after ``done`` steps, ``now`` seconds after the beginning."""
         self._since = done, now
 
     def steps(self, config: Config, done: int, now: float) -> int:
-        """How many steps the run should have after ``done`` in ``now`` seconds; ``done`` where the time is over.
+        """Return how many steps the run should have after ``done`` in ``now`` seconds; ``done`` where the time is over.
 
         Args:
             config: of the run as it is; its own number of steps is returned where it should stay.
         """
-        total = config.train.steps
+        total, given, reserve = config.train.steps, self.run.given, self.run.reserve
         if self._since is None:
             self.begin(done, now)
             return total
         since, then = self._since
         pace = (now - then) / max(done - since, 1)
-        if now + 2 * pace + self.save_seconds + self.reserve > self.seconds:
+        if now + 2 * pace + self.save_seconds + reserve > given:
             return done
         if not self.fits or done - since < max(total // FITS, 10) or done >= total:
             return total
         self.begin(done, now)
-        left = AIM * self.seconds - now - self.refit_seconds - self.reserve
+        left = AIM * given - now - self.refit_seconds - reserve
         found = fitting_steps(config, done, pace, left, self.most_steps)
         worth_it = left > 0 and abs(found - total) > SMALLEST_CHANGE * total
         return found if worth_it and same_phase(config, with_steps(config, found), done) else total
 
-    def kept(self, done: int, now: float) -> str:
-        """The line about ``budget.max_minutes`` after a run of ``done`` steps that took ``now`` seconds."""
-        asked = f"asked {self.seconds / 60:g}, got {now / 60:.2f}"
+    def state(self) -> dict[str, Tensor]:
+        """Return nothing: a resumed run keeps its number of steps."""
+        return {}
+
+    def restore(self, stored: Mapping[str, Tensor]) -> None:
+        """Do nothing."""
+
+    def reached(self) -> str:
+        """Return the line about ``budget.max_minutes`` after a run."""
+        done = self.run.trainer.done
+        asked = f"asked {self.run.given / 60:g}, got {self.run.used / 60:.2f}"
         if not self.fits:
             return f"budget.max_minutes: {asked}: {done:,} steps"
         cost = "; what more would bring is not known" if done < self.most_steps else ": all, it cost nothing"
         return f"budget.max_minutes: {asked}: {done:,} of {self.most_steps:,} steps{cost}"
 
-
-def deadline_of(config: Config, most_steps: int | None, refit_seconds: float = 0.0) -> Deadline | None:
-    """The deadline of a run, if it has one; ``most_steps``: that are wanted, None where their number is settled."""
-    minutes = config.budget.max_minutes
-    if minutes is None:
-        return None
-    return Deadline(60 * minutes, most_steps or config.train.steps, most_steps is not None, refit_seconds)
+    def _go_on(self, steps: int, done: int) -> None:
+        run = self.run
+        run.config = with_steps(run.config, steps)
+        if steps > done:
+            start = run.used
+            run.exchange(refitted(run.trainer, run.config))
+            self._on_refit()
+            prepared = run.used
+            self._save()  # a resumed run goes on from here with the new schedules
+            now = run.used
+            self.refit_seconds, self.save_seconds = prepared - start, now - prepared
+            self.begin(done, now)
+        else:
+            run.trainer.config = with_steps(run.trainer.config, done)
+        save_config(run.config, run.folder / RESOLVED_NAME)
+        run.loop.expect(run.config.total_steps)
 
 
 def with_steps(config: Config, steps: int) -> Config:
@@ -143,9 +184,8 @@ def refitted(trainer: Trainer, config: Config) -> Trainer:
     fitted = assemble(config, restored=True)
     fitted.pictures, fitted.bad_gradients = trainer.pictures, trainer.bad_gradients
     fitted.restore(trainer.checkpoint())
-    old, new, step = trainer.model, fitted.model, trainer.done + 1
-    if isinstance(old, DynamicScene) and isinstance(new, DynamicScene) and new.field is not None:
-        new.field.extend(old.window.bounds(step), new.window.bounds(step))
+    step = trainer.done + 1
+    fitted.training.extend(fitted.scene, trainer.training.window(step), step)
     return fitted
 
 
@@ -170,7 +210,8 @@ def seconds_left(config: Config, done: int, steps: int, pace: float) -> float:
     weight = fmean(_weight(picture_divisor(options, step)) for step in sampled) / now
     if done < scaled(config.strategy.stop, steps):
         weight *= GROWTH
-    if isinstance(config.model, DynamicModel) and done < deform_schedule(config.model, Rates(steps)).fine:
+    motion = motion_begins_after(config, steps)
+    if motion is not None and done < motion:
         weight *= MOTION
     return left * pace * weight
 
@@ -182,13 +223,8 @@ def same_phase(old: Config, new: Config, done: int) -> bool:
 
 def _happened(config: Config, done: int) -> tuple[bool, ...]:
     """Which of the things that happen once in a run have happened after ``done`` steps."""
-    steps, happened = config.train.steps, []
-    if isinstance(config.model, DynamicModel):
-        schedule = deform_schedule(config.model, Rates(steps))
-        happened += [done >= schedule.fine]
-    if isinstance(config.colour, AutoColour):
-        happened += [done >= max(1, round(config.colour.measure_at * steps))]
-    return tuple(happened)
+    once = motion_begins_after(config, config.train.steps), harmonics_measured_after(config)
+    return tuple(done >= step for step in once if step is not None)
 
 
 def _weight(divisor: int) -> float:

@@ -108,7 +108,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _export_dyngs(arguments: argparse.Namespace) -> int:
     """Write the run as a .dyngs file and print how much its pictures change."""
-    from dyngs.storage.run import SMALLEST_CHANGE, write_compact
+    from dyngs.export.scene_file import write_scene_file
+    from dyngs.storage.measure import SMALLEST_CHANGE
 
     options = ("time", "times", "motion", "static", "dynamic")
     given = [name for name in options if getattr(arguments, name) not in (None, False)]
@@ -122,7 +123,7 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
         raise DyngsError(
             f"{out}: --format dyngs writes a folder (config.yaml and scene.dyngs); give --out {out.with_suffix('')}"
         )
-    written = write_compact(arguments.run_dir, out, max_change)
+    written = write_scene_file(arguments.run_dir, out, max_change)
     change = written.precision.change
     if change is None:
         warning = "the capture cannot be read: quantisation steps are fixed, and the change of pictures is not measured"

@@ -47,7 +47,7 @@ def parse_views(text: str) -> int | tuple[str, ...]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Predict, and say how long it took and what to do next."""
-    from dyngs.train.predictor_run import predict_person
+    from dyngs.api.predict import predict_person
 
     out: Path = arguments.out
     made = predict_person(arguments.network, arguments.capture, out, arguments.views)

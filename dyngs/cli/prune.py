@@ -11,7 +11,7 @@ from dyngs.cli.arguments import threads
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dyngs.prune.run import Cost
+    from dyngs.api.prune import Cost
 
 _EPILOG = """\
 examples:
@@ -58,20 +58,18 @@ def run(arguments: argparse.Namespace) -> int:
     """Prune, fine-tune, compare with the run before, and print a table."""
     from rich.console import Console
 
-    from dyngs.deform.trained import TrainedScene
-    from dyngs.prune.run import compact_run, compared
+    from dyngs.api.prune import compared, prune_run
     from dyngs.runs.checkpoint import load_run
 
     keys = {"prune": "share", "score": "score", "max_loss": "max_loss", "masks": "mask_times", "steps": "steps"}
     asked = {key: getattr(arguments, option) for option, key in keys.items()}
     overrides = [f"prune.{key}={value}" for key, value in asked.items() if value is not None]
     overrides += [f"run.threads={arguments.threads}", *arguments.overrides]
-    folder = compact_run(arguments.run_dir, arguments.out, overrides)
+    folder = prune_run(arguments.run_dir, arguments.out, overrides)
     before, after = compared(arguments.run_dir, folder, arguments.threads)
     Console().print(cost_table(before, after))
     pruned = load_run(folder)
-    has_masks = isinstance(pruned.scene, TrainedScene) and pruned.scene.masks is not None
-    if pruned.config.prune.mask_times > 1 and not has_masks:
+    if pruned.config.prune.mask_times > 1 and pruned.scene.masks is None:
         print("note: --masks was ignored; they are for scenes in which a deformation field moves something")
     print(f"written: {folder}\nnext:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/pictures")
     return 0

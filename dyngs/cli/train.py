@@ -41,7 +41,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def run(arguments: argparse.Namespace) -> int:
     """Train, and say what to do next."""
     config = parse_config(arguments.overrides, arguments.resume)
-    from dyngs.train.trainer import train
+    from dyngs.api.train import train
 
     folder = train(config, resume_from=arguments.resume)
     for line in _about_motion(folder, config):

@@ -19,6 +19,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.shading import Sight, num_inputs, shading_inputs
 from dyngs.rendering import Shader
+from dyngs.state import Role, State, with_role
 from dyngs.tensor_checks import require_positive, require_tensor
 
 
@@ -56,6 +57,13 @@ class ColourNetwork:
     def num_values(self) -> int:
         """How many numbers it holds."""
         return self.box.numel() + sum(layer.weight.numel() + layer.bias.numel() for layer in self.layers)
+
+    def state(self) -> State:
+        """Return weights, and what their inputs are; ``network_of`` reads it."""
+        tensors = {"box": self.box, "sees": torch.tensor([self.sees_time, self.sees_normals], device="cpu")}
+        for i, layer in enumerate(self.layers):
+            tensors |= {f"weight{i}": layer.weight.detach(), f"bias{i}": layer.bias.detach()}
+        return with_role(tensors, Role.SHARED)
 
     def shader(self, time: float | None, frame: Frame | None = None) -> Shader:
         """Colours at ``time`` (clamped to [0, 1], None is 0), for ``render``; ``frame`` for Gaussians on a body."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -10,8 +9,9 @@ from torch import Tensor
 
 from dyngs.config import FieldSection
 from dyngs.deform.field import Offsets
-from dyngs.deform.learned import LearnedTensors
+from dyngs.initialisation import glorot
 from dyngs.ops.perceptron import Layer, perceptron
+from dyngs.parameters import Parameters
 
 
 class Decoder:
@@ -37,15 +37,14 @@ class Decoder:
         for i in range(last + 1):
             fan_in = self.widths[i] + (self.widths[0] if i == self.skip else 0)
             fan_out = self.widths[i + 1]
-            bound = 0.0 if i == last else math.sqrt(6 / (fan_in + fan_out))
-            uniform = torch.rand((fan_out, fan_in), generator=generator)
-            values[f"weight{i}"] = (2 * uniform - 1) * bound
+            weight = glorot(fan_in, fan_out, generator)
+            values[f"weight{i}"] = torch.zeros_like(weight) if i == last else weight
             values[f"bias{i}"] = torch.zeros(fan_out)
         return values
 
-    def __call__(self, features: Tensor, learned: LearnedTensors) -> Tensor:
-        """(M, K) outputs of ``features`` (M, num_inputs) with the weights in ``learned``."""
-        layers = [Layer(learned[f"weight{i}"], learned[f"bias{i}"]) for i in range(len(self.widths) - 1)]
+    def __call__(self, features: Tensor, parameters: Parameters) -> Tensor:
+        """(M, K) outputs of ``features`` (M, num_inputs) with the weights in ``parameters``."""
+        layers = [Layer(parameters[f"weight{i}"], parameters[f"bias{i}"]) for i in range(len(self.widths) - 1)]
         return perceptron(features, layers, skip=self.skip)
 
 

@@ -5,16 +5,21 @@ Local letters: M moving Gaussians, a subset of the N of a scene.
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
-from dyngs.deform.learned import LearnedTensors
-from dyngs.gaussians import Gaussians
+from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.ops.offsets import add_offsets_
 from dyngs.ops.registration import has_kernel
+from dyngs.parameters import Parameters
+from dyngs.state import State, moved_to, part_of, prefixed
+
+F = TypeVar("F", bound="NetworkField")
 
 MAX_KEY_TIMES = 256
 """Longer clips want a choice of their own: memory grows with it."""
@@ -69,13 +74,17 @@ class FieldSetup:
 class DeformationField(Protocol):
     """Offsets of canonical Gaussians over time, the identity before training."""
 
-    learned: LearnedTensors
+    setup: FieldSetup
+    parameters: Parameters
     """All that is optimised."""
-    buffers: dict[str, Tensor]
-    """What a checkpoint must hold besides."""
+
+    @property
+    def num_values(self) -> int:
+        """Numbers that the field holds."""
+        ...
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        """What moves at ``time`` in [0, 1].
+        """Return the offsets at ``time``.
 
         Args:
             means: (M, 3) canonical, of all moving Gaussians in order.
@@ -85,16 +94,77 @@ class DeformationField(Protocol):
         ...
 
     def penalties(self, time: float) -> dict[str, Tensor]:
-        """Differentiable regularizers of the field itself, weighted, by name; some look at ``time`` only."""
+        """Return differentiable regularizers of the field itself, weighted, by name; some look at ``time`` only."""
         ...
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        """Continue to the times in ``soon``, which are trained on next, what was learned for those in ``seen``."""
+        """Continue what was learned for the times in ``seen`` to those in ``soon``, which are trained on next."""
         ...
 
-    def select(self, index: Tensor, is_new: Tensor) -> None:
-        """Follow a change of the moving set: row i of the new one descends from row ``index[i]`` of the old one."""
+    def edited(self, edit: TopologyEdit) -> DeformationField:
+        """Return the field after an edit of the moving Gaussians: row i descends from the old row ``edit.source[i]``."""
         ...
+
+    def regroup(self) -> None:
+        """Find out anew, when next needed, what depends on which Gaussians there are."""
+        ...
+
+    def state(self) -> State:
+        """Return what ``restored`` needs, but for the setup."""
+        ...
+
+    def restored(self, tensors: Mapping[str, Tensor]) -> DeformationField:
+        """Return the field of what ``state`` returned, with the options and the setup of this one.
+
+        Raises:
+            KeyError: a tensor is missing.
+            ValueError: one is not as a field of these options has it.
+        """
+        ...
+
+    def to(self, device: torch.device | str) -> DeformationField:
+        """Return the field on ``device``."""
+        ...
+
+
+class NetworkField:
+    """What fields whose tensors belong to no single Gaussian have in common."""
+
+    setup: FieldSetup
+    parameters: Parameters
+
+    @property
+    def num_values(self) -> int:
+        return self.parameters.num_values
+
+    def penalties(self, time: float) -> dict[str, Tensor]:
+        return {}
+
+    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
+        """Do nothing: the field continues by itself."""
+
+    def edited(self: F, edit: TopologyEdit) -> F:
+        return self
+
+    def regroup(self) -> None:
+        """Do nothing: nothing depends on which Gaussians there are."""
+
+    def state(self) -> State:
+        return prefixed("learned", self.parameters.state())
+
+    def restored(self: F, tensors: Mapping[str, Tensor]) -> F:
+        return self.with_parameters(self.parameters.restored(part_of(tensors, "learned")))
+
+    def to(self: F, device: torch.device | str) -> F:
+        field = self.with_parameters(self.parameters.to(device))
+        field.setup = moved_to(self.setup, device)
+        return field
+
+    def with_parameters(self: F, parameters: Parameters) -> F:
+        """Return a copy with other ``parameters``."""
+        field = copy.copy(self)
+        field.parameters = parameters
+        return field
 
 
 def key_times(num_times: int) -> int:

@@ -9,15 +9,15 @@ from torch import Tensor
 
 from dyngs.config import HexplaneField
 from dyngs.deform.decoder import Decoder, head_sizes, split_heads
-from dyngs.deform.field import FieldSetup, Offsets, chosen, key_times
-from dyngs.deform.learned import LearnedTensors
+from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen, key_times
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
+from dyngs.parameters import Parameters
 
 SPACE_RANGE = (0.1, 0.5)
 """Planes over space start uniformly in it, those with time at 1 (Wu et al.): the product does not depend on time."""
 
 
-class Hexplane:
+class Hexplane(NetworkField):
     """Features from six planes per level, decoded into offsets.
 
     Time covers the planes' whole range, and the decoder's last layer starts at zero, so that the field starts as the
@@ -27,7 +27,6 @@ class Hexplane:
 
     def __init__(self, options: HexplaneField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup
-        self.buffers: dict[str, Tensor] = {}
         tensors: dict[str, Tensor] = {}
         rows = time_rows(options, setup.num_times)
         for level, multiplier in enumerate(options.levels):
@@ -41,18 +40,18 @@ class Hexplane:
         rates = dict.fromkeys(tensors, options.lr_planes * setup.extent)
         weights = self.decoder.start_values(generator)
         rates |= dict.fromkeys(weights, options.lr_decoder * setup.extent)
-        self.learned = LearnedTensors(tensors | weights, rates, options.lr_decay)
+        self.parameters = Parameters(tensors | weights, rates, options.lr_decay)
 
     @property
     def levels(self) -> list[PlaneLevel]:
         indices = range(len(self.options.levels))
-        return [PlaneLevel(self.learned[f"space{i}"], self.learned[f"time{i}"]) for i in indices]
+        return [PlaneLevel(self.parameters[f"space{i}"], self.parameters[f"time{i}"]) for i in indices]
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """See ``DeformationField.offsets``; no gradient flows to ``means``."""
         coords = self.setup.normalized(chosen(means.detach(), rows))
         features = hexplane_features(coords, time, self.levels)
-        return split_heads(self.decoder(features, self.learned), self.options)
+        return split_heads(self.decoder(features, self.parameters), self.options)
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         options = self.options
@@ -67,9 +66,6 @@ class Hexplane:
             low, high = max(math.floor(seen[0] * last), 0), min(math.ceil(seen[1] * last), last)
             planes[:, max(math.floor(soon[0] * last), 0) : low] = planes[:, low, None]
             planes[:, high + 1 : math.ceil(soon[1] * last) + 1] = planes[:, high, None]
-
-    def select(self, index: Tensor, is_new: Tensor) -> None:
-        """Nothing: no part of the field belongs to one Gaussian."""
 
 
 def time_rows(options: HexplaneField, num_times: int) -> int:

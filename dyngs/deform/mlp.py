@@ -7,14 +7,14 @@ from torch import Tensor
 
 from dyngs.config import MlpField
 from dyngs.deform.decoder import Decoder, split_heads
-from dyngs.deform.field import FieldSetup, Offsets, chosen
-from dyngs.deform.learned import LearnedTensors
+from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen
+from dyngs.parameters import Parameters
 
 SKIP_LAYER = 5
 """The input is fed once more into this layer (counted from 0), where there are that many hidden ones."""
 
 
-class Mlp:
+class Mlp(NetworkField):
     """Offsets by a deep network; starts as the identity, because its last layer starts at zero.
 
     Differs from Deformable-3DGS in two small ways: time is encoded like position instead of by a network of its own,
@@ -23,28 +23,18 @@ class Mlp:
 
     def __init__(self, options: MlpField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup
-        self.buffers: dict[str, Tensor] = {}
         inputs = 3 * (1 + 2 * options.space_frequencies) + 1 + 2 * options.time_frequencies
         skip = SKIP_LAYER if options.depth > SKIP_LAYER else None
         self.decoder = Decoder(inputs, [options.width] * options.depth, options, skip=skip)
         weights = self.decoder.start_values(generator)
-        self.learned = LearnedTensors(weights, dict.fromkeys(weights, options.lr), options.lr_decay)
+        self.parameters = Parameters(weights, dict.fromkeys(weights, options.lr), options.lr_decay)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """See ``DeformationField.offsets``; no gradient flows to ``means``, as in the paper."""
         space = encoded(self.setup.normalized(chosen(means.detach(), rows)), self.options.space_frequencies)
         moment = encoded(space.new_full((1, 1), time), self.options.time_frequencies)
         features = torch.cat([space, moment.expand(len(space), -1)], dim=1)
-        return split_heads(self.decoder(features, self.learned), self.options)
-
-    def penalties(self, time: float) -> dict[str, Tensor]:
-        return {}
-
-    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        """Nothing: the field continues by itself."""
-
-    def select(self, index: Tensor, is_new: Tensor) -> None:
-        """Nothing: no part of the field belongs to one Gaussian."""
+        return split_heads(self.decoder(features, self.parameters), self.options)
 
 
 def encoded(x: Tensor, num_frequencies: int) -> Tensor:

@@ -7,8 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.static.densify import EditResult
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 
 BOX_MARGIN = 1.1
 SEED_SIZE = 0.3

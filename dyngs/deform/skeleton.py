@@ -10,6 +10,7 @@ Local letters: S nodes, P control points.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 
@@ -18,9 +19,11 @@ from torch import Tensor
 
 from dyngs.config import ControlNodesField
 from dyngs.deform.decoder import head_sizes
-from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, Offsets
-from dyngs.deform.learned import LearnedTensors
+from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, NetworkField, Offsets
 from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, spread_out, turned
+from dyngs.gaussians import TopologyEdit
+from dyngs.parameters import Parameters
+from dyngs.state import Role, State, StateTensor, moved_to, part_of, prefixed
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
 NOTHING = torch.zeros(0, 3)
@@ -30,7 +33,7 @@ PIECES_PER_TIME = 0.3
 """Pieces of the splines per training time. With more, poses follow single pictures; with fewer, they lag behind."""
 
 
-class Skeleton:
+class Skeleton(NetworkField):
     """Offsets of nodes, uniform cubic B-splines of time, blended into those of the Gaussians that follow them.
 
     Nodes are placed when first needed. Whenever the set of Gaussians has changed, nodes that nothing follows are
@@ -40,7 +43,7 @@ class Skeleton:
     def __init__(self, options: ControlNodesField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup
         self.num_pieces = options.pieces or min(max(1, round(PIECES_PER_TIME * setup.num_times)), MAX_KEY_TIMES)
-        self.buffers: dict[str, Tensor] = {"positions": NOTHING}
+        self.buffers = {"positions": NOTHING}
         sizes = head_sizes(options)
         tensors = {name: torch.zeros(0, self.num_points, size) for name, size in sizes.items()}
         rates = {
@@ -50,18 +53,14 @@ class Skeleton:
             "logit_opacities": options.lr_opacities,
             "colors": options.lr_colors,
         }
-        self.learned = LearnedTensors(tensors, {name: rates[name] for name in sizes}, options.lr_decay)
+        self.parameters = Parameters(tensors, {name: rates[name] for name in sizes}, options.lr_decay)
 
-    def load_state(self, learned: Mapping[str, Tensor], buffers: Mapping[str, Tensor]) -> None:
-        """Take over the state of ``learned`` and the buffers of a skeleton.
-
-        Raises:
-            KeyError: a tensor lacks.
-            ValueError: they do not fit together.
-        """
+    def restored(self, tensors: Mapping[str, Tensor]) -> Skeleton:
+        buffers = part_of(tensors, "buffers")
         count, moving = len(buffers["positions"]), self.setup.num_moving
         require_tensor("positions", buffers["positions"], (count, 3))
-        self.learned.load_state(learned, dict.fromkeys(head_sizes(self.options), count))
+        learned = part_of(tensors, "learned")
+        field = self.with_parameters(self.parameters.restored(learned, dict.fromkeys(head_sizes(self.options), count)))
         if count:
             require_positive("radii", require_tensor("radii", buffers["radii"], (count,)))
         for name, length in (("followed", moving), ("neighbours", count)):
@@ -69,7 +68,33 @@ class Skeleton:
                 require_indices(name, buffers[name], (length, None), count)
         if "followed" in buffers and not 1 <= buffers["followed"].shape[1] <= FOLLOWED:
             raise ValueError(f"'followed' names {buffers['followed'].shape[1]} nodes for each Gaussian")
-        self.buffers = dict(buffers)
+        field.buffers = buffers
+        return field
+
+    def state(self) -> State:
+        own = {"followed": Role.PER_MOVING, "neighbours": Role.TRAINING}
+        buffers = {name: StateTensor(x, own.get(name, Role.SHARED)) for name, x in self.buffers.items()}
+        return super().state() | prefixed("buffers", buffers)
+
+    @property
+    def num_values(self) -> int:
+        return self.parameters.num_values + sum(x.numel() for x in self.buffers.values())
+
+    def edited(self, edit: TopologyEdit) -> Skeleton:
+        field = copy.copy(self)
+        field.buffers = dict(self.buffers)
+        if "followed" in field.buffers:
+            field.buffers["followed"] = edit.apply(field.buffers["followed"])
+        return field
+
+    def regroup(self) -> None:
+        """Place nodes anew, and find out which of them Gaussians follow, when that is next needed."""
+        self.buffers.pop("followed", None)
+
+    def to(self, device: torch.device | str) -> Skeleton:
+        field = super().to(device)
+        field.buffers = moved_to(self.buffers, device)
+        return field
 
     @property
     def num_points(self) -> int:
@@ -91,7 +116,7 @@ class Skeleton:
             return {}
         penalties = {}
         if self.options.smoothness:
-            bend = self.learned["means"].diff(n=2, dim=1) / self.buffers["radii"][:, None, None]
+            bend = self.parameters["means"].diff(n=2, dim=1) / self.buffers["radii"][:, None, None]
             penalties["node acceleration"] = self.options.smoothness * bend.square().mean()
         if self.options.rigidity:
             penalties["node rigidity"] = self.options.rigidity * self._strain(self._at(time))
@@ -114,10 +139,6 @@ class Skeleton:
             x[:, high + 1 :] = x[:, high, None] + after * ((x[:, high] - x[:, high - reach]) / max(reach, 1))[:, None]
             x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
 
-    def select(self, index: Tensor, is_new: Tensor) -> None:
-        """Find out anew, when next needed, what follows what."""
-        self.buffers.pop("followed", None)
-
     def _at(self, time: float) -> Offsets:
         """The nodes' offsets at ``time``."""
         place = min(max(time, 0.0), 1.0) * self.num_pieces
@@ -130,7 +151,7 @@ class Skeleton:
 
     def _splines(self) -> dict[str, Tensor]:
         """Head to its (S, P, size) values."""
-        return {name: self.learned[name] for name in head_sizes(self.options)}
+        return {name: self.parameters[name] for name in head_sizes(self.options)}
 
     def _nodes(self, means: Tensor) -> Nodes:
         if "followed" not in self.buffers:
@@ -148,9 +169,9 @@ class Skeleton:
         source = torch.cat([kept, torch.zeros(len(added), dtype=torch.long)])
         is_new = torch.arange(len(source)) >= len(kept)
         started = self._motion_at(added)
-        for name in head_sizes(self.options):
-            values = torch.cat([self.learned[name].detach()[kept], started[name]])
-            self.learned.rearrange(name, values, source, is_new)
+        own = self._splines()
+        values = {name: torch.cat([x.detach()[kept], started[name]]) for name, x in own.items()}
+        self.parameters = self.parameters.rearranged(values, source, is_new)
         nodes = nodes_at(torch.cat([old[kept], added]), means)
         around = nodes_at(nodes.positions, nodes.positions).followed[:, 1:]
         self.buffers = {

@@ -12,39 +12,33 @@ from torch import Tensor
 
 from dyngs.config import TrajectoryField
 from dyngs.deform.decoder import head_sizes, split_heads
-from dyngs.deform.field import FieldSetup, Offsets, chosen
-from dyngs.deform.learned import LearnedTensors
+from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen
+from dyngs.gaussians import TopologyEdit
+from dyngs.parameters import Parameters
+from dyngs.state import Role
 
 
-class Trajectory:
+class Trajectory(NetworkField):
     """Offsets as sums of basis functions with coefficients per Gaussian, all zero at the start."""
 
     def __init__(self, options: TrajectoryField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup
-        self.buffers: dict[str, Tensor] = {}
         self.num_terms = options.polynomial + 2 * options.fourier
         sizes = head_sizes(options)
         tensors = {name: torch.zeros(setup.num_moving, self.num_terms, size) for name, size in sizes.items()}
         rates = dict.fromkeys(sizes, options.lr_quats)
         rates["means"] = options.lr_means * setup.extent
-        self.learned = LearnedTensors(tensors, rates, options.lr_decay)
+        self.parameters = Parameters(tensors, rates, options.lr_decay, Role.PER_MOVING)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """See ``DeformationField.offsets``; ``means`` do not matter."""
         terms = basis(time, self.options.polynomial, self.options.fourier).to(means)
-        curves = (chosen(self.learned[name], rows) for name in head_sizes(self.options))
+        curves = (chosen(self.parameters[name], rows) for name in head_sizes(self.options))
         parts = [torch.einsum("b,mbd->md", terms, x) for x in curves]
         return split_heads(torch.cat(parts, dim=1), self.options)
 
-    def penalties(self, time: float) -> dict[str, Tensor]:
-        return {}
-
-    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        """Nothing: the field continues by itself."""
-
-    def select(self, index: Tensor, is_new: Tensor) -> None:
-        for name in head_sizes(self.options):
-            self.learned.select(name, index, is_new)
+    def edited(self, edit: TopologyEdit) -> Trajectory:
+        return self.with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
 
 
 def basis(time: float, polynomial: int, fourier: int) -> Tensor:

@@ -15,21 +15,20 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from dyngs.config import DynamicModel, SceneModel
+from dyngs.config.kinds import field_of
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
-from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
-from dyngs.evaluate.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
 from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.files.write import write_text
-from dyngs.human.avatar.trained import AvatarScene
+from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.captured import captured_motion, same_bodies
+from dyngs.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
 from dyngs.rendering import RenderOptions
-from dyngs.runs.checkpoint import COMPACT_NAME, LoadedRun, is_compact, load_run
-from dyngs.scene import Scene, moment_of, num_colour_values
-from dyngs.train.background import evaluation_background
+from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
+from dyngs.scene import Scene, render_options
+from dyngs.training.background import evaluation_background
 
 
 @dataclass(frozen=True)
@@ -158,11 +157,11 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
         lpips=_mean([s.lpips for s in scores]),
         lpips_net=lpips_net,
         num_gaussians=len(scene),
-        num_moving=0 if scene.is_still else len(scene.rows),
+        num_moving=0 if scene.is_still else scene.num_moving,
         moving_share=scene.moving_share,
         model_mb=parameter_megabytes(scene),
-        field_mb=4e-6 * scene.num_field_values,
-        colour_floats=num_colour_values(scene) / max(len(scene), 1),
+        field_mb=4e-6 * scene.num_motion_values,
+        colour_floats=scene.num_colour_values / max(len(scene), 1),
         fps=1 / median(s.render_seconds for s in scores),
         deform_share=median(s.deform_seconds / s.render_seconds for s in scores),
         seconds_train=run.seconds_train,
@@ -175,7 +174,7 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
         per_view=tuple(scores),
         psnr_person=_mean([s.psnr_person for s in scores]),
         ssim_person=_mean([s.ssim_person for s in scores]),
-        stored_mb=1e-6 * (run_dir / COMPACT_NAME).stat().st_size if is_compact(run_dir) else None,
+        stored_mb=1e-6 * (run_dir / SCENE_FILE).stat().st_size if has_only_scene_file(run_dir) else None,
     )
     write_text(report_path(run_dir, split), report.to_json())
     return report
@@ -210,7 +209,7 @@ def score_views(
         if not rendered.isfinite().all():
             raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
         truth, mask = picture.composite(background), picture.mask
-        box = person_box(picture) if isinstance(scene, AvatarScene) else None
+        box = person_box(picture) if avatar_of(scene) is not None else None
         optional = {"flip": flip(rendered, truth, mask), "lpips": lpips(rendered, truth, mask)}
         for name, metric in optional.items():
             if metric.reason is not None:
@@ -258,24 +257,14 @@ def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
 
     Frames that were trained on keep their refined poses; others have those of their files.
     """
-    if not isinstance(run.scene, AvatarScene) or capture.body is None:
+    avatar = avatar_of(run.scene)
+    if avatar is None or capture.body is None:
         return run.scene
     given, trained = capture.body[cast(Split, split)], capture.body["train"]
     if same_bodies(given, trained):
         return run.scene
-    shown = captured_motion(capture.root, given, split_views(capture, split), run.scene.given_joints)
-    return run.scene.playing(shown.clip)
-
-
-def render_options(model: SceneModel) -> RenderOptions:
-    """How a model wants to be drawn."""
-    return RenderOptions(
-        near=model.near,
-        eps2d=model.eps2d,
-        mode=model.rasterize_mode,
-        alpha_min=model.alpha_min,
-        transmittance_min=model.transmittance_min,
-    )
+    shown = captured_motion(capture.root, given, split_views(capture, split), avatar.skeleton.joints)
+    return avatar.playing(shown.clip)
 
 
 def parameter_megabytes(scene: Scene) -> float:
@@ -284,9 +273,7 @@ def parameter_megabytes(scene: Scene) -> float:
     Harmonics of a Gaussian that are all zero beyond the base colour do not count.
     """
     shapes = sum(x.numel() for name, x in scene.gaussians.tensors().items() if name != "sh")
-    masks = scene.masks if isinstance(scene, TrainedScene) else None
-    bits = 0.0 if masks is None else 1e-6 * masks.bits.numel()
-    return 4e-6 * (shapes + num_colour_values(scene) + scene.num_field_values) + bits
+    return 4e-6 * (shapes + scene.num_colour_values + scene.num_motion_values) + 1e-6 * scene.num_mask_bytes
 
 
 def _timed_render(
@@ -295,9 +282,9 @@ def _timed_render(
     """(H, W, 3) rendered picture, the seconds that it took, and those of them that the deformation took."""
     with torch.no_grad():
         start = time.perf_counter()
-        moment = moment_of(scene, picture.time)
+        moment = scene.moment(picture.time)
         deformed = time.perf_counter()
-        rendering = moment.seen_by(picture.cameras, options, background)
+        rendering = scene.render(picture.cameras, moment, options=options, background=background)
         end = time.perf_counter()
     return rendering.rgb[0], end - start, deformed - start
 
@@ -307,7 +294,7 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
     notes = []
     if run.config.data.background == "random":
         notes.append("trained on random backgrounds, evaluated on black")
-    if isinstance(run.config.model, DynamicModel) and run.scene.is_still:
+    if field_of(run.config) is not None and run.scene.is_still:
         notes.append("the model is dynamic, but nothing moves in it: it is drawn as fast as a static one")
     if len({(s.width, s.height) for s in scores}) > 1:
         notes.append("views differ in size; width and height are those of the first")

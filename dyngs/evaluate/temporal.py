@@ -21,9 +21,9 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.times import static_cameras
 from dyngs.errors import DyngsError
-from dyngs.evaluate.metrics import MetricValue
+from dyngs.metrics import MetricValue
 from dyngs.rendering import RenderOptions
-from dyngs.scene import Scene, moment_of
+from dyngs.scene import Scene
 
 MAX_MOMENTS = 60
 """Up to so many training times, flicker is measured at all of them."""
@@ -58,7 +58,8 @@ class Drawing:
     @torch.no_grad()
     def picture(self, cameras: Cameras, time: float | None) -> Tensor:
         """(H, W, 3) what the one camera sees at ``time``, clamped to [0, 1]."""
-        return moment_of(self.scene, time).seen_by(cameras, self.options, self.background).rgb[0].clamp(0, 1)
+        drawn = self.scene.render(cameras, time, options=self.options, background=self.background)
+        return drawn.rgb[0].clamp(0, 1)
 
 
 def clamped_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
@@ -91,7 +92,7 @@ def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> Metri
     Smooth motion has little of it, flickering much. Where moments are not evenly spaced, R_k is compared with the
     straight line between its neighbours: 2 |w R_{k-1} + (1 - w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} -
     t_{k-1}), which is the same for even ones. Of more than 60 moments, 20 triples of neighbours are taken, evenly
-    spread. A scene in which nothing moves has 0.
+    evenly_spaced. A scene in which nothing moves has 0.
 
     Args:
         drawing: what is drawn.

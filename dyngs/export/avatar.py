@@ -15,14 +15,15 @@ import torch
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig, HumanModel
+from dyngs.config.kinds import person_of
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.anchors import Anchors, skinning_weights
-from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
+from dyngs.human.avatar.anchors import Anchors
+from dyngs.human.avatar.corrections import new_corrections
 from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
-from dyngs.human.avatar.trained import AvatarScene
+from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.motion.placement import rest_clip
 from dyngs.human.pose.skinning import check_tree
@@ -59,8 +60,8 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
     Raises:
         DyngsError: the run is not one of a person, its template is gone, or the file cannot be written.
     """
-    scene, model = run.scene, run.config.model
-    if not isinstance(scene, AvatarScene) or not isinstance(model, HumanModel):
+    scene, model = avatar_of(run.scene), person_of(run.config)
+    if scene is None or model is None:
         raise DyngsError(
             f"--format avatar needs the run of a person (model.kind=human), this one is {run.config.model.kind}"
         )
@@ -68,7 +69,7 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
         raise DyngsError(f"{path}: an avatar is written as {SUFFIX}")
     if scene.colour is not None:
         raise DyngsError("an avatar file holds harmonics, this run's colours are a network; train with colour.kind=sh")
-    reference = rest_clip(scene.given_clip, scene.given_joints, scene.skeleton.parents)
+    reference = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
     anchors = scene.anchors
     tensors = {f"gaussians.{name}": x for name, x in scene.gaussians.tensors().items()}
     tensors |= {f"anchors.{name}": x for name, x in anchors.tensors().items()}
@@ -76,8 +77,8 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
         "anchors.face": anchors.face.int(),
         "anchors.joints": anchors.joints.to(torch.uint8),
         "anchors.weights": scene.weights.gather(1, anchors.joints),
-        "skeleton.joints": scene.skeleton.joints,
-        "skeleton.template_joints": scene.given_joints,
+        "skeleton.joints": scene.learned_skeleton.joints,
+        "skeleton.template_joints": scene.skeleton.joints,
         "skeleton.parents": torch.tensor(scene.skeleton.parents),
         "fit.turns": scene.fit.turns,
         "fit.log_scale": torch.tensor([scene.fit.log_scale]),
@@ -185,7 +186,7 @@ def _require_index(name: str, index: Tensor, count: int) -> None:
         raise ValueError(f"'{name}' names something beyond the {count} that there are")
 
 
-def _scene(tensors: Mapping[str, Tensor]) -> AvatarScene:
+def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
     """The person of checked tensors."""
 
     def part(prefix: str) -> dict[str, Any]:
@@ -194,7 +195,6 @@ def _scene(tensors: Mapping[str, Tensor]) -> AvatarScene:
     own = part("anchors.")
     anchors = Anchors(**{**own, "face": own["face"].long(), "joints": own["joints"].long()})
     parents = tuple(tensors["skeleton.parents"].tolist())
-    fit = SharedCorrection(tensors["fit.turns"], float(tensors["fit.log_scale"]))
     reference = MotionClip(
         times=torch.zeros(1, dtype=torch.float64),
         poses=tensors["reference.poses"][None],
@@ -202,18 +202,25 @@ def _scene(tensors: Mapping[str, Tensor]) -> AvatarScene:
         scale=tensors["reference.scale"],
     )
     shapes = part("shapes.")
-    return AvatarScene(
+    given = tensors["skeleton.template_joints"]
+    skeleton = Skeleton(given, parents)
+    values = {
+        "poses": torch.zeros_like(reference.poses),
+        "trans": torch.zeros_like(reference.trans),
+        "turns": tensors["fit.turns"],
+        "joints": tensors["skeleton.joints"] - given,
+        "log_scale": tensors["fit.log_scale"],
+        "weights": torch.zeros_like(anchors.weights),
+    }
+    values |= {name: tensors[name] for name in ("pose_dirs",) if name in tensors}
+    options = HumanModel(pose_offsets="pose_dirs" in tensors)
+    return HumanScene(
         gaussians=Gaussians(**part("gaussians.")),
         anchors=anchors,
-        weights=skinning_weights(anchors, len(parents)),
-        skeleton=Skeleton(tensors["skeleton.joints"], parents),
-        given_joints=tensors["skeleton.template_joints"],
-        fit=fit,
+        skeleton=skeleton,
+        clip=reference,
+        learned=new_corrections(options, reference, skeleton, anchors).restored(values),
         shapes=PoseBlendShapes(shapes["directions"].float(), shapes["faces"].long()) if shapes else None,
-        pose_dirs=tensors.get("pose_dirs"),
-        clip=corrected_clip(fit, reference),
-        given_clip=reference,
-        num_field_values=sum(tensors[x].numel() for x in ("anchors.weights", "fit.turns", "skeleton.joints")),
     )
 
 

@@ -9,12 +9,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
+import torch
+
 from dyngs.colour.bake import with_harmonics
 from dyngs.errors import DyngsError
 from dyngs.export.ply import write_ply
 from dyngs.files.temporary import temporary_folder_beside
 from dyngs.runs.checkpoint import LoadedRun, load_run
-from dyngs.scene import Scene, moment_of
+from dyngs.scene import Scene
 
 Part = Literal["all", "moving", "still"]
 
@@ -97,11 +99,13 @@ def scene_part(scene: Scene, part: Part) -> Scene:
 
 
 def _write(run: LoadedRun, scene: Scene, path: Path, time: float) -> Path:
-    model, moment = run.config.model, moment_of(scene, time)
-    gaussians = moment.gaussians
+    model = run.config.model
+    with torch.no_grad():
+        moment = scene.moment(time)
+    gaussians, shader = moment.gaussians, scene.shader(moment)
     comments = [f"step: {run.step}"] if scene.is_still else [f"step: {run.step}", f"dyngs time {time!r}"]
-    if moment.shader is not None:
-        baked = with_harmonics(gaussians, moment.shader)
+    if shader is not None:
+        baked = with_harmonics(gaussians, shader)
         gaussians = baked.gaussians
         comments.append(f"colours: harmonics fitted to a network, rms error {baked.error:.4f}")
     return write_ply(

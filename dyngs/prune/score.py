@@ -1,19 +1,19 @@
-"""What each Gaussian is worth: its share of pictures over views and times, weighed in one of several ways.
+"""How important each Gaussian is: its share of pictures over views and times, weighed in one of several ways.
 
 Local letters: K moments, C (K, N) sums over pixels and views of what a Gaussian contributes at each moment.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.gaussians import Gaussians
-from dyngs.rendering import RenderOptions, Shader, contributions, sensitivities
+from dyngs.rendering import RenderOptions, contributions, sensitivities
+from dyngs.scene import Scene
 
 STEEPNESS = 4.0
 """Of the hyperbolic tangent: second differences of a profile are small numbers."""
@@ -21,20 +21,18 @@ VOLUME_POWER = 0.1
 
 
 @dataclass(frozen=True)
-class Survey:
-    """What is looked at: every camera at every moment.
+class ScoringViews:
+    """A scene, and the views that its Gaussians are scored on: every camera at every time.
 
     Attributes:
-        at: the N Gaussians at a time.
-        shader_at: what colours them then; None: their harmonics.
+        scene: N Gaussians; none is masked.
         cameras: V groups of one camera.
         times: K moments in [0, 1], ascending; one None for a still scene.
         options: how the scene is drawn.
         background: (3,) colour.
     """
 
-    at: Callable[[float | None], Gaussians]
-    shader_at: Callable[[float | None], Shader | None]
+    scene: Scene
     cameras: Sequence[Cameras]
     times: Sequence[float | None]
     options: RenderOptions
@@ -42,8 +40,8 @@ class Survey:
 
 
 @dataclass(frozen=True)
-class Worth:
-    """What N Gaussians do at K moments.
+class Importance:
+    """Contributions of N Gaussians at K moments.
 
     Attributes:
         shares: (K, N) C, sums over pixels and views of alpha T.
@@ -91,20 +89,22 @@ class Worth:
 
 
 @torch.no_grad()
-def worth(survey: Survey, *, slopes: bool) -> Worth:
-    """What every Gaussian contributes to the pictures of a survey; ``slopes`` are the dearer half."""
-    shares, opacities, volumes, squares = [], [], [], torch.zeros(())
-    for time in survey.times:
-        now = survey.at(time)
-        sums = [contributions(now, camera, survey.options)[0] for camera in survey.cameras]
+def importance(views: ScoringViews, *, slopes: bool) -> Importance:
+    """Return what every Gaussian contributes to the pictures of ``views``; ``slopes`` are the dearer half."""
+    scene, options, behind = views.scene, views.options, views.background
+    shares, opacities, volumes, squares = [], [], [], torch.zeros((), device=behind.device)
+    for time in views.times:
+        moment = scene.moment(time)
+        now = moment.gaussians
+        sums = [contributions(now, camera, options)[0] for camera in views.cameras]
         shares.append(torch.stack(sums).sum(0))
         opacities.append(now.opacities)
         volumes.append(now.log_scales.sum(1))
         if slopes:
-            shader, behind = survey.shader_at(time), survey.background
-            for camera in survey.cameras:
-                squares = squares + sensitivities(now, camera, survey.options, background=behind, shader=shader)[0]
-    return Worth(torch.stack(shares), squares if slopes else None, torch.stack(opacities), torch.stack(volumes))
+            shader = scene.shader(moment)
+            for camera in views.cameras:
+                squares = squares + sensitivities(now, camera, options, background=behind, shader=shader)[0]
+    return Importance(torch.stack(shares), squares if slopes else None, torch.stack(opacities), torch.stack(volumes))
 
 
 def _smoothed(x: Tensor) -> Tensor:

@@ -10,73 +10,31 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from dyngs.colour.network import network_of
-from dyngs.config import Config, HumanModel, HumanPredictorModel, SceneModel
+from dyngs.build import restored_scene
+from dyngs.config import Config
 from dyngs.config.io import load_resolved
+from dyngs.config.kinds import network_of
 from dyngs.conventions import RasterizeMode
-from dyngs.deform.trained import trained_scene
 from dyngs.errors import DyngsError, reading, require_regular
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.files.write import write_text
-from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.trained import trained_avatar
 from dyngs.scene import Scene
 from dyngs.storage.file import read_scene
+from dyngs.training.state import Checkpoint, CheckpointInfo
 
 KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"
-COMPACT_NAME = "scene.dyngs"
+SCENE_FILE = "scene.dyngs"
 """Of the file that holds a run that is done in little space, see ``dyngs.storage``."""
 _KIND = FileKind("dyngs", "a checkpoint", 1)
-OTHER_CONFIG = "was its config changed? Otherwise train anew"
-"""Advice where a checkpoint and its run do not fit together."""
 MAX_STEP = 2**53
 BACKGROUNDS = ("white", "black", "random")
-
-
-@dataclass(frozen=True)
-class CheckpointInfo:
-    """What a checkpoint says of itself.
-
-    Attributes:
-        step: steps done.
-        extent: of the scene, world units.
-        world_offset: add it to the means to get the capture's own coordinates.
-        background: resolved choice: "white", "black" or "random".
-        rasterize_mode: how the Gaussians want to be drawn.
-    """
-
-    step: int
-    extent: float
-    world_offset: tuple[float, float, float]
-    background: str
-    rasterize_mode: str
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """Everything that a run needs to go on: named tensors and a few values."""
-
-    info: CheckpointInfo
-    tensors: dict[str, Tensor]
-    path: Path | None = field(default=None, compare=False)
-    """Of the file that it was read from."""
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        return f"the checkpoint of step {self.info.step}" if self.path is None else str(self.path)
-
-    def part(self, prefix: str) -> dict[str, Tensor]:
-        """The tensors whose names start with ``prefix.``, without it."""
-        return {name[len(prefix) + 1 :]: x for name, x in self.tensors.items() if name.startswith(f"{prefix}.")}
 
 
 @dataclass(frozen=True)
@@ -122,7 +80,7 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
     """
     tensors = {name: x.detach().contiguous() for name, x in checkpoint.tensors.items()}
     for name, x in tensors.items():
-        if name.startswith(("gaussians.", "model.")) and not bool(torch.isfinite(x).all()):
+        if not bool(torch.isfinite(x).all()):
             field, step = name.removeprefix("gaussians.").removeprefix("model."), checkpoint.info.step
             raise DyngsError(f"{run_dir}: {field} is not finite after step {step}; not saved. {last_good(run_dir)}")
     path = run_dir / "checkpoints" / f"step_{checkpoint.info.step:07d}.safetensors"
@@ -182,42 +140,25 @@ def load_run(run_dir: Path) -> LoadedRun:
         DyngsError: no run folder, no checkpoint, or a damaged one.
     """
     config = load_resolved(run_dir)
-    if isinstance(config.model, HumanPredictorModel):
+    if network_of(config) is not None:
         raise DyngsError(f"{run_dir}: a network, not a scene; `dyngs predict {run_dir} CAPTURE --out RUN` makes one")
-    checkpoint = _compact_checkpoint(run_dir) if is_compact(run_dir) else latest_checkpoint(run_dir)
-    scene = stored_scene(checkpoint, config.model)
+    checkpoint = _scene_checkpoint(run_dir) if has_only_scene_file(run_dir) else latest_checkpoint(run_dir)
+    scene = restored_scene(checkpoint, config.model)
     step = checkpoint.info.step
     return LoadedRun(config, scene, step, seconds_at(run_dir, step), checkpoint.info)
 
 
-def is_compact(run_dir: Path) -> bool:
+def has_only_scene_file(run_dir: Path) -> bool:
     """Whether the run is only there as the file that ``dyngs export --format compact`` writes."""
-    return (run_dir / COMPACT_NAME).is_file() and not checkpoint_paths(run_dir)
+    return (run_dir / SCENE_FILE).is_file() and not checkpoint_paths(run_dir)
 
 
-def _compact_checkpoint(run_dir: Path) -> Checkpoint:
+def _scene_checkpoint(run_dir: Path) -> Checkpoint:
     """What drawing needs; it cannot be trained on."""
-    path = run_dir / COMPACT_NAME
+    path = run_dir / SCENE_FILE
     stored = read_scene(path)
     with reading(path):
         return Checkpoint(info_of(stored.info.model_dump()), stored.tensors, path)
-
-
-def stored_scene(checkpoint: Checkpoint, model: SceneModel) -> Scene:
-    """The scene of a checkpoint of ``model``.
-
-    Raises:
-        DyngsError: a tensor lacks, or is not as the model or the other tensors have it; names the file.
-    """
-    with reading(checkpoint.name, OTHER_CONFIG):
-        try:
-            gaussians, state = Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
-            colour = network_of(checkpoint.part("model.colour"))
-            if isinstance(model, HumanModel):
-                return replace(trained_avatar(gaussians, state), colour=colour)
-            return replace(trained_scene(gaussians, state, model), colour=colour)
-        except KeyError as missing:
-            raise DyngsError(f"{checkpoint.name} lacks {missing}; an earlier version wrote it: train anew") from None
 
 
 def last_good(run_dir: Path) -> str:

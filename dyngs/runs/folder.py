@@ -12,7 +12,7 @@ from dyngs.config import Config, RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.files.temporary import remove_leftovers, remove_quietly, temporary_folder_beside
-from dyngs.runs.checkpoint import COMPACT_NAME, TIMING_NAME, checkpoint_paths
+from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths
 from dyngs.runs.lock import LOCK_NAME, writing
 from dyngs.runs.log import LOG_NAME
 
@@ -47,10 +47,9 @@ def require_no_run(folder: Path) -> None:
         raise DyngsError(
             f"{folder} already holds a run; go on with `dyngs train --resume {folder}` or give another folder"
         )
-    if COMPACT_NAME in found:
+    if SCENE_FILE in found:
         raise DyngsError(
-            f"{folder} already holds a run, as {COMPACT_NAME}, which can be drawn but not trained on; "
-            "give another folder"
+            f"{folder} already holds a run, as {SCENE_FILE}, which can be drawn but not trained on; give another folder"
         )
     if found:
         raise DyngsError(f"{folder} already holds {found[0]}, which a new run would replace; give another folder")
@@ -173,7 +172,7 @@ def tidy(folder: Path, *, sole_writer: bool) -> None:
 
 def _found(folder: Path) -> list[str]:
     """Names in ``folder`` that a run writes, whatever lies there under them; those of a begun run last."""
-    names = [COMPACT_NAME, SMALL_FOLDER, *sorted(path.name for path in folder.glob("metrics*.json")), *_BEGUN]
+    names = [SCENE_FILE, SMALL_FOLDER, *sorted(path.name for path in folder.glob("metrics*.json")), *_BEGUN]
     found = [name for name in names if (folder / name).exists() or (folder / name).is_symlink()]
     checkpoints = folder / "checkpoints"
     is_taken = not checkpoints.is_dir() and (checkpoints.exists() or checkpoints.is_symlink())

@@ -6,14 +6,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from dyngs.config import DefaultStrategy
-from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.quaternions import unit_quats
 from dyngs.tensor_checks import require_tensor
 
@@ -42,21 +42,6 @@ class DensifySchedule:
 
     def densifies_at(self, step: int) -> bool:
         return self.start < step < self.stop and step % self.every == 0
-
-
-@dataclass(frozen=True)
-class EditResult:
-    """A change of the set of Gaussians.
-
-    Attributes:
-        edit: how rows move; None where all stay in place.
-        changes: field name to its new values (N_new, ...), for the fields that are not just rows moved.
-        zero_moments: fields whose optimizer moments start anew in every row.
-    """
-
-    edit: TopologyEdit | None
-    changes: dict[str, Tensor] = field(default_factory=dict)
-    zero_moments: frozenset[str] = frozenset()
 
 
 class Densifier(Protocol):

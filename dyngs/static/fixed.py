@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyngs.gaussians import Gaussians
-from dyngs.static.densify import EditResult
+from dyngs.gaussians import EditResult, Gaussians
 
 
 class FixedDensifier:

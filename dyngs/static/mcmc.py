@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from dyngs.config import McmcStrategy
-from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.static.densify import MAX_LOG_VARIANCE, DensifySchedule, EditResult, rotate
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.static.densify import MAX_LOG_VARIANCE, DensifySchedule, rotate
 
 MAX_COPIES = 50
 NOISE_STEEPNESS = 100.0

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
+from dyngs.adam import AdamState
 from dyngs.config import OptimConfig
-from dyngs.gaussians import Gaussians
-from dyngs.ops.adam import adam_step_, seen_rows
-from dyngs.static.densify import EditResult
-from dyngs.tensor_checks import require_tensor
-
-PARTS = "gaussians", "exp_avg", "exp_avg_sq"
-"""Of a state: parameters and moments."""
+from dyngs.gaussians import EditResult, Gaussians
+from dyngs.ops.adam import seen_rows
+from dyngs.state import State
 
 
 class GaussianOptimizer:
@@ -25,11 +24,10 @@ class GaussianOptimizer:
     def __init__(self, gaussians: Gaussians, options: OptimConfig) -> None:
         self.options = options
         self.parameters = _as_leaves(gaussians.tensors())
-        self._exp_avg = {name: torch.zeros_like(x.detach()) for name, x in gaussians.tensors().items()}
-        self._exp_avg_sq = {name: torch.zeros_like(x.detach()) for name, x in gaussians.tensors().items()}
+        self._adam = AdamState.zero(gaussians.tensors())
 
     def step(self, step: int, lr_means: float, *, dense: bool, frozen_rest: Tensor | None = None) -> int:
-        """How many rows were left out for a gradient that is not finite; updates parameters and drops the gradients.
+        """Update the parameters, drop the gradients, and return the number of rows left out for bad gradients.
 
         Args:
             step: number of this step, from 1, for Adam's bias correction.
@@ -48,39 +46,25 @@ class GaussianOptimizer:
         }
         if frozen_rest is not None and self.parameters.sh.grad is not None:
             self.parameters.sh.grad[frozen_rest, 1:] = 0
-        left_out = 0
-        for name, x in self.parameters.tensors().items():
-            if x.grad is not None:
-                left_out += adam_step_(
-                    x.detach(),
-                    x.grad,
-                    self._exp_avg[name],
-                    self._exp_avg_sq[name],
-                    lr=rates[name],
-                    step=step,
-                    eps=self.options.eps,
-                    rows=rows,
-                )
-                x.grad = None
-        return left_out
+        return sum(
+            self._adam.step_(name, x, lr=rates[name], step=step, eps=self.options.eps, rows=rows)
+            for name, x in self.parameters.tensors().items()
+        )
 
     def apply(self, result: EditResult) -> None:
         """Change the set of Gaussians: parameters and moments of survivors move along, new rows start without moments.
 
         All parameters become new leaf tensors; gradients are dropped.
         """
-        moved: dict[str, Tensor] = {}
+        edit, moved = result.edit, {}
+        if edit is not None:
+            self._adam = self._adam.mapped(edit.apply_moments)
+        self._adam = self._adam.mapped(torch.zeros_like, result.zero_moments)
         for name, x in self.parameters.tensors().items():
-            if result.edit is not None:
-                self._exp_avg[name] = result.edit.apply_moments(self._exp_avg[name])
-                self._exp_avg_sq[name] = result.edit.apply_moments(self._exp_avg_sq[name])
-            if name in result.zero_moments:
-                self._exp_avg[name].zero_()
-                self._exp_avg_sq[name].zero_()
             if name in result.changes:
                 moved[name] = result.changes[name]
             else:
-                moved[name] = x if result.edit is None else result.edit.apply(x.detach())
+                moved[name] = x if edit is None else edit.apply(x.detach())
         self.parameters = _as_leaves(moved)
 
     def drop_rest(self, base: Tensor, frozen_rest: Tensor) -> None:
@@ -95,30 +79,24 @@ class GaussianOptimizer:
         plain = torch.cat([base[:, None], torch.zeros_like(sh[:, 1:])], dim=1)
         count = 1 if bool(frozen_rest.all()) else sh.shape[1]
         self.parameters = _as_leaves({**self.parameters.tensors(), "sh": torch.where(chosen, plain, sh)[:, :count]})
-        for moments in (self._exp_avg, self._exp_avg_sq):
-            rest = torch.where(chosen, 0.0, moments["sh"][:, 1:])
-            moments["sh"] = torch.cat([moments["sh"][:, :1], rest], dim=1)[:, :count].contiguous()
+        self._adam = self._adam.mapped(
+            lambda x: torch.cat([x[:, :1], torch.where(chosen, 0.0, x[:, 1:])], dim=1)[:, :count].contiguous(), ["sh"]
+        )
 
-    def state(self) -> dict[str, Tensor]:
-        """Parameters and moments by name, for a checkpoint: ``gaussians.*``, ``exp_avg.*``, ``exp_avg_sq.*``."""
-        state = {f"gaussians.{name}": x.detach() for name, x in self.parameters.tensors().items()}
-        state |= {f"exp_avg.{name}": x for name, x in self._exp_avg.items()}
-        return state | {f"exp_avg_sq.{name}": x for name, x in self._exp_avg_sq.items()}
+    def state(self) -> State:
+        """Return the moments by name: ``exp_avg.*``, ``exp_avg_sq.*``."""
+        return self._adam.state()
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Take over what ``state()`` returned.
+    def restored(self, parameters: Gaussians, tensors: Mapping[str, Tensor]) -> GaussianOptimizer:
+        """Return an optimizer of ``parameters`` with the moments that ``state`` returned.
 
         Raises:
-            KeyError: a tensor lacks.
-            ValueError: one is not finite float32, or they do not fit together.
+            KeyError: a moment is missing.
+            ValueError: one is not finite float32, or does not fit the parameters.
         """
-        parts = {part: {n: state[f"{part}.{n}"].clone() for n in self.parameters.tensors()} for part in PARTS}
-        parameters = Gaussians.stored(parts["gaussians"])
-        for part in PARTS[1:]:
-            for name, x in parameters.tensors().items():
-                require_tensor(f"{part}.{name}", parts[part][name], tuple(x.shape))
-        self.parameters = _as_leaves(parameters.tensors())
-        self._exp_avg, self._exp_avg_sq = parts["exp_avg"], parts["exp_avg_sq"]
+        optimizer = GaussianOptimizer(parameters, self.options)
+        optimizer._adam = AdamState.restored(tensors, parameters.tensors())
+        return optimizer
 
     def _harmonics_rates(self) -> Tensor:
         """(K * 3,) one rate per coefficient."""

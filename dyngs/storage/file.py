@@ -24,11 +24,11 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
-from dyngs.config import SceneModel
 from dyngs.errors import DyngsError, require_regular
 from dyngs.files.write import atomic_file
+from dyngs.scene import Scene
 from dyngs.storage.coding import Packing, compressed, decompressed, packed, unpacked
-from dyngs.storage.drawable import completed, drawable, in_storage_order
+from dyngs.storage.drawable import completed, drawable, stored_edit
 from dyngs.storage.tensors import (
     COARSENESS,
     Coding,
@@ -61,7 +61,7 @@ class _Part(BaseModel):
 
 
 class SceneInfo(_Part):
-    """What a checkpoint says of itself; see ``dyngs.runs.checkpoint.CheckpointInfo``."""
+    """What a checkpoint says of itself; see ``dyngs.training.state.CheckpointInfo``."""
 
     step: int
     extent: float
@@ -137,28 +137,30 @@ def read_scene(path: Path) -> StoredScene:
         raise DyngsError(f"{path}: {error}") from None
 
 
-def encoded(info: SceneInfo, tensors: Mapping[str, Tensor], model: SceneModel, steps: Mapping[str, float]) -> bytes:
-    """The bytes of a file; the same for what was read from it.
+def encoded(info: SceneInfo, scene: Scene, steps: Mapping[str, float], coarseness: Tensor | None = None) -> bytes:
+    """Return the bytes of a file; the same for what was read from it.
 
     Args:
         info: about the run.
-        tensors: of a checkpoint; what only training needs is left out.
-        model: whose they are.
+        scene: N Gaussians; what only training needs is left out.
         steps: of groups of tensors, see ``dyngs.storage.precision``; others are stored in half precision.
+        coarseness: (N,) uint8 of the Gaussians, see ``coarseness_of``; None: all are stored alike.
 
     Raises:
         DyngsError: a value is not finite.
     """
-    kept = drawable(tensors)
-    scaled = COARSENESS in kept
-    means = kept["gaussians.means"]
-    means = restored(means, coding_of("gaussians.means", means, steps))
-    kept = in_storage_order(kept, means.numpy(), model)
+    means = scene.gaussians.means.detach()
+    if not bool(means.isfinite().all()):
+        raise DyngsError("means is not finite; it cannot be stored")
+    edit = stored_edit(scene, restored(means, coding_of("gaussians.means", means, steps)).numpy())
+    kept, scale = drawable(scene.edited(edit)), None
+    if coarseness is not None:
+        kept[COARSENESS] = edit.apply(coarseness)
+        scale = checked_coarseness(kept[COARSENESS], len(means))
     entries, blocks = [], []
-    coarseness = checked_coarseness(kept[COARSENESS], len(means)) if scaled else None
     for name in sorted(kept):
-        coding = coding_of(name, kept[name], steps, by_coarseness=scaled)
-        entry, block = _stored(name, kept[name], coding, coarseness)
+        coding = coding_of(name, kept[name], steps, by_coarseness=scale is not None)
+        entry, block = _stored(name, kept[name], coding, scale)
         entries.append(entry)
         blocks.append(block)
     header = compressed(_Header(info=info, tensors=tuple(entries)).model_dump_json().encode(), room=MAX_HEADER)

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.storage.drawable import completed, drawable
+from dyngs.gaussians import Gaussians
+from dyngs.storage.drawable import completed
 from dyngs.storage.quantize import LIMIT, step_below
 from dyngs.storage.tensors import COARSENESS, MAX_COARSENESS, checked_coarseness, coding_of, group_of, restored
 
@@ -66,33 +67,30 @@ def coarseness_of(visibility: Tensor) -> Tensor:
     return octaves.round().clamp_max(MAX_COARSENESS).to(torch.uint8)
 
 
-def assumed_precision(tensors: Mapping[str, Tensor]) -> Precision:
-    """Steps where no picture can be drawn: fine ones, positions by the size of the Gaussians; all else is halves.
-
-    Args:
-        tensors: of a checkpoint.
-    """
-    log_scales = tensors["gaussians.log_scales"].double()
+def assumed_precision(gaussians: Gaussians) -> Precision:
+    """Return steps where no picture can be drawn: fine ones, positions by the size of the Gaussians; all else is halves."""
+    log_scales = gaussians.log_scales.detach().double()
     size = float(log_scales.median(1).values.median().exp()) if len(log_scales) else 1.0
     return Precision(
         {f"gaussians.{name}": step for name, step in ASSUMED_STEPS.items()} | {"gaussians.means": size / 64}
     )
 
 
-def measured_precision(tensors: Mapping[str, Tensor], draw: Draw, max_change: float) -> Precision:
-    """The largest steps found that change the pictures by at most ``max_change``.
+def measured_precision(
+    exact: Mapping[str, Tensor], wanted: Sequence[Tensor], draw: Draw, max_change: float
+) -> Precision:
+    """Return the largest steps found that change the pictures by at most ``max_change``.
 
     Args:
-        tensors: of a checkpoint.
-        draw: the pictures that count.
+        exact: from ``drawable``, and the coarseness of the Gaussians if they have any.
+        wanted: the pictures that count.
+        draw: draws them anew from the tensors of a checkpoint.
         max_change: root mean square over all of their values, grey levels of 255, more than 0.
 
     Raises:
         DyngsError: a value is not finite.
     """
-    exact = drawable(tensors)
     coarseness = checked_coarseness(exact[COARSENESS], len(exact["gaussians.means"])) if COARSENESS in exact else None
-    wanted = draw(tensors)
 
     def change(steps: Mapping[str, float], names: Iterable[str] = exact) -> float:
         """Mean square over all values, with the tensors of these names quantised."""

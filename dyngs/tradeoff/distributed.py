@@ -12,9 +12,9 @@ from datetime import timedelta
 
 import torch
 
+from dyngs.api.train import num_cores
 from dyngs.errors import DyngsError
 from dyngs.tradeoff.variants import Variant
-from dyngs.train.trainer import num_cores
 
 PATIENCE = timedelta(days=30)
 """That one process waits for the others, which may be training."""

@@ -16,10 +16,10 @@ from dyngs.config import SceneModel
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
-from dyngs.evaluate.metrics import Lpips, psnr, ssim
 from dyngs.evaluate.report import render_options
+from dyngs.metrics import Lpips, psnr, ssim
 from dyngs.rendering import RenderOptions
-from dyngs.scene import Scene, moment_of
+from dyngs.scene import Scene
 from dyngs.tradeoff.measurements import Quartiles, Speed
 from dyngs.tradeoff.variants import Variant
 
@@ -43,11 +43,8 @@ class VariantRenderer:
     @torch.no_grad()
     def picture(self, cameras: Cameras, time: float | None) -> Tensor:
         """(H, W, 3) what the one camera sees at ``time``; drawn smaller and enlarged bilinearly where ``scale`` < 1."""
-        seen = (
-            moment_of(self.scene, time)
-            .seen_by(scaled_cameras(cameras, self.scale), self.options, self.background)
-            .rgb[0]
-        )
+        smaller = scaled_cameras(cameras, self.scale)
+        seen = self.scene.render(smaller, time, options=self.options, background=self.background).rgb[0]
         if seen.shape[:2] == (cameras.height, cameras.width):
             return seen
         size = (cameras.height, cameras.width)

@@ -9,14 +9,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
+from dyngs.api.train import num_cores
 from dyngs.config.io import load_resolved
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.evaluate.metrics import LpipsNet, load_lpips
 from dyngs.evaluate.report import scene_of_split, split_views
 from dyngs.files.write import write_text
+from dyngs.metrics import LpipsNet, load_lpips
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.tradeoff.distributed import SINGLE_PROCESS, ProcessGroup
@@ -27,8 +28,7 @@ from dyngs.tradeoff.pareto import combinations
 from dyngs.tradeoff.requirements import Figures
 from dyngs.tradeoff.variant_runs import VariantRuns, megabytes_on_disk, run_settings
 from dyngs.tradeoff.variants import Variant, Variation, single_changes
-from dyngs.train.background import evaluation_background
-from dyngs.train.trainer import num_cores
+from dyngs.training.background import evaluation_background
 
 TIMED_VIEWS = 8
 """Of the split, evenly chosen; quality is that of all."""

@@ -6,31 +6,33 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dyngs.build import assemble
-from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, HumanPredictorModel, PruneConfig, SceneModel
+from dyngs.api.prune import prune_run
+from dyngs.api.train import num_cores, train
+from dyngs.build import assemble, restored_scene
+from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.config.kinds import field_of, network_of
 from dyngs.config.schema import section_class
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
-from dyngs.evaluate.metrics import MAX_PSNR
+from dyngs.export.scene_file import num_bytes_exact, write_scene_file
+from dyngs.metrics import MAX_PSNR
 from dyngs.ops.native import kernel_threads
-from dyngs.prune.run import compact_run
-from dyngs.prune.stage import compact_
+from dyngs.prune.stage import prune_
 from dyngs.runs.checkpoint import (
-    COMPACT_NAME,
+    SCENE_FILE,
     Checkpoint,
     checkpoint_paths,
-    is_compact,
+    has_only_scene_file,
     latest_checkpoint,
     load_run,
     save_checkpoint,
     seconds_at,
 )
+from dyngs.state import tensors_of
 from dyngs.storage.file import write_scene
-from dyngs.storage.run import num_bytes_exact, write_compact
 from dyngs.tradeoff.measure import with_render_settings
 from dyngs.tradeoff.variants import RunSettings, Variant
-from dyngs.train.trainer import num_cores, train
 
 FIELD_SIZE = {"control_nodes": "nodes", "hexplane": "channels", "mlp": "width", "trajectory": "fourier"}
 """What the size of a field is, by its kind: a key of its section."""
@@ -72,7 +74,7 @@ class VariantRuns:
         if wanted.storage is not None:
             exact = self.folder(replace(wanted, storage=None, field_step=1.0))
             max_change = wanted.storage if isinstance(wanted.storage, float) else None
-            write_compact(exact, folder, max_change, wanted.field_step)
+            write_scene_file(exact, folder, max_change, wanted.field_step)
         elif wanted.sh_degree is not None:
             source = self.folder(replace(wanted, sh_degree=None))
             _write(folder, *_with_degree(source, wanted.sh_degree), source)
@@ -89,7 +91,7 @@ class VariantRuns:
     def _trained(self, wanted: Variant) -> Path:
         """The run trained anew with other colours or another field."""
         out = self.out / "training" / wanted.slug
-        changes = [*field_changes(load_resolved(self.run_dir).model, wanted)]
+        changes = [*field_changes(load_resolved(self.run_dir), wanted)]
         if wanted.colour is not None:
             changes.append(f"colour.kind={wanted.colour}")
         changes += [*NO_BUDGET, f"run.dir={out}", f"run.threads={self.threads}"]
@@ -100,7 +102,7 @@ class VariantRuns:
         if checkpoint_paths(out):
             return finished(load_resolved(out), out)
         steps = [*NO_BUDGET, f"prune.steps={wanted.finetune}", f"run.threads={self.threads}"]
-        return compact_run(source, out, [*_compaction(wanted, load_resolved(source).prune), *steps])
+        return prune_run(source, out, [*_compaction(wanted, load_resolved(source).prune), *steps])
 
     def _compacted(self, source: Path, wanted: Variant) -> tuple[Checkpoint, Config]:
         """Pruned and masked, and nothing trained after it."""
@@ -110,7 +112,7 @@ class VariantRuns:
         with kernel_threads(self.threads or num_cores()):
             trainer = assemble(config, restored=True)
             trainer.restore(checkpoint)
-            compact_(trainer)
+            prune_(trainer)
             return trainer.checkpoint(), config
 
 
@@ -125,13 +127,13 @@ def run_settings(run_dir: Path) -> RunSettings:
     Raises:
         DyngsError: no run that can be varied.
     """
-    if is_compact(run_dir):
-        raise DyngsError(f"{run_dir}: only {COMPACT_NAME} is there; give the run that it was made from")
+    if has_only_scene_file(run_dir):
+        raise DyngsError(f"{run_dir}: only {SCENE_FILE} is there; give the run that it was made from")
     config = load_resolved(run_dir)
-    if isinstance(config.model, HumanPredictorModel):
+    if network_of(config) is not None:
         raise DyngsError(f"{run_dir}: a network, not a scene; vary what it predicts")
     scene = load_run(run_dir).scene
-    model = config.model
+    model, moves_by = config.model, field_of(config)
     return RunSettings(
         sh_degree=scene.gaussians.sh_degree,
         mode=model.rasterize_mode.value,
@@ -139,15 +141,15 @@ def run_settings(run_dir: Path) -> RunSettings:
         transmittance_min=model.transmittance_min,
         mask_times=config.prune.mask_times,
         colour=config.colour.kind,
-        field=model.deform.kind if isinstance(model, DynamicModel) and not scene.is_still else None,
+        field=None if moves_by is None or scene.is_still else moves_by.kind,
     )
 
 
 def megabytes_on_disk(folder: Path) -> float:
     """1e6 bytes of the stored file, or 4 bytes for each value that drawing needs of a checkpoint."""
-    if is_compact(folder):
-        return 1e-6 * (folder / COMPACT_NAME).stat().st_size
-    return 1e-6 * num_bytes_exact(latest_checkpoint(folder))
+    if has_only_scene_file(folder):
+        return 1e-6 * (folder / SCENE_FILE).stat().st_size
+    return 1e-6 * num_bytes_exact(load_run(folder).scene)
 
 
 def write_chosen(models: VariantRuns, variant: Variant) -> Path:
@@ -162,8 +164,8 @@ def write_chosen(models: VariantRuns, variant: Variant) -> Path:
         longest = None if data.longest_side is None else max(1, round(data.longest_side * variant.scale))
         data = data.model_copy(update={"downscale": data.downscale / variant.scale, "longest_side": longest})
     chosen = config.model_copy(update={"model": model, "data": data})
-    if is_compact(made):
-        write_scene(out / COMPACT_NAME, (made / COMPACT_NAME).read_bytes())
+    if has_only_scene_file(made):
+        write_scene(out / SCENE_FILE, (made / SCENE_FILE).read_bytes())
         save_config(chosen, out / RESOLVED_NAME)
     else:
         _write(out, latest_checkpoint(made), chosen, made)
@@ -176,11 +178,12 @@ def _compaction(wanted: Variant, own: PruneConfig) -> Sequence[str]:
     return (f"prune.share={wanted.prune}", f"prune.max_loss={MAX_PSNR}", *masks)
 
 
-def field_changes(model: SceneModel, wanted: Variant) -> Iterator[str]:
+def field_changes(config: Config, wanted: Variant) -> Iterator[str]:
     """Overrides that make a field of another kind, which moves the same attributes, or of another size."""
-    if not isinstance(model, DynamicModel):
+    field = field_of(config)
+    if field is None:
         return
-    field, kind = model.deform, wanted.field or model.deform.kind
+    kind = wanted.field or field.kind
     if kind != field.kind:
         moves = FieldSection.model_fields
         field = section_class(DynamicModel.model_fields["deform"], kind)(
@@ -207,6 +210,6 @@ def _write(folder: Path, checkpoint: Checkpoint, config: Config, source: Path, *
     """
     tensors = checkpoint.tensors
     if not whole:
-        tensors = {name: x for name, x in tensors.items() if name.startswith(("gaussians.", "model."))}
+        tensors = tensors_of(restored_scene(checkpoint, config.model).state())
     save_checkpoint(folder, replace(checkpoint, tensors=tensors), seconds_at(source, checkpoint.info.step))
     save_config(config, folder / RESOLVED_NAME)

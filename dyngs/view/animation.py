@@ -8,8 +8,9 @@ from pathlib import Path
 import torch
 
 from dyngs.config import HumanModel
+from dyngs.config.kinds import person_of
 from dyngs.errors import DyngsError
-from dyngs.human.avatar.trained import AvatarScene
+from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion.clip import motion_clip
 from dyngs.human.motion.placement import place_like, rest_clip
 from dyngs.human.template.load import load_template
@@ -37,13 +38,13 @@ def with_motion(run: LoadedRun, path: Path) -> AnimatedRun:
 
     scene, model = _avatar(run, f"--motion {path}")
     motion = read_motion(path, load_template(model))
-    if motion.poses.shape[1] != len(scene.given_joints):
-        motion = motion.for_joints(len(scene.given_joints))
+    if motion.poses.shape[1] != len(scene.skeleton.joints):
+        motion = motion.for_joints(len(scene.skeleton.joints))
     clip = motion_clip(motion)
     if bool((motion.scale != 1).any()):
         clip = replace(clip, trans=clip.trans - torch.tensor(run.info.world_offset))
     else:
-        clip = place_like(clip, scene.given_clip, scene.given_joints, scene.skeleton.parents)
+        clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
     return AnimatedRun(replace(run, scene=scene.playing(clip)), motion.fps)
 
 
@@ -54,11 +55,12 @@ def at_rest(run: LoadedRun) -> LoadedRun:
         DyngsError: the run is not one of a person.
     """
     scene, _ = _avatar(run, "--pose rest")
-    rest = rest_clip(scene.given_clip, scene.given_joints, scene.skeleton.parents)
+    rest = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
     return replace(run, scene=scene.playing(rest))
 
 
-def _avatar(run: LoadedRun, wanted: str) -> tuple[AvatarScene, HumanModel]:
-    if not isinstance(run.scene, AvatarScene) or not isinstance(run.config.model, HumanModel):
+def _avatar(run: LoadedRun, wanted: str) -> tuple[HumanScene, HumanModel]:
+    scene, model = avatar_of(run.scene), person_of(run.config)
+    if scene is None or model is None:
         raise DyngsError(f"{wanted} needs the run of a person (model.kind=human), this one is {run.config.model.kind}")
-    return run.scene, run.config.model
+    return scene, model

@@ -15,12 +15,11 @@ from dyngs.data.capture import Capture
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.evaluate.metrics import psnr
 from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
 from dyngs.files.write import to_uint8, write_image
+from dyngs.metrics import psnr
 from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import load_run
-from dyngs.scene import moment_of
 from dyngs.view.camera_paths import CameraPath
 from dyngs.view.contact_sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
 from dyngs.view.render_job import Frame, RenderJob, job_frames, render_frame
@@ -100,7 +99,7 @@ def write_split_images(run_dir: Path, split: str, out_dir: Path, output: OutputO
     with _FrameWriter(out_dir, output, files_of(capture)) as writer:
         for i, stem in enumerate(file_stems([view.name for view in views])):
             picture = loader[i]
-            frame = render_frame(moment_of(scene, picture.time), picture.cameras, options, background)
+            frame = render_frame(scene, scene.moment(picture.time), picture.cameras, options, background)
             writer.write(stem, frame)
             if i in shown:
                 truth = picture.composite(background)

@@ -12,7 +12,7 @@ from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options
 from dyngs.export.avatar import read_avatar
-from dyngs.human.avatar.trained import AvatarScene
+from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion.placement import up_direction
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.view.animation import with_motion
@@ -36,18 +36,19 @@ def job_of_avatar(file: Path, options: RenderJobOptions) -> RenderJob:
     if options.motion is not None:
         played = with_motion(run, options.motion)
         run, fps = played.run, played.fps
-    if not isinstance(run.scene, AvatarScene):
+    scene = avatar_of(run.scene)
+    if scene is None:
         raise DyngsError(f"{file}: holds no person; give a file of `dyngs export RUN --format avatar`")
-    path = _path(run.scene, run.info.world_offset, options)
+    path = _path(scene, run.info.world_offset, options)
     if fps is not None:
         path = replace(path, fps=fps)
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     _, background = evaluation_background(options.background or run.info.background, has_alpha=True)
-    return RenderJob(run.scene, path, render_options(run.config.model), background)
+    return RenderJob(scene, path, render_options(run.config.model), background)
 
 
-def _path(scene: AvatarScene, world_offset: tuple[float, float, float], options: RenderJobOptions) -> CameraPath:
+def _path(scene: HumanScene, world_offset: tuple[float, float, float], options: RenderJobOptions) -> CameraPath:
     """The cameras that are asked for, and the moments of the clip that they see."""
     times = scene.times if options.times is None else options.times
     if options.path is None:
@@ -66,11 +67,11 @@ def _path(scene: AvatarScene, world_offset: tuple[float, float, float], options:
     return with_times(replace(path, warnings=()), times * len(path) if len(times) == 1 else times)
 
 
-def _around(scene: AvatarScene, options: RenderJobOptions, count: int) -> Cameras:
+def _around(scene: HumanScene, options: RenderJobOptions, count: int) -> Cameras:
     """An orbit around where the person is, a spiral before it, or without a path the one camera in front of it."""
     moments = np.linspace(0, 1, 1 if scene.is_still else _MOMENTS)
     means = torch.cat([scene.at(moment).means for moment in moments.tolist()]).numpy()
-    x, y, z = up_direction(scene.given_clip).tolist()
+    x, y, z = up_direction(scene.clip).tolist()
     size = options.size or DEFAULT_SIZE
     if options.path == "orbit":
         return frame_orbit_for_points(means, count, size, (x, y, z))

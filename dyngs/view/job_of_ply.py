@@ -6,14 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from dyngs.camera import Cameras
-from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background
 from dyngs.export.ply import SplatFile, read_ply
 from dyngs.rendering import RenderOptions
+from dyngs.static.scene import StaticScene
 from dyngs.view.camera_paths import CameraPath, frame_orbit_for_points, read_path, spiral_path
 from dyngs.view.render_job import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJob, RenderJobOptions, path_file, resize_cameras
 
@@ -39,7 +38,7 @@ def job_of_ply(file: Path, options: RenderJobOptions) -> RenderJob:
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     _, background = evaluation_background(options.background or "black", has_alpha=False)
-    scene = TrainedScene(splat.gaussians, torch.zeros(0, dtype=torch.long))
+    scene = StaticScene(gaussians=splat.gaussians)
     return RenderJob(scene, path, splat_options(splat), background)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.rendering import RenderOptions
-from dyngs.scene import Moment, Scene, moment_of
+from dyngs.scene import Moment, Scene
 from dyngs.view.camera_paths import CameraPath
 
 DEFAULT_FRAMES = 120
@@ -88,18 +88,23 @@ class RenderJobOptions:
 
 
 def render_frame(
-    moment: Moment, camera: Cameras, options: RenderOptions = DEFAULT_OPTIONS, background: Tensor | None = None
+    scene: Scene,
+    moment: Moment,
+    camera: Cameras,
+    options: RenderOptions = DEFAULT_OPTIONS,
+    background: Tensor | None = None,
 ) -> Frame:
     """The picture that one camera sees, without gradients.
 
     Args:
-        moment: what it looks at.
+        scene: what it looks at.
+        moment: of the scene.
         camera: one camera.
         options: how to draw; ``depth`` other than "none" fills ``Frame.depth``.
         background: (3,) colour; None is black.
     """
     with torch.no_grad():
-        rendering = moment.seen_by(camera, options, background)
+        rendering = scene.render(camera, moment, options=options, background=background)
     depth = None if rendering.depth is None else rendering.depth[0].cpu().numpy()
     return Frame(rendering.rgb[0].clamp(0, 1).cpu().numpy(), rendering.alpha[0].cpu().numpy(), depth)
 
@@ -114,8 +119,9 @@ def job_frames(shot: RenderJob) -> Iterator[Frame]:
     for i in range(len(shot.path)):
         time = None if times is None or shot.scene.is_still else times[i]
         if moment is None or time != moment_time:
-            moment, moment_time = moment_of(shot.scene, time), time
-        yield render_frame(moment, shot.path.cameras.select(i), shot.options, shot.background)
+            with torch.no_grad():
+                moment, moment_time = shot.scene.moment(time), time
+        yield render_frame(shot.scene, moment, shot.path.cameras.select(i), shot.options, shot.background)
 
 
 def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:

@@ -23,7 +23,7 @@ from dyngs.bench.deform import (
 from dyngs.cli import main
 from dyngs.config import DynamicModel, RandomInit, StaticModel
 from dyngs.errors import DyngsError
-from dyngs.train.trainer import train
+from dyngs.api.train import train
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_resolved
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.train.trainer import train
+from dyngs.api.train import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -100,7 +100,7 @@ def test_room_in_a_file_is_a_limit(
     captures: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And a stage that removes more is left alone."""
-    monkeypatch.setattr("dyngs.budget.limits.FEWEST", 1)
+    monkeypatch.setattr("dyngs.training.limits.FEWEST", 1)
     config = config_of("default", captures, tmp_path / "run", BudgetConfig(max_mb=0.001))
     folder = train(config)
     assert len(load_run(folder).scene) == 1000 // (16 + 0.35 * 9)

@@ -15,10 +15,10 @@ from dyngs.config.io import load_resolved
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.prune.stage import quality_of
-from dyngs.runs.checkpoint import COMPACT_NAME, checkpoint_paths, is_compact, latest_checkpoint, load_run
+from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, has_only_scene_file, latest_checkpoint, load_run
 from dyngs.runs.folder import SMALL_FOLDER
-from dyngs.train.step import Trainer
-from dyngs.train.trainer import train
+from dyngs.training.step import Trainer
+from dyngs.api.train import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -57,7 +57,7 @@ def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_pat
     for share in (0.8, 0.4, 0.15):
         asked = share * usual.megabytes
         report = write_within(trainer, tmp_path / str(share), asked)
-        file = tmp_path / str(share) / SMALL_FOLDER / COMPACT_NAME
+        file = tmp_path / str(share) / SMALL_FOLDER / SCENE_FILE
         assert file.stat().st_size == round(1e6 * report.megabytes) <= 1e6 * asked
         assert report.coarser > 1 or report.num_kept < 500
         assert report.before == usual.before
@@ -82,10 +82,10 @@ def test_a_run_writes_it_and_a_finished_one_makes_it_again(
 ) -> None:
     folder = train(config_of(still, tmp_path / "run", BudgetConfig(max_mb=0.02)))
     assert "budget.max_mb: asked 0.02, got" in capsys.readouterr().out
-    file, end = folder / SMALL_FOLDER / COMPACT_NAME, checkpoint_paths(folder)[-1].read_bytes()
+    file, end = folder / SMALL_FOLDER / SCENE_FILE, checkpoint_paths(folder)[-1].read_bytes()
     wanted = file.read_bytes()
     assert len(wanted) <= 20_000
-    assert is_compact(folder / SMALL_FOLDER)
+    assert has_only_scene_file(folder / SMALL_FOLDER)
     assert len(load_run(folder / SMALL_FOLDER).scene) == len(latest_checkpoint(folder).tensors["gaussians.means"])
     shutil.rmtree(folder / SMALL_FOLDER)
     train(load_resolved(folder), resume_from=folder)

@@ -39,8 +39,8 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.temporal import Drawing
 from dyngs.runs.checkpoint import checkpoint_paths, load_run, stored_scene
 from dyngs.scene import Scene
-from dyngs.train.step import Trainer
-from dyngs.train.trainer import train
+from dyngs.training.step import Trainer
+from dyngs.api.train import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -29,8 +29,8 @@ from dyngs.config import AutoColour, BudgetConfig, Config, DataConfig, DynamicMo
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import load_run
-from dyngs.train.step import StepReport, Trainer
-from dyngs.train.trainer import train
+from dyngs.training.step import StepReport, Trainer
+from dyngs.api.train import train
 
 PLAIN = Config(data=DataConfig(root=Path("nowhere")))
 SHRUNK = PLAIN.model_copy(update={"train": TrainConfig(steps=7000, initial_downscale=4)})

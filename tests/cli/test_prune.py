@@ -10,7 +10,7 @@ from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.cli import main
 from dyngs.config.io import load_resolved
-from dyngs.train.trainer import train
+from dyngs.api.train import train
 
 
 @pytest.mark.usefixtures("one_thread")

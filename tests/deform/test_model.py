@@ -355,7 +355,7 @@ def test_where_nothing_moves_the_field_goes_for_good() -> None:
     assert (scene.field, scene.rows.tolist(), scene.num_moving(9)) == (None, [], 0)
     assert scene.state().keys() == {"times"}
     assert scene.gaussians_at(gaussians, picture(0.2), SPLIT + 1).gaussians is gaussians
-    scene.after_step(gaussians, SPLIT + 1, EditResult(TopologyEdit.keep(torch.arange(9) < 5)))
+    scene.after_step(gaussians, SPLIT + 1, EditResult(TopologyEdit.select(torch.arange(9) < 5)))
     assert scene.field is None
 
 

@@ -32,7 +32,7 @@ from dyngs.rendering import render
 from dyngs.runs.checkpoint import stored_scene
 from dyngs.static.densify import EditResult
 from dyngs.static.model import StaticScene
-from dyngs.train.step import Trainer
+from dyngs.training.step import Trainer
 
 LONG = 10_000
 
@@ -179,7 +179,7 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     trainer.step()
     keep = torch.ones(len(trainer.optimizer.parameters), dtype=torch.bool)
     keep[model.rows] = False
-    result = EditResult(TopologyEdit.keep(keep))
+    result = EditResult(TopologyEdit.select(keep))
     trainer.optimizer.apply(result)
     trainer.densifier = assemble(trainer.config).densifier
     model.after_step(trainer.optimizer.parameters, 11, result)

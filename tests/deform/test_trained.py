@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.config import DynamicModel, StaticModel
 from dyngs.deform.field import deformed
 from dyngs.deform.fields import field_state
-from dyngs.deform.masks import KeyMasks
+from dyngs.visibility import VisibilityMasks
 from dyngs.deform.trained import TrainedScene, trained_scene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -132,7 +132,7 @@ def test_masks_show_the_same_of_fewer(kind: str, filtered: bool) -> None:
     """Before, between and after key times, in any order of times; parts and sizes are those of all Gaussians."""
     scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if filtered else None)
     seen = torch.rand(3, 9, generator=torch.Generator().manual_seed(1)) < 0.4
-    masked = replace(scene, masks=KeyMasks.pack((0.0, 0.5, 1.0), seen))
+    masked = replace(scene, masks=VisibilityMasks.pack((0.0, 0.5, 1.0), seen))
     for time, active in ((0.1, seen[:2]), (0.9, seen[1:]), (0.3, seen[:2]), (1.0, seen[1:]), (None, seen[:2])):
         found, whole = masked.at(time), scene.at(time).select(active.any(0))
         for name, x in found.tensors().items():

@@ -20,7 +20,7 @@ from dyngs.data.loader import Picture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.trained import TrainedScene
 from dyngs.errors import DyngsError
-from dyngs.evaluate.metrics import Lpips, psnr
+from dyngs.metrics import Lpips, psnr
 from dyngs.evaluate.report import (
     evaluate_run,
     parameter_megabytes,

@@ -24,7 +24,7 @@ from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.train.trainer import train
+from dyngs.api.train import train
 from dyngs.view.animation import at_rest, with_motion
 
 

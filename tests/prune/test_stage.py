@@ -13,24 +13,24 @@ from torch import Tensor
 from dyngs.build import assemble
 from dyngs.camera import Cameras
 from dyngs.config import (
+    PruneConfig,
     Config,
     DataConfig,
     McmcStrategy,
-    PruneConfig,
     RandomInit,
     RunConfig,
     StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
-from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.frame_selection import spread
 from dyngs.deform.model import DynamicScene
 from dyngs.deform.trained import TrainedScene
 from dyngs.prune.stage import Compaction, compact_, distinct_cameras
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
 from dyngs.static.fixed import FixedDensifier
-from dyngs.train.step import Trainer
-from dyngs.train.trainer import train
+from dyngs.training.step import Trainer
+from dyngs.api.train import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STAGE = PruneConfig(share=0.5, max_loss=100.0, steps=6, mask_times=3, mask_below=1.0)
@@ -169,5 +169,5 @@ def test_cameras_of_a_standing_rig_are_taken_once() -> None:
     one, other = camera(), camera()
     moved = Cameras(other.cam_from_world + torch.tensor(0.5), other.intrinsics, other.width, other.height)
     assert distinct_cameras([one, moved, camera(), moved], 8) == [one, moved]
-    assert evenly_spaced(10, 3) == [0, 3, 6]
-    assert evenly_spaced(2, 3) == [0, 1]
+    assert spread(10, 3) == [0, 3, 6]
+    assert spread(2, 3) == [0, 1]

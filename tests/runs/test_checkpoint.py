@@ -253,22 +253,22 @@ def _header(**changes: object) -> dict[str, object]:
     return asdict(info) | changes
 
 
-@pytest.mark.parametrize("is_compact", [False, True])
+@pytest.mark.parametrize("has_only_scene_file", [False, True])
 @pytest.mark.parametrize("kind", CONTENTS)
 def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_picture(
-    tmp_path: Path, kind: str, is_compact: bool
+    tmp_path: Path, kind: str, has_only_scene_file: bool
 ) -> None:
     """The checksum fits; tensors lack, have other types, shapes and values, headers others kinds of fields."""
     (tensors, model), chance = contents(kind), random.Random(kind)
     save_config(Config(data=DataConfig(root=tmp_path), model=model), tmp_path / RESOLVED_NAME)
-    path = tmp_path / ("scene.dyngs" if is_compact else "checkpoints/step_0000007.safetensors")
+    path = tmp_path / ("scene.dyngs" if has_only_scene_file else "checkpoints/step_0000007.safetensors")
     path.parent.mkdir(exist_ok=True)
-    tensors = drawable(tensors) if is_compact else tensors
+    tensors = drawable(tensors) if has_only_scene_file else tensors
     refused, told = 0, []
     for trial in range(61):
         changed, header = forged(tensors, _header(), chance) if trial else (tensors, _header())
         try:
-            if is_compact:
+            if has_only_scene_file:
                 path.write_bytes(stored_as_they_are(changed, header))
             else:
                 write_tensors(path, checkpoint._KIND, changed, header)

@@ -19,13 +19,13 @@ from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.demo import unused_folder
 from dyngs.errors import DyngsError
 from dyngs.export.run_to_ply import write_run_ply_sequence
-from dyngs.prune.run import compact_run
+from dyngs.prune.run import prune_run
 from dyngs.runs.checkpoint import KEEP_CHECKPOINTS, checkpoint_paths, latest_checkpoint, load_run, save_checkpoint
 from dyngs.runs.folder import default_folder, new_folder, tidy
 from dyngs.runs.lock import LOCK_NAME, InUseError, writing
 from dyngs.runs.log import RunLog
-from dyngs.storage.run import write_compact
-from dyngs.train.trainer import train
+from dyngs.storage.run import write_scene_file
+from dyngs.api.train import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -74,10 +74,10 @@ Command = Callable[[Path, Path, Path], object]
 """Of the capture, a run, and where to."""
 COMMANDS: dict[str, Command] = {
     "train": lambda capture, run, out: train(config_of(capture, out)),
-    "compact": lambda capture, run, out: compact_run(
+    "compact": lambda capture, run, out: prune_run(
         run, out, ("prune.share=0.5", "prune.max_loss=100", "prune.steps=1", "run.threads=1")
     ),
-    "export": lambda capture, run, out: write_compact(run, out),
+    "export": lambda capture, run, out: write_scene_file(run, out),
     "resume": lambda capture, run, out: train(config_of(capture, out), resume_from=out),
     "synth": lambda capture, run, out: require_new_folder(out),
     "sequence": lambda capture, run, out: write_run_ply_sequence(load_run(run), out, (0.0, 1.0)),
@@ -160,20 +160,20 @@ def test_a_finished_run_that_cannot_be_written_is_finished(run_dir: Path, tmp_pa
 def test_a_run_that_is_only_stored_stays(still: Path, run_dir: Path, tmp_path: Path) -> None:
     """Its folder holds config.yaml and scene.dyngs, and no checkpoints."""
     out = tmp_path / "out"
-    write_compact(run_dir, out)
+    write_scene_file(run_dir, out)
     before = _contents(out)
     assert before.keys() == {"config.yaml", "scene.dyngs"}
     for resume in (None, out):
         with pytest.raises(DyngsError, match=r"scene\.dyngs|no checkpoints"):
             train(config_of(still, out), resume_from=resume)
     assert _contents(out) == before
-    write_compact(run_dir, out)  # the same run may be exported again
+    write_scene_file(run_dir, out)  # the same run may be exported again
     assert _contents(out) == before
     other = train(config_of(still, tmp_path / "other", seed=7))
     with pytest.raises(DyngsError, match="another run"):
-        write_compact(other, out)
+        write_scene_file(other, out)
     with pytest.raises(DyngsError, match="another run"):
-        write_compact(other, run_dir)
+        write_scene_file(other, run_dir)
     assert _contents(out) == before
 
 

@@ -55,7 +55,7 @@ def test_the_filter_is_kept_until_it_is_due() -> None:
     assert torch.equal(drawn(far).log_scales, with_near.log_scales)
     model.after_step(far, 100, None)
     assert torch.equal(drawn(far).log_scales, with_far.log_scales)
-    model.after_step(near, 101, EditResult(TopologyEdit.keep(torch.ones(3, dtype=torch.bool))))
+    model.after_step(near, 101, EditResult(TopologyEdit.select(torch.ones(3, dtype=torch.bool))))
     assert torch.equal(drawn(far).log_scales, with_near.log_scales)
     model.after_step(far, 102, EditResult(None))  # opacities were reset: where cameras look may have changed
     assert torch.equal(drawn(far).log_scales, with_far.log_scales)

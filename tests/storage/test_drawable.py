@@ -9,7 +9,7 @@ from tiny_fields import KINDS, cloud, stirred_field, tiny_options, tiny_setup
 
 from dyngs.config import DynamicModel, StaticModel
 from dyngs.deform.fields import field_state
-from dyngs.deform.masks import KeyMasks
+from dyngs.visibility import VisibilityMasks
 from dyngs.deform.trained import trained_scene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -99,7 +99,7 @@ def test_what_is_not_finite_is_refused() -> None:
 def masked_tensors() -> tuple[dict[str, torch.Tensor], DynamicModel]:
     """As ``moving_tensors``; each Gaussian is seen at one of three key times."""
     tensors, model = moving_tensors("trajectory")
-    masks = KeyMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])
+    masks = VisibilityMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])
     return tensors | {f"model.masks.{name}": x for name, x in masks.state().items()}, model
 
 

@@ -14,7 +14,7 @@ from moving_scene import write_moving_run
 from dyngs.errors import DyngsError
 from dyngs.tradeoff.distributed import SINGLE_PROCESS, ProcessGroup
 from dyngs.tradeoff.variants import Variant
-from dyngs.train.trainer import num_cores
+from dyngs.api.train import num_cores
 
 VARIANTS = st.builds(
     Variant,

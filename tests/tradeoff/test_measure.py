@@ -10,7 +10,7 @@ from moving_scene import Sliding, camera, moving_scene, still_scene
 from dyngs.config import StaticModel
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Picture
-from dyngs.evaluate.metrics import Lpips
+from dyngs.metrics import Lpips
 from dyngs.rendering import RenderOptions
 from dyngs.tradeoff.measure import (
     VariantRenderer,

@@ -22,7 +22,7 @@ from dyngs.tradeoff.report import write_report
 from dyngs.tradeoff.sweep import Plan, figures_of, sweep
 from dyngs.tradeoff.variant_runs import VariantRuns, field_changes, run_settings, write_chosen
 from dyngs.tradeoff.variants import Variant, parse_variations
-from dyngs.train.trainer import train
+from dyngs.api.train import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SETTINGS = ("prune=0.5", "mask_times=3", "sh_degree=0", "storage=2", "field_step=64", "alpha_min=0.02", "scale=0.5")

@@ -7,18 +7,18 @@ frames, J joints, N Gaussians, K joints that one follows.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dyngs.config import HumanModel
-from dyngs.deform.learned import LearnedTensors
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.posing import BodyPose, Skeleton
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.parameters import Parameters
+from dyngs.state import Role
 
 POSE_CM = 0.05
 """Turn of a joint, rad, that counts as much as a centimetre."""
@@ -37,64 +37,51 @@ class SharedCorrection:
     log_scale: float
 
 
-class Corrections:
-    """Learned differences to a clip of F frames, a skeleton and skinning weights.
+def new_corrections(options: HumanModel, clip: MotionClip, skeleton: Skeleton, anchors: Anchors) -> Parameters:
+    """Return differences, all zero, to a clip of F frames, a skeleton and skinning weights, to be learned.
 
     Names: ``poses`` (F, J, 3) axis-angle, applied before the given rotation of a joint; ``trans`` (F, 3); ``turns``
     (J, 3) as ``poses`` but of all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K); as an option
     ``pose_dirs`` (N, 27), see ``dyngs.human.avatar.posing.learned_offsets``.
     """
-
-    def __init__(self, options: HumanModel, clip: MotionClip, skeleton: Skeleton, anchors: Anchors) -> None:
-        self.options = options
-        unit = float(clip.scale.mean())
-        rates = {
-            "poses": options.lr_poses,
-            "trans": options.lr_trans * unit,
-            "turns": options.lr_turns,
-            "joints": options.lr_joints,
-            "log_scale": options.lr_log_scale,
-            "weights": options.lr_weights,
-            "pose_dirs": options.lr_pose_offsets,
-        }
-        zeros = {
-            "poses": torch.zeros_like(clip.poses),
-            "trans": torch.zeros_like(clip.trans),
-            "turns": torch.zeros_like(skeleton.joints),
-            "joints": torch.zeros_like(skeleton.joints),
-            "log_scale": torch.zeros(1),
-            "weights": torch.zeros_like(anchors.weights),
-        }
-        if options.pose_offsets:
-            zeros["pose_dirs"] = torch.zeros(len(anchors), 27)
-        self.learned = LearnedTensors(zeros, rates, options.lr_decay)
-
-    @property
-    def pose_dirs(self) -> Tensor | None:
-        """(N, 27), None where they are not learned."""
-        return self.learned["pose_dirs"] if self.options.pose_offsets else None
-
-    def follow(self, source: Tensor, is_new: Tensor) -> None:
-        """Rows of Gaussians descend from ``source``."""
-        for name in ("weights", "pose_dirs"):
-            if name in self.learned:
-                self.learned.select(name, source, is_new)
-
-    def penalties(self) -> dict[str, Tensor]:
-        """Weighted mean squares: fits and weights should stay near what was given."""
-        learned, options = self.learned, self.options
-        terms = {}
-        if options.pose_weight > 0:
-            turns = (learned["poses"].square().mean() + learned["turns"].square().mean()) / POSE_CM**2
-            terms["pose"] = options.pose_weight * (turns + (100 * learned["joints"]).square().mean())
-        if "pose_dirs" in learned and options.offset_weight > 0:
-            terms["pose offsets"] = options.offset_weight * (100 * learned["pose_dirs"]).square().sum(1).mean()
-        if options.weights_weight > 0:
-            terms["skinning weights"] = options.weights_weight * learned["weights"].square().mean()
-        return terms
+    unit = float(clip.scale.mean())
+    rates = {
+        "poses": options.lr_poses,
+        "trans": options.lr_trans * unit,
+        "turns": options.lr_turns,
+        "joints": options.lr_joints,
+        "log_scale": options.lr_log_scale,
+        "weights": options.lr_weights,
+        "pose_dirs": options.lr_pose_offsets,
+    }
+    zeros = {
+        "poses": torch.zeros_like(clip.poses),
+        "trans": torch.zeros_like(clip.trans),
+        "turns": torch.zeros_like(skeleton.joints),
+        "joints": torch.zeros_like(skeleton.joints),
+        "log_scale": skeleton.joints.new_zeros(1),
+        "weights": torch.zeros_like(anchors.weights),
+    }
+    if options.pose_offsets:
+        zeros["pose_dirs"] = anchors.weights.new_zeros(len(anchors), 27)
+    roles = dict.fromkeys(zeros, Role.SHARED) | dict.fromkeys(("weights", "pose_dirs"), Role.PER_GAUSSIAN)
+    return Parameters(zeros, rates, options.lr_decay, roles)
 
 
-def corrected_pose(learned: LearnedTensors | Mapping[str, Tensor], clip: MotionClip, row: int) -> BodyPose:
+def correction_penalties(learned: Parameters, options: HumanModel) -> dict[str, Tensor]:
+    """Return weighted mean squares: fits and weights should stay near what was given."""
+    terms = {}
+    if options.pose_weight > 0:
+        turns = (learned["poses"].square().mean() + learned["turns"].square().mean()) / POSE_CM**2
+        terms["pose"] = options.pose_weight * (turns + (100 * learned["joints"]).square().mean())
+    if "pose_dirs" in learned and options.offset_weight > 0:
+        terms["pose offsets"] = options.offset_weight * (100 * learned["pose_dirs"]).square().sum(1).mean()
+    if options.weights_weight > 0:
+        terms["skinning weights"] = options.weights_weight * learned["weights"].square().mean()
+    return terms
+
+
+def corrected_pose(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
     """The pose of frame ``row`` of the clip that was trained on."""
     own = axis_angle_to_matrix(learned["turns"] + learned["poses"][row])
     return BodyPose(
@@ -123,11 +110,11 @@ def corrected_clip(
     )
 
 
-def corrected_skeleton(learned: LearnedTensors | Mapping[str, Tensor], skeleton: Skeleton) -> Skeleton:
+def corrected_skeleton(learned: Parameters, skeleton: Skeleton) -> Skeleton:
     """Joints where they were learned to be."""
     return Skeleton(skeleton.joints + learned["joints"], skeleton.parents)
 
 
-def corrected_weights(learned: LearnedTensors | Mapping[str, Tensor], anchors: Anchors, num_joints: int) -> Tensor:
+def corrected_weights(learned: Parameters, anchors: Anchors, num_joints: int) -> Tensor:
     """(N, J) skinning weights."""
     return skinning_weights(anchors, num_joints, learned["weights"])

@@ -16,8 +16,8 @@ from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import texel_gaussians
-from dyngs.human.avatar.model import Subject
 from dyngs.human.avatar.posing import BodyPose, Skeleton, frame_pose, pose_blend_shapes
+from dyngs.human.avatar.subject import Subject
 from dyngs.human.motion.captured import captured_motion
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.model import Subject
+from dyngs.human.avatar.subject import Subject
 from dyngs.human.prediction.network import HEADS, AtlasNetwork
 from dyngs.human.prediction.person import CapturedPerson
 from dyngs.human.prediction.texel_maps import TexelMaps, from_atlas, to_atlas

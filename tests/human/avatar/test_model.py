@@ -20,7 +20,7 @@ from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import load_run, save_checkpoint, stored_scene
 from dyngs.static.densify import EditResult
 from dyngs.train.step import Trainer
-from dyngs.train.trainer import train
+from dyngs.api.train import train
 from dyngs.view.animation import at_rest, with_motion
 
 BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.11)

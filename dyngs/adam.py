@@ -1,0 +1,100 @@
+"""Moments of Adam (Kingma and Ba 2015) for named tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+import torch
+from torch import Tensor
+
+from dyngs.ops.adam import adam_step_
+from dyngs.state import Role, State, moved_to, prefixed, with_role
+from dyngs.tensor_checks import require_tensor
+
+MOMENTS = "exp_avg", "exp_avg_sq"
+"""Prefixes of the moments' names in a state."""
+
+
+class AdamState:
+    """First and second moments of named tensors.
+
+    Attributes:
+        exp_avg, exp_avg_sq: name to moment, of the shape of the tensor.
+    """
+
+    def __init__(self, exp_avg: dict[str, Tensor], exp_avg_sq: dict[str, Tensor]) -> None:
+        self.exp_avg, self.exp_avg_sq = exp_avg, exp_avg_sq
+
+    @staticmethod
+    def zero(tensors: Mapping[str, Tensor]) -> AdamState:
+        """Return the moments before the first update of ``tensors``."""
+        first, second = ({name: torch.zeros_like(x.detach()) for name, x in tensors.items()} for _ in MOMENTS)
+        return AdamState(first, second)
+
+    @staticmethod
+    def restored(stored: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> AdamState:
+        """Return the moments of ``tensors`` from what ``state`` returned.
+
+        Raises:
+            KeyError: a moment is missing.
+            ValueError: one is not like its tensor, or not finite.
+        """
+        first, second = (
+            {
+                name: require_tensor(f"{part}.{name}", stored[f"{part}.{name}"], tuple(x.shape), x.dtype).clone()
+                for name, x in tensors.items()
+            }
+            for part in MOMENTS
+        )
+        return AdamState(first, second)
+
+    def step_(
+        self, name: str, x: Tensor, *, lr: float | Tensor, step: int, eps: float = 1e-15, rows: Tensor | None = None
+    ) -> int:
+        """Update the leaf tensor ``x`` in place, drop its gradient, and return the number of rows left out.
+
+        Rows whose gradient is not finite are left out.
+
+        Args:
+            name: of the tensor.
+            x: (N, ...) with a gradient; nothing is done without one.
+            lr: one rate, or one per value of a row.
+            step: number of this update, from 1, for the bias correction.
+            eps: added to the root of the second moment.
+            rows: (N,) bool, the rows to update; None: all.
+        """
+        if x.grad is None:
+            return 0
+        arrays = x.detach(), x.grad, self.exp_avg[name], self.exp_avg_sq[name]
+        x.grad = None
+        return adam_step_(*arrays, lr=lr, step=step, eps=eps, rows=rows)
+
+    def step_along_last_axis_(self, name: str, x: Tensor, *, lr: float, step: int) -> int:
+        """As ``step_``; only the values along the last axis are a row, so that little is left out of a large array."""
+        if x.grad is None:
+            return 0
+        arrays = [_rows(a) for a in (x.detach(), x.grad, self.exp_avg[name], self.exp_avg_sq[name])]
+        x.grad = None
+        return adam_step_(*arrays, lr=lr, step=step)
+
+    def mapped(self, function: Callable[[Tensor], Tensor], names: Iterable[str] | None = None) -> AdamState:
+        """Return the moments with ``function`` applied to those of the named tensors; None: of all."""
+        chosen = set(self.exp_avg if names is None else names)
+        first, second = (
+            {name: function(x) if name in chosen else x for name, x in moments.items()}
+            for moments in (self.exp_avg, self.exp_avg_sq)
+        )
+        return AdamState(first, second)
+
+    def state(self) -> State:
+        """Return ``exp_avg.NAME`` and ``exp_avg_sq.NAME``."""
+        parts = zip(MOMENTS, (self.exp_avg, self.exp_avg_sq), strict=True)
+        return {k: x for part, moments in parts for k, x in prefixed(part, with_role(moments, Role.TRAINING)).items()}
+
+    def to(self, device: torch.device | str) -> AdamState:
+        """Return the moments on ``device``."""
+        return AdamState(moved_to(self.exp_avg, device), moved_to(self.exp_avg_sq, device))
+
+
+def _rows(x: Tensor) -> Tensor:
+    return x.reshape(-1, x.shape[-1]) if x.ndim > 1 else x

@@ -1,0 +1,142 @@
+"""From a trained network and a few pictures of a person to a run folder like that of a trained avatar."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from dyngs.build import assemble
+from dyngs.config import Config, DataConfig, HumanPredictorModel
+from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
+from dyngs.config.kinds import network_of, person_of
+from dyngs.errors import DyngsError
+from dyngs.human.prediction.person import CapturedPerson, named_views, spread_views
+from dyngs.human.prediction.predict import PredictedAvatar, predict_gaussians
+from dyngs.human.template.load import load_template
+from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
+from dyngs.runs.folder import new_folder, require_empty
+from dyngs.static.optimizer import GaussianOptimizer
+from dyngs.static.rates import Rates
+from dyngs.training.prediction import filmed, human_options, load_network, new_network, scene_of
+
+_FAINT = 0.02
+"""Opacity below which a predicted Gaussian is left out, as the preset for one person has it."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What ``predict_person`` made.
+
+    Attributes:
+        run_dir: the run folder.
+        views: names of the pictures that were predicted from.
+        num_gaussians: N.
+        seconds_maps: reading these pictures and bringing them to the atlas.
+        seconds_network: the network and its Gaussians.
+    """
+
+    run_dir: Path
+    views: tuple[str, ...]
+    num_gaussians: int
+    seconds_maps: float
+    seconds_network: float
+
+
+def predict_person(network_run: Path, capture: Path, out: Path, views: int | tuple[str, ...]) -> Prediction:
+    """The person of ``capture`` as a run folder ``out``, which all commands take; ``dyngs train --resume`` refines it.
+
+    Args:
+        network_run: run folder of ``model.kind: human_predictor``.
+        capture: of a person, in any format that has body parameters and silhouettes.
+        out: a new run folder.
+        views: how many of the training views to predict from, well spread; or their names.
+
+    Raises:
+        DyngsError: not such a run or capture, views that are not there, or an ``out`` that is not empty.
+    """
+    config, model = network_config(network_run)
+    require_empty(out)  # before the work
+    checkpoint = latest_checkpoint(network_run)
+    network = new_network(model, torch.Generator())
+    mean = load_network(network, checkpoint, model.resolution)
+    data = config.data.model_copy(update={"root": capture.absolute()})
+    person = filmed(data, model, load_template(human_options(model)))
+    chosen = _chosen(person.sitter, views)
+    start = time.perf_counter()
+    maps = person.look(chosen)
+    middle = time.perf_counter()
+    with torch.no_grad():
+        avatar = without_faint(predict_gaussians(person.sitter, maps, mean, network, model.min_silhouette_share))
+    end = time.perf_counter()
+    write_run(out, avatar, data, model, end - start)
+    names = tuple(person.sitter.views[i].name for i in chosen)
+    return Prediction(out, names, len(avatar.gaussians), middle - start, end - middle)
+
+
+def network_config(run_dir: Path) -> tuple[Config, HumanPredictorModel]:
+    """Return the configuration of the run of a network, and its model section.
+
+    Raises:
+        DyngsError: the run is of something else.
+    """
+    config = load_resolved(run_dir)
+    model = network_of(config)
+    if model is None:
+        raise DyngsError(
+            f"{run_dir}: a run of model.kind={config.model.kind}; a prediction needs one of human_predictor"
+        )
+    return config, model
+
+
+def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: HumanPredictorModel, seconds: float) -> None:
+    """Write ``avatar`` as a run of the preset for one person after no step; ``seconds`` is what it took so far."""
+    preset = load_config(packaged_preset("human"), ["data.root=."])
+    person = person_of(preset)
+    if person is None:
+        raise ValueError(f"the preset of one person is of model.kind={preset.model.kind}")
+    same = (
+        "body",
+        "uv",
+        "resolution",
+        "scaffold_heights",
+        "min_silhouette_share",
+        "near",
+        "eps2d",
+        "rasterize_mode",
+        "sh_degree",
+    )
+    given = human_options(model)
+    human = person.model_copy(update={name: getattr(given, name) for name in same})
+    config = preset.model_copy(
+        update={
+            "data": data,
+            "model": human,
+            "run": preset.run.model_copy(update={"name": out.name, "dir": out}),
+        }
+    )
+    trainer = assemble(config)
+    scene, training = scene_of(human, avatar, Rates(config.train.steps))
+    optimizer = GaussianOptimizer(avatar.gaussians, config.optim)
+    scene = replace(scene.with_gaussians(optimizer.parameters), colour=trainer.scene.colour)
+    trainer = replace(trainer, scene=scene, training=training, optimizer=optimizer)
+    with new_folder(out) as started:
+        save_config(config, started / RESOLVED_NAME)
+        save_checkpoint(started, trainer.checkpoint(), seconds)
+
+
+def without_faint(avatar: PredictedAvatar) -> PredictedAvatar:
+    """Without Gaussians that are hardly there."""
+    kept = avatar.gaussians.opacities >= _FAINT
+    anchors = avatar.subject.anchors.select(kept)
+    return PredictedAvatar(avatar.gaussians.select(kept), replace(avatar.subject, anchors=anchors))
+
+
+def _chosen(sitter: CapturedPerson, views: int | tuple[str, ...]) -> list[int]:
+    if isinstance(views, tuple):
+        return named_views(sitter, views)
+    if not 1 <= views <= len(sitter.views):
+        raise DyngsError(f"{sitter.name}: cannot choose {views} of its {len(sitter.views)} training views")
+    return spread_views(sitter, views)

@@ -1,0 +1,248 @@
+"""Train a run: its folder, its checkpoints and log, its limits, and the loop between them."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol
+
+from torch import Tensor
+
+from dyngs.budget.count import count_limit
+from dyngs.budget.run import LimitedRun
+from dyngs.budget.size import has_file, write_within
+from dyngs.budget.speed import SpeedLimit
+from dyngs.budget.time import Deadline, first_fit, refitted
+from dyngs.build import build
+from dyngs.config import Config
+from dyngs.evaluate.report import evaluate_run
+from dyngs.ops.memory import keep_freed_memory
+from dyngs.ops.native import kernel_threads
+from dyngs.prune.stage import PruneStage
+from dyngs.runs.checkpoint import (
+    Checkpoint,
+    checkpoint_paths,
+    last_good,
+    latest_checkpoint,
+    remove_old_checkpoints,
+    save_checkpoint,
+    seconds_at,
+    step_of,
+)
+from dyngs.runs.folder import begin, default_folder, require_startable, tidy, was_only_begun
+from dyngs.runs.lock import writing
+from dyngs.runs.log import RunLog
+from dyngs.runs.progress import Progress
+from dyngs.training.events import Evaluated, Event, Listener, Saved, StepDone
+from dyngs.training.interrupt import Interrupts
+from dyngs.training.limits import require_possible
+from dyngs.training.loop import Loop, Stopwatch
+
+_COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"
+"""Parts of a checkpoint: what was done for limits."""
+
+
+class Limit(Protocol):
+    """A listener whose state belongs into checkpoints."""
+
+    def __call__(self, event: Event) -> None: ...
+
+    def state(self) -> dict[str, Tensor]: ...
+
+    def restore(self, stored: dict[str, Tensor]) -> None: ...
+
+    def reached(self) -> str:
+        """Return the line about the limit after a run."""
+        ...
+
+
+def train(config: Config, *, resume_from: Path | None = None, listeners: Sequence[Listener] = ()) -> Path:
+    """Train and return the run folder.
+
+    Args:
+        config: everything that decides the run; on resuming, that of the run folder.
+        resume_from: a run folder to go on with, from its newest checkpoint, or from the beginning where it was stopped
+            before its first: the result has the same bytes as if the run had never stopped.
+        listeners: are told everything that happens, see ``dyngs.training.events``.
+
+    Raises:
+        DyngsError: bad input, a run folder that already holds a run or that another process writes into, a budget that
+            cannot be kept, a loss that is not finite, a full disk.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how to go on.
+    """
+    folder = resume_from or config.run.dir or default_folder(config.run.name)
+    require_possible(config)
+    if resume_from is not None and (not folder.is_dir() or _is_done_and_read_only(config, folder)):
+        latest_checkpoint(folder)
+        return folder
+    keep_freed_memory()
+    with writing(folder) as is_sole_writer, kernel_threads(config.run.threads or num_cores()):
+        tidy(folder, sole_writer=is_sole_writer)
+        resumed = _start_of_run(config, folder, resuming=resume_from is not None)
+        if resumed is not None and resumed.info.step >= config.total_steps and not _owes_file(config, folder):
+            return folder
+        _Run(config, folder, resumed).run(listeners)
+    return folder
+
+
+class _Run:
+    """A run from the reading of its capture to its last line.
+
+    Args:
+        config: of the run.
+        folder: of the run.
+        resumed: what it goes on from; None: it begins.
+    """
+
+    def __init__(self, config: Config, folder: Path, resumed: Checkpoint | None) -> None:
+        watch = Stopwatch()
+        built = build(config, restored=resumed is not None)
+        self.folder, self.limits = folder, dict[str, Limit]()
+        self.loop = Loop(built.trainer, config.total_steps, watch, lambda: last_good(folder))
+        if resumed is not None:
+            built.trainer.restore(resumed)
+            watch.pause(-seconds_at(folder, resumed.info.step))
+        self.limited = (
+            None if built.scene_trainer is None else LimitedRun(folder, config, self.loop, built.scene_trainer)
+        )
+        self._config, self._saved = config, self.loop.trainer.done
+        if self.limited is not None:
+            self._set_limits(self.limited, resumed)
+        if resumed is None:
+            begin(folder, self.config)
+
+    @property
+    def config(self) -> Config:
+        """As it is saved; limits may change the number of steps."""
+        return self._config if self.limited is None else self.limited.config
+
+    def run(self, listeners: Sequence[Listener]) -> None:
+        """Step until the end, or until interrupted, and keep the limits."""
+        options, loop, done = self.config.train, self.loop, self.loop.trainer.done
+        with (
+            RunLog(self.folder, done, every=options.log_every, tensorboard=options.tensorboard) as log,
+            Progress(loop.total, done, options.log_every) as progress,
+            Interrupts() as interrupts,
+        ):
+            loop.subscribe(*self.limits.values(), log, progress, *listeners, self._save_and_evaluate)
+            limited = self.limited
+            if limited is not None:
+                loop.subscribe(PruneStage(loop, lambda: limited.trainer))
+            loop.run(lambda: interrupts.requested)
+            if loop.trainer.done < loop.total:
+                if loop.trainer.done > self._saved:
+                    self._save()
+                raise KeyboardInterrupt(
+                    f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume {self.folder}"
+                )
+        for line in self._reached():
+            print(line, flush=True)
+
+    def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None) -> None:
+        """Prepare what keeps the limits of the configuration; measure before training what must be known then."""
+        budget, speed = run.config.budget, None
+        if budget.min_fps is not None:
+            speed = SpeedLimit(run, budget.min_fps)
+            if resumed is not None:
+                speed.restore(resumed.part(_SPEED))
+            speed.begin()
+        if budget.max_minutes is not None:
+            run.given = 60 * budget.max_minutes
+            wanted, begun = run.config.train.steps, run.used
+            if resumed is None:
+                run.config = first_fit(run.config, run.trainer, run.used + run.reserve)
+                begun = run.used
+                run.exchange(refitted(run.trainer, run.config))
+                self.loop.total = run.config.total_steps
+            self.limits[_TIME] = Deadline(
+                run,
+                wanted,
+                fits=resumed is None,
+                refit_seconds=run.used - begun,
+                save=self._save,
+                on_refit=(lambda: None) if speed is None else speed.hold,
+            )
+        count = count_limit(run)
+        if count is not None:
+            self.limits[_COUNT] = count
+            if resumed is not None:
+                count.restore(resumed.part(_COUNT))
+        if speed is not None:
+            self.limits[_SPEED] = speed
+
+    def _save_and_evaluate(self, event: Event) -> None:
+        """Save and evaluate when it is time to."""
+        match event:
+            case StepDone():
+                options, step = self.config.train, event.step
+                evaluates = options.eval_every > 0 and step % options.eval_every == 0
+                is_last = step == options.steps or event.is_last
+                if evaluates or is_last or (options.save_every > 0 and step % options.save_every == 0):
+                    self._save()
+                if evaluates and event.loop.trainer.has_test_views:
+                    self._evaluate(step)
+
+    def _save(self) -> None:
+        checkpoint = self.loop.trainer.checkpoint()
+        for part, limit in self.limits.items():
+            kept = {f"{part}.{name}": x for name, x in limit.state().items()}
+            checkpoint = replace(checkpoint, tensors=checkpoint.tensors | kept)
+        path = save_checkpoint(self.folder, checkpoint, self.loop.watch.seconds)
+        self._saved = self.loop.trainer.done
+        self.loop.tell(Saved(self._saved, path))
+
+    def _evaluate(self, step: int) -> None:
+        """Tell the scores of the test split."""
+        start = time.perf_counter()
+        report = evaluate_run(self.folder, "test")
+        seconds = time.perf_counter() - start
+        self.loop.watch.pause(seconds)
+        self.loop.tell(Evaluated(step, "test", report.psnr, report.ssim, seconds))
+
+    def _reached(self) -> Iterator[str]:
+        """Yield a line for each limit; what is still owed is done before its line."""
+        for part in (_COUNT, _TIME):
+            if part in self.limits:
+                yield self.limits[part].reached()
+        if self.limited is not None and self.config.budget.max_mb is not None:
+            yield str(write_within(self.limited.trainer, self.folder, self.config.budget.max_mb))
+        if _SPEED in self.limits:
+            yield self.limits[_SPEED].reached()
+
+
+def _is_done_and_read_only(config: Config, folder: Path) -> bool:
+    """Return whether nothing is to be done in the run folder, and nothing can be."""
+    paths = checkpoint_paths(folder)
+    is_done = bool(paths) and step_of(paths[-1]) >= config.total_steps and not _owes_file(config, folder)
+    return is_done and not os.access(folder, os.W_OK)
+
+
+def _owes_file(config: Config, folder: Path) -> bool:
+    return config.budget.max_mb is not None and not has_file(folder)
+
+
+def _start_of_run(config: Config, folder: Path, *, resuming: bool) -> Checkpoint | None:
+    """Return the checkpoint to go on from, or None for a run that begins: a new one, or one stopped before its first.
+
+    Raises:
+        DyngsError: resuming where no run was begun, or a new run where something is that it would replace.
+    """
+    if not resuming:
+        require_startable(folder, config)
+        return None
+    if was_only_begun(folder):
+        return None
+    checkpoint = latest_checkpoint(folder)
+    remove_old_checkpoints(folder)
+    return checkpoint
+
+
+def num_cores() -> int:
+    """Return the number of cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on Linux
+        return os.cpu_count() or 1

@@ -1,0 +1,84 @@
+"""A run whose result is limited: what the limits look at and change."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from dyngs.config import Config
+from dyngs.prune.stage import training_quality
+from dyngs.training.events import Message, TopologyChanged
+from dyngs.training.loop import Loop
+from dyngs.training.trainer import Trainer
+
+STAGES = (0.7, 0.9)
+"""Shares of a run after which Gaussians are removed where that is needed, with steps left for the others to adapt."""
+
+
+@dataclass
+class LimitedRun:
+    """A run with limits.
+
+    Attributes:
+        folder: of the run.
+        config: as it is saved there; that of the trainer has its limits applied.
+        loop: its steps.
+        trainer: of its scene.
+        given: seconds that it has.
+        reserve: seconds that its limits need before the end.
+    """
+
+    folder: Path
+    config: Config
+    loop: Loop
+    trainer: Trainer
+    given: float = math.inf
+    reserve: float = 0.0
+
+    @property
+    def used(self) -> float:
+        """Seconds of training so far."""
+        return self.loop.watch.seconds
+
+    @property
+    def stage(self) -> int:
+        """How many stages of removal the run has come to; the last is its end."""
+        return stage(self.config, self.trainer.done, self.used / self.given)
+
+    def exchange(self, trainer: Trainer) -> None:
+        """Go on with another trainer."""
+        self.trainer = self.loop.trainer = trainer
+
+    def remove(self, kept: Tensor) -> tuple[float, float]:
+        """Leave only the Gaussians ``kept`` (N,); return the quality of training pictures before and after, dB."""
+        trainer = self.trainer
+        before, count = training_quality(trainer, trainer.scene), trainer.num_gaussians
+        trainer.keep(kept)
+        self.loop.tell(TopologyChanged(trainer.done, count, trainer.num_gaussians))
+        return before, training_quality(trainer, trainer.scene)
+
+    def say(self, text: str) -> None:
+        """Tell people."""
+        self.loop.tell(Message(text))
+
+
+def stage(config: Config, step: int, share: float = 0.0) -> int:
+    """Return how many stages of removal a run has come to after ``step``; the last is its end.
+
+    Where pruning follows training, its beginning is the first stage, and the others are shares of it.
+
+    Args:
+        config: of the run.
+        step: done.
+        share: of its time that is used.
+    """
+    steps, total = config.train.steps, config.total_steps
+    if step > steps:
+        later = (step - steps) / (total - steps)
+        return len(STAGES) + 2 + sum(later >= x for x in (*STAGES, 1.0))
+    if total > steps:
+        return 0
+    return sum(max(step / steps, share) >= x for x in STAGES) + (step == steps)

@@ -1,0 +1,172 @@
+"""The dynamic scene: canonical Gaussians, and a field that moves some of them over time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyngs.config import DynamicModel
+from dyngs.deform.field import DeformationField, Offsets, deformed
+from dyngs.deform.fields import field_state, restored_field
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.scene import Moment, Scene
+from dyngs.state import Role, State, StateTensor, part_of, prefixed
+from dyngs.static.scene import filter_state, filtered, stored_filter, stored_times, times_state
+from dyngs.tensor_checks import require_ascending, require_indices
+from dyngs.visibility import VisibilityMasks, matched
+
+_NONE = torch.zeros(0, dtype=torch.long)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DynamicScene(Scene):
+    """N canonical Gaussians of which a field moves M.
+
+    Attributes:
+        seen_at: distinct training times in [0, 1], ascending.
+        field: None before motion begins, and for good where nothing moves.
+        moving: (M,) ascending indices of the Gaussians that it moves.
+        filter_std: (N,) standard deviations of Mip-Splatting's 3D filter, world units; None without one.
+    """
+
+    seen_at: tuple[float, ...]
+    field: DeformationField | None = None
+    moving: Tensor = _NONE
+    filter_std: Tensor | None = None
+
+    @staticmethod
+    def restored(options: DynamicModel, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
+        """Return the scene of what ``state`` returned.
+
+        Raises:
+            KeyError: a tensor is missing.
+            ValueError: one is not as the others and the options have it.
+        """
+        count = len(gaussians)
+        own = part_of(tensors, "field")
+        std, times = stored_filter(tensors, count), stored_times(tensors)
+        if not own:
+            return DynamicScene(gaussians=gaussians, seen_at=times, filter_std=std)
+        masks = VisibilityMasks.restored(part_of(tensors, "masks"), count)
+        rows = tensors.get("rows", torch.arange(count))
+        require_ascending("rows", require_indices("rows", rows, (None,), count))
+        field = restored_field(options.deform, own, len(rows))
+        return DynamicScene(gaussians=gaussians, seen_at=times, field=field, moving=rows, masks=masks, filter_std=std)
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        return self.seen_at
+
+    @property
+    def is_still(self) -> bool:
+        return self.field is None or len(self.moving) == 0
+
+    @property
+    def rows(self) -> Tensor:
+        return self.moving
+
+    @property
+    def offset_rows(self) -> Tensor:
+        return self.moving
+
+    @property
+    def num_motion_values(self) -> int:
+        return 0 if self.field is None or self.is_still else self.field.num_values
+
+    def moment(self, time: float | None) -> Moment:
+        """Return all N Gaussians at ``time``, or with masks only those that are seen around then, in their order.
+
+        What does not move is not computed anew.
+        """
+        now = clamped_time(time)
+        if self.field is None or self.is_still:
+            return Moment(filtered(self.gaussians, self.filter_std), now)
+        return Moment(self.deformed_at(now)[0], now)
+
+    def deformed_at(self, time: float, *, detach: bool = False) -> tuple[Gaussians, Offsets]:
+        """Return the Gaussians drawn at ``time``, and the offsets of those of them that move.
+
+        Args:
+            time: in [0, 1].
+            detach: gradients reach the field alone, not the canonical Gaussians.
+        """
+        if self.field is None:
+            raise ValueError("nothing moves")
+        part = self._drawn_around(time, detach=detach)
+        offsets = self.field.offsets(part.moving_means, time, part.asked)
+        return filtered(deformed(part.gaussians, offsets, part.rows), part.filter_std), offsets
+
+    def edited(self, edit: TopologyEdit) -> DynamicScene:
+        position = torch.full((len(self),), -1)
+        position[self.moving] = torch.arange(len(self.moving))
+        descent = position[edit.source]
+        rows = torch.nonzero(descent >= 0)[:, 0]
+        field = self.field
+        if field is not None:
+            field = field.edited(TopologyEdit(descent[rows], edit.is_new[rows]))
+        return replace(
+            self,
+            gaussians=self.gaussians.edited(edit),
+            moving=rows,
+            field=field,
+            masks=None if self.masks is None else self.masks.select(edit.source),
+            filter_std=None if self.filter_std is None else edit.apply(self.filter_std),
+        )
+
+    def _model_state(self) -> State:
+        state = filter_state(self.filter_std) | times_state(self.seen_at)
+        if self.field is not None:
+            state |= prefixed("field", field_state(self.field))
+            state["rows"] = StateTensor(self.moving, Role.SHARED)
+        return state if self.masks is None else state | prefixed("masks", self.masks.state())
+
+    def _drawn_around(self, time: float, *, detach: bool) -> _Part:
+        """Return what is drawn around ``time``; without gradients, that of the last interval of the masks is kept."""
+        interval = 0 if self.masks is None else self.masks.interval(time)
+        if torch.is_grad_enabled():
+            return self._selected(self.gaussians.detach() if detach else self.gaussians, interval)
+        if interval not in self._derived:
+            self._derived.clear()
+            self._derived[interval] = self._selected(self.gaussians, interval)
+        return self._derived[interval]
+
+    def _selected(self, gaussians: Gaussians, interval: int) -> _Part:
+        means = gaussians.means.index_select(0, self.moving)
+        if self.masks is None:
+            rows = None if len(self.moving) == len(self) else self.moving
+            return _Part(gaussians, self.filter_std, means, None, rows)
+        active = self.masks.active(interval)
+        std = None if self.filter_std is None else self.filter_std[active]
+        asked, rows = matched(self.moving, active, len(self))
+        return _Part(gaussians.picked(active), std, means, asked, rows)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What is drawn around a time.
+
+    Attributes:
+        gaussians: A canonical ones.
+        filter_std: (A,) of theirs, or None.
+        moving_means: (M, 3) canonical means of all that move.
+        asked: which of the M are drawn; None: all.
+        rows: their places among the A; None: all of them, in order.
+    """
+
+    gaussians: Gaussians
+    filter_std: Tensor | None
+    moving_means: Tensor
+    asked: Tensor | None
+    rows: Tensor | None
+
+
+def clamped_time(time: float | None) -> float:
+    """Return ``time`` within [0, 1]; None is 0. Raises DyngsError for NaN."""
+    if time is not None and math.isnan(time):
+        raise DyngsError("the time to draw is not a number; give one from 0 to 1")
+    return min(max(0.0 if time is None else time, 0.0), 1.0)

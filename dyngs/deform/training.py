@@ -1,0 +1,218 @@
+"""How a dynamic scene is trained.
+
+Training goes through three phases: coarse (nothing moves), fine (the field moves all Gaussians), and from the first
+split on the field moves only those whose motion can be seen; the others are frozen and cost nothing more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.config import DynamicModel
+from dyngs.data.loader import Picture
+from dyngs.deform.field import FieldSetup, Offsets, deformed
+from dyngs.deform.fields import new_field
+from dyngs.deform.motion import bake_, measure_motion
+from dyngs.deform.residual import Residuals, two_group_threshold
+from dyngs.deform.scene import DynamicScene
+from dyngs.deform.seeds import box_of, seeded
+from dyngs.deform.window import TimeWindow
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.scene import Moment, Scene
+from dyngs.state import State
+from dyngs.static.filters import FILTER_VARIANCE, filter_std
+from dyngs.static.rates import Rates
+from dyngs.static.training import FilterUpdate
+
+SURELY_MOVING = 1.5
+"""Errors so many times ``motion_threshold`` are never taken for those of still things."""
+SURELY_STILL = 0.25
+"""Where cameras stay in place, errors of so many times ``motion_threshold`` are those of still things."""
+MIN_MOVING_SHARE = 0.02
+"""If no larger share of the Gaussians surely moves, nothing does."""
+
+
+@dataclass(frozen=True)
+class DeformSchedule:
+    """When the phases begin, in steps of this run.
+
+    Attributes:
+        fine: last step without motion.
+        opens, full: steps between which the window of times grows, to all of them.
+        decays: step from which the field's rates fall.
+        splits: steps after which Gaussians that do not move are frozen.
+        rates: how the field's rates fall.
+    """
+
+    fine: int
+    opens: int
+    full: int
+    decays: int
+    splits: tuple[int, ...]
+    rates: Rates
+
+
+@dataclass(frozen=True)
+class TrainingViews:
+    """What the training of a dynamic scene needs to know of its capture.
+
+    Attributes:
+        times: of the training views, in [0, 1], ascending; at least two differ.
+        cameras: the training cameras.
+        extent: of the scene, world units.
+        residuals: how far its pictures disagree with what is still, where N Gaussians are seen.
+        cameras_stay: in place, so that pictures show what is still exactly alike.
+    """
+
+    times: tuple[float, ...]
+    cameras: Sequence[Cameras]
+    extent: float
+    residuals: Callable[[Callable[[float], Gaussians]], Residuals]
+    cameras_stay: bool = False
+
+
+class DynamicTraining:
+    """See ``SceneTraining``.
+
+    Attributes:
+        window: which of the times are trained on.
+    """
+
+    moves_by = ("field", "model.deform")
+
+    def __init__(
+        self,
+        options: DynamicModel,
+        schedule: DeformSchedule,
+        capture: TrainingViews,
+        update: FilterUpdate,
+        generator: torch.Generator,
+    ) -> None:
+        self.options, self.schedule, self.capture = options, schedule, capture
+        self.times = tuple(sorted(set(capture.times)))
+        phases = schedule.fine, schedule.opens, schedule.full
+        self._window = TimeWindow.around_middle(capture.times, options.time_window, *phases)
+        self._update, self._generator = update, generator
+
+    def first_scene(self, gaussians: Gaussians) -> DynamicScene:
+        """Return the scene of the first Gaussians: nothing moves yet."""
+        return DynamicScene(gaussians=gaussians, seen_at=self.times, filter_std=self._update.of(gaussians))
+
+    def trains_on(self, time: float | None, step: int) -> bool:
+        """Return whether ``time`` lies in the window of ``step``."""
+        return self._window.holds(time or 0.0, step)
+
+    def window(self, step: int) -> tuple[float, float]:
+        return self._window.bounds(step)
+
+    def extend(self, scene: DynamicScene, seen: tuple[float, float], step: int) -> None:
+        if scene.field is not None:
+            scene.field.extend(seen, self._window.bounds(step))
+
+    def moment(self, scene: DynamicScene, picture: Picture, step: int) -> Moment:
+        """Return what is drawn for ``picture`` at its time, and the regularizers of motion."""
+        if scene.field is None:
+            return scene.moment(picture.time)
+        time = self._jittered(picture.time or 0.0, step)
+        gaussians, offsets = scene.deformed_at(time, detach=self._window.tracks(step))
+        return Moment(gaussians, picture.time, None, scene.field.penalties(time) | self._sparsity(offsets))
+
+    def optimize(self, scene: DynamicScene, step: int) -> int:
+        """Update the field."""
+        if scene.field is None:
+            return 0
+        progress = self.schedule.rates.progress(step, since=self.schedule.decays)
+        return scene.field.parameters.step(step - self.schedule.fine, progress)
+
+    def after_step(self, scene: DynamicScene, step: int, edited: bool) -> DynamicScene:
+        """Return the scene with its filter up to date, the field extended to new times, still Gaussians frozen."""
+        if self._update.is_due(step, edited):
+            scene = replace(scene, filter_std=self._update.of(scene.gaussians))
+        if scene.field is None:
+            return scene
+        if edited:
+            scene.field.regroup()
+        scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
+        return self._frozen(scene) if step in self.schedule.splits else scene
+
+    def grown(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
+        """Return the scene with random Gaussians to begin motion with; None where a still model explains all."""
+        if step != self.schedule.fine:
+            return None
+        now = scene.gaussians
+        found = self.capture.residuals(lambda _: now)
+        floor = self.options.motion_threshold
+        if not bool((found.most > SURELY_MOVING * floor).float().mean() > MIN_MOVING_SHARE):
+            return None
+        threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
+        rows = torch.nonzero(found.usual > threshold)[:, 0]
+        result = seeded(now.detach(), self.options.num_random_moving, self.capture.extent, self._generator)
+        added = torch.arange(len(now), len(now) + self.options.num_random_moving)
+        moving = torch.cat([rows, added])
+        center, half_size = box_of(now, self.capture.extent)
+        setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
+        field = new_field(self.options.deform, setup, self._generator)
+        gaussians = Gaussians(**result.changes)
+        std = self._update.of(gaussians)
+        return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
+
+    def all_moving(self, scene: DynamicScene, extent: float) -> DynamicScene:
+        if not scene.is_still:
+            return scene
+        count, means = len(scene), scene.gaussians.means.detach()
+        setup = FieldSetup(means.mean(0), torch.full_like(means[0], extent), len(self.times), count, extent)
+        field = new_field(self.options.deform, setup, torch.Generator())
+        return replace(scene, moving=torch.arange(count), field=field)
+
+    def follow(self, edit: TopologyEdit) -> None:
+        """Do nothing: nothing is kept per Gaussian."""
+
+    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> DynamicScene:
+        scene = DynamicScene.restored(self.options, gaussians, tensors)
+        return replace(scene, colour=like.colour, options=like.options, background=like.background)
+
+    def state(self) -> State:
+        return {}
+
+    def _frozen(self, scene: DynamicScene) -> DynamicScene:
+        """Return the scene in which Gaussians whose motion is too small to be seen no longer move."""
+        field, now = scene.field, scene.gaussians.detach()
+        if field is None:
+            return scene
+        px_size = filter_std(now.means, self.capture.cameras)[scene.moving] / math.sqrt(FILTER_VARIANCE)
+        motion = measure_motion(field, now.select(scene.moving), self.times, px_size)
+        moves = motion.pixels >= self.options.freeze_below_px
+        if self.capture.cameras_stay:
+            means = now.means[scene.moving]
+            seen = self.capture.residuals(lambda time: deformed(now, field.offsets(means, time), scene.moving))
+            moves &= seen.usual[scene.moving] > SURELY_STILL * self.options.motion_threshold
+        still = torch.nonzero(~moves)[:, 0]
+        bake_(scene.gaussians, scene.moving[still], motion.mean.select(still))
+        kept = torch.nonzero(moves)[:, 0]
+        if not len(kept):
+            return replace(scene, field=None, moving=scene.moving[kept])
+        left = field.edited(TopologyEdit.select(kept))
+        left.regroup()
+        return replace(scene, field=left, moving=scene.moving[kept])
+
+    def _jittered(self, time: float, step: int) -> float:
+        """Return ``time`` with the annealed noise of Deformable-3DGS (Yang et al. 2024), against frames that overfit."""
+        if self.options.time_jitter == 0:
+            return time
+        gap = 1 / max(len(self.times) - 1, 1)
+        noise = float(torch.randn((), generator=self._generator)) * self.options.time_jitter * gap
+        return min(max(time + noise * max(0.0, 1 - step / self.schedule.rates.steps), 0.0), 1.0)
+
+    def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
+        """Return the mean motion as a penalty: what need not move should not."""
+        if self.options.motion_sparsity == 0 or not len(offsets.means):
+            return {}
+        tiny = 1e-6 * self.capture.extent
+        length = (offsets.means.square().sum(1) + tiny**2).sqrt().mean()
+        return {"motion sparsity": length * (self.options.motion_sparsity / self.capture.extent)}

@@ -1,0 +1,64 @@
+"""The person that is filmed, and the first Gaussians on its template: in the colours and silhouettes of pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from dyngs.conventions import SH_C0
+from dyngs.data.loader import Picture
+from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.anchors import Anchors, skinning_weights
+from dyngs.human.avatar.observations import SurfacePoints, observe_points
+from dyngs.human.avatar.posing import BodyPose, PoseBlendShapes, Skeleton, frame_pose, rest_offsets
+from dyngs.human.motion.captured import CapturedMotion
+from dyngs.human.template.atlas import Texels
+
+NEIGHBOURS = 5
+CENTIMETRE = 0.01
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Who is filmed: the template's skeleton, what ties the first N Gaussians to it, and the poses of the pictures.
+
+    ``shapes`` are the template's pose blend shapes, None where it has none.
+    """
+
+    skeleton: Skeleton
+    anchors: Anchors
+    footage: CapturedMotion
+    shapes: PoseBlendShapes | None = None
+
+
+def first_look(
+    gaussians: Gaussians, texels: Texels, subject: Subject, pictures: Iterable[Picture], carve: float
+) -> tuple[Gaussians, Subject]:
+    """Those of the first Gaussians that pictures can hold, in the colours that they show.
+
+    Gaussians above the lowest scaffold are kept if they lie inside the silhouette of a share ``carve`` of the pictures.
+
+    Args:
+        gaussians: P times the number of scaffolds, as ``texel_gaussians`` orders them.
+        texels: P.
+        subject: whose anchors are those of ``gaussians``.
+        pictures: some of those to train on.
+    """
+    clip, anchors, skeleton = subject.footage.clip, subject.anchors, subject.skeleton
+    rows = {frame: row for row, frame in enumerate(subject.footage.frames)}
+    shown = ((picture, frame_pose(clip, rows[picture.frame or 0])) for picture in pictures)
+    normals = texels.normals.repeat(len(anchors) // max(len(texels), 1), 1)
+    weights = skinning_weights(anchors, len(skeleton.joints))
+
+    def offsets(posing: BodyPose) -> Tensor | None:
+        return rest_offsets(anchors, weights, posing, subject.shapes, None)
+
+    found = observe_points(SurfacePoints(anchors.points, normals, weights, offsets), skeleton, shown)
+    sh = gaussians.sh.clone()
+    sh[:, 0] = (found.rgb - 0.5) / SH_C0
+    kept = found.inside >= carve
+    kept[: len(texels)] = True
+    gaussians = gaussians.replace(sh=sh).select(kept)
+    return gaussians, replace(subject, anchors=anchors.select(kept))

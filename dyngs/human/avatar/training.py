@@ -1,0 +1,160 @@
+"""How an avatar is trained: in the pose of every picture, with the fit of its body refined."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from torch import Tensor
+
+from dyngs.colour.network import Frame
+from dyngs.config import HumanModel
+from dyngs.data.loader import Picture
+from dyngs.errors import DyngsError
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.human.avatar.corrections import correction_penalties, new_corrections
+from dyngs.human.avatar.neighbours import nearest_neighbours
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.avatar.subject import Subject
+from dyngs.scene import Moment, Scene
+from dyngs.state import Role, State, StateTensor
+from dyngs.static.rates import Rates
+
+NEIGHBOURS = 5
+CENTIMETRE = 0.01
+
+
+class HumanTraining:
+    """See ``SceneTraining``.
+
+    Args:
+        options: of the model.
+        frames: number of the frame of each row of the clip of training.
+        rates: how learning rates fall.
+    """
+
+    moves_by = ("pose", "model")
+
+    def __init__(self, options: HumanModel, frames: Sequence[int], rates: Rates) -> None:
+        self.options, self.rates = options, rates
+        self.refines_from = round(options.refine_from * rates.steps)
+        self._rows = {frame: row for row, frame in enumerate(frames)}
+        self._given_weights: Tensor | None = None
+        self._near: Tensor | None = None
+
+    def first_scene(self, gaussians: Gaussians, subject: Subject) -> HumanScene:
+        """Return the scene of the first Gaussians: nothing is learned yet."""
+        clip = subject.footage.clip
+        learned = new_corrections(self.options, clip, subject.skeleton, subject.anchors)
+        return HumanScene(
+            gaussians=gaussians,
+            anchors=subject.anchors,
+            skeleton=subject.skeleton,
+            clip=clip,
+            learned=learned,
+            shapes=subject.shapes,
+        )
+
+    def trains_on(self, time: float | None, step: int) -> bool:
+        """Return true: every picture, always."""
+        return True
+
+    def window(self, step: int) -> tuple[float, float]:
+        """Return [0, 1]: all times, always."""
+        return 0.0, 1.0
+
+    def extend(self, scene: HumanScene, seen: tuple[float, float], step: int) -> None:
+        """Do nothing: all times are trained on."""
+
+    def moment(self, scene: HumanScene, picture: Picture, step: int) -> Moment:
+        """Return the Gaussians in the pose of ``picture``, and the regularizers.
+
+        Raises:
+            DyngsError: the picture's frame has no pose.
+        """
+        row = self._rows.get(-1 if picture.frame is None else picture.frame)
+        if row is None:
+            raise DyngsError(f"view {picture.name!r}: no body parameters for frame {picture.frame}")
+        penalties = self._penalties(scene)
+        if self._refines(step):
+            gaussians, posing = scene.in_frame(row)
+            penalties |= correction_penalties(scene.learned, self.options)
+        else:
+            if self._given_weights is None:
+                self._given_weights = scene.given_weights()
+            gaussians, posing = scene.in_frame(row, self._given_weights)
+        penalties |= self._between_neighbours(scene, gaussians, float(scene.clip.scale[row]), step)
+        frame = Frame(scene.gaussians.means, posing.rotations[0])
+        return Moment(gaussians, picture.time, frame, penalties)
+
+    def optimize(self, scene: HumanScene, step: int) -> int:
+        """Update the corrections."""
+        if not self._refines(step):
+            return 0
+        progress = self.rates.progress(step, since=self.refines_from)
+        return scene.learned.step(step - self.refines_from, progress)
+
+    def after_step(self, scene: HumanScene, step: int, edited: bool) -> HumanScene:
+        return scene
+
+    def grown(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
+        """Return None: the set of Gaussians is left to the strategy."""
+        return None
+
+    def all_moving(self, scene: HumanScene, extent: float) -> HumanScene:
+        """Return ``scene``: they do."""
+        return scene
+
+    def follow(self, edit: TopologyEdit) -> None:
+        """Find out anew who the neighbours are, and what they weigh."""
+        self._given_weights = self._near = None
+
+    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> HumanScene:
+        scene = HumanScene.restored(self.options, gaussians, tensors)
+        self._near, self._given_weights = tensors.get("near"), None
+        return replace(scene, colour=like.colour, options=like.options, background=like.background)
+
+    def state(self) -> State:
+        return {} if self._near is None else {"near": StateTensor(self._near, Role.TRAINING)}
+
+    def _refines(self, step: int) -> bool:
+        return self.options.refine and step > self.refines_from
+
+    def _penalties(self, scene: HumanScene) -> dict[str, Tensor]:
+        """Return penalties for Gaussians far from their scaffolds, or larger than their texels."""
+        terms, options, now = {}, self.options, scene.gaussians
+        if options.offset_weight > 0:
+            away = (now.means - scene.anchors.points) / CENTIMETRE
+            terms["offset"] = options.offset_weight * away.square().sum(1).mean()
+        if options.scale_weight > 0:
+            longer = now.log_scales - scene.anchors.size.log()[:, None]
+            terms["scale"] = options.scale_weight * longer.clamp_min(0).square().sum(1).mean()
+        return terms
+
+    def _between_neighbours(self, scene: HumanScene, moved: Gaussians, scale: float, step: int) -> dict[str, Tensor]:
+        """Return penalties between neighbours at rest, in cm^2; in each step for one of the five neighbours.
+
+        Rigidity: distances do not change. Smoothness: offsets from the scaffold are alike.
+        """
+        options, means = self.options, scene.gaussians.means
+        if options.rigidity == 0 and options.smoothness == 0:
+            return {}
+        if self._near is None:
+            self._near = nearest_neighbours(means, NEIGHBOURS)
+        if not self._near.shape[1]:
+            return {}
+        near = self._near[:, step % self._near.shape[1]]
+        terms = {}
+        if options.rigidity > 0:
+            before, after = (_lengths(x - x.index_select(0, near)) for x in (means, moved.means))
+            strain = (after / scale - before) / CENTIMETRE
+            terms["rigidity"] = options.rigidity * strain.square().mean()
+        if options.smoothness > 0:
+            away = (means - scene.anchors.points) / CENTIMETRE
+            terms["smoothness"] = options.smoothness * (away - away.index_select(0, near)).square().sum(1).mean()
+        return terms
+
+
+def _lengths(vectors: Tensor) -> Tensor:
+    """Return (N,) lengths, with a gradient of 0 at 0."""
+    return (vectors.square().sum(1) + 1e-12).sqrt()

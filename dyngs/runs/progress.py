@@ -1,0 +1,112 @@
+"""The progress of a run, for people."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from types import TracebackType
+from typing import IO, Any
+
+from dyngs.runs.log import LogRecord, record_of
+from dyngs.training.events import Evaluated, Event, Message, StepDone, TotalChanged
+
+PLAIN_LINES = 10
+"""Lines that a run prints where there is no terminal."""
+
+
+class Progress:
+    """Listener that shows a bar with loss, PSNR, Gaussians, steps per second and time left; plain lines where there is no terminal.
+
+    A context manager; tells nothing where ``total`` steps are already done.
+
+    Args:
+        total: steps that there will be.
+        done: steps done.
+        every: steps between updates; the last step has one, too.
+        stream: where to; None: standard error.
+    """
+
+    def __init__(self, total: int, done: int, every: int = 1, stream: IO[str] | None = None) -> None:
+        self._total, self._start, self._every = total, done, every
+        self._stream = sys.stderr if stream is None else stream
+        self._since = time.perf_counter()
+        self._psnr: float | None = None
+        self._next_line = done
+        self._bar: Any = None
+        self._task: Any = None
+
+    def __call__(self, event: Event) -> None:
+        """Show what ``event`` tells."""
+        match event:
+            case StepDone() if event.step % self._every == 0 or event.is_last:
+                self.update(record_of(event))
+            case TotalChanged():
+                self.expect(event.total)
+            case Evaluated():
+                self.pause(event.seconds)
+            case Message():
+                self.say(event.text)
+
+    def update(self, record: LogRecord) -> None:
+        """Show ``record``; PSNR is averaged over the last few of them."""
+        # One picture says little: views differ by several dB.
+        if record.psnr is not None:
+            self._psnr = record.psnr if self._psnr is None else 0.95 * self._psnr + 0.05 * record.psnr
+        rate = (record.step - self._start) / max(time.perf_counter() - self._since, 1e-9)
+        psnr = "-" if self._psnr is None else f"{self._psnr:.2f}"
+        text = f"loss {record.loss:.4f} psnr {psnr} {record.num_gaussians:,} Gaussians {rate:.1f} steps/s"
+        if self._bar is not None:
+            self._bar.update(self._task, completed=record.step, text=text)
+        elif record.step >= self._next_line or record.step == self._total:
+            left = _clock((self._total - record.step) / max(rate, 1e-9))
+            print(f"step {record.step}/{self._total} {text} {left} left", file=self._stream, flush=True)
+            self._next_line = record.step + max(1, self._total // PLAIN_LINES)
+
+    def expect(self, total: int) -> None:
+        """From now on ``total`` steps are to be done."""
+        self._total = total
+        if self._bar is not None:
+            self._bar.update(self._task, total=total)
+
+    def say(self, line: str) -> None:
+        """Show ``line`` above what changes."""
+        if self._bar is not None:
+            self._bar.console.print(line, markup=False, highlight=False)
+        else:
+            print(line, file=self._stream, flush=True)
+
+    def pause(self, seconds: float) -> None:
+        """Leave ``seconds`` that were not spent training out of the rate."""
+        self._since += seconds
+
+    def __enter__(self) -> Progress:
+        if self._stream.isatty() and os.environ.get("TERM") != "dumb":
+            self._bar, self._task = _rich_bar(self._total, self._start, self._stream)
+            self._bar.start()
+        self._since = time.perf_counter()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+
+def _rich_bar(total: int, done: int, stream: IO[str]) -> tuple[Any, Any]:
+    """A rich progress bar, not yet shown, and its task."""
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as RichProgress
+
+    steps, text = TextColumn("{task.completed:.0f}/{task.total:.0f}"), TextColumn("{task.fields[text]}")
+    columns = (steps, BarColumn(bar_width=6), text, TimeRemainingColumn(compact=True))  # fits 80 characters
+    bar = RichProgress(*columns, console=Console(file=stream), refresh_per_second=4)
+    return bar, bar.add_task("train", total=total, completed=done, text="")
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(int(seconds + 0.5), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

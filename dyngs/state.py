@@ -1,0 +1,71 @@
+"""Named tensors with a role: what a scene, an optimizer or a strategy must keep to go on from where it is."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import TypeVar, cast
+
+import torch
+from torch import Tensor
+
+
+class Role(Enum):
+    """What the rows of a tensor belong to, and who needs it."""
+
+    PER_GAUSSIAN = "per Gaussian"
+    PER_MOVING = "per moving Gaussian"
+    SHARED = "shared"
+    TRAINING = "training only"
+    """Whatever its rows are, nothing is drawn from it."""
+
+
+@dataclass(frozen=True)
+class StateTensor:
+    """A tensor and its role."""
+
+    tensor: Tensor
+    role: Role
+
+
+State = dict[str, StateTensor]
+"""Name to tensor and role."""
+
+T = TypeVar("T")
+
+
+def with_role(tensors: Mapping[str, Tensor], role: Role) -> State:
+    """Return a state in which all ``tensors`` have the same role."""
+    return {name: StateTensor(x, role) for name, x in tensors.items()}
+
+
+def prefixed(prefix: str, state: Mapping[str, StateTensor]) -> State:
+    """Return the state with ``prefix.`` before every name."""
+    return {f"{prefix}.{name}": x for name, x in state.items()}
+
+
+def tensors_of(state: Mapping[str, StateTensor]) -> dict[str, Tensor]:
+    """Return name to tensor, without the roles."""
+    return {name: x.tensor for name, x in state.items()}
+
+
+def part_of(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Return the tensors whose names start with ``prefix.``, without it."""
+    start = f"{prefix}."
+    return {name.removeprefix(start): x for name, x in tensors.items() if name.startswith(start)}
+
+
+def moved_to(value: T, device: torch.device | str) -> T:
+    """Return a copy of ``value`` whose tensors are on ``device``: dataclasses, containers, objects with a ``to``."""
+    if isinstance(value, Tensor):
+        return cast(T, value.to(device))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: moved_to(getattr(value, f.name), device) for f in dataclasses.fields(value) if f.init}
+        return cast(T, dataclasses.replace(value, **fields))
+    if isinstance(value, tuple):
+        return cast(T, tuple(moved_to(x, device) for x in value))
+    if isinstance(value, dict):
+        return cast(T, {name: moved_to(x, device) for name, x in value.items()})
+    return value.to(device) if hasattr(value, "to") else value  # type: ignore[union-attr]

@@ -1,0 +1,131 @@
+"""How exactly a trained scene must be stored: measured on pictures of its capture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from dyngs.build import restored_scene
+from dyngs.camera import Cameras
+from dyngs.config import Config
+from dyngs.data.capture import Capture, View
+from dyngs.data.loader import PictureLoader
+from dyngs.data.read import read_capture
+from dyngs.errors import DyngsError
+from dyngs.rendering import contributions
+from dyngs.scene import Scene, render_options
+from dyngs.storage.drawable import drawable
+from dyngs.storage.precision import (
+    GREY_LEVELS,
+    Precision,
+    assumed_precision,
+    coarseness_of,
+    measured_precision,
+)
+from dyngs.storage.tensors import COARSENESS
+from dyngs.training.background import evaluation_background
+from dyngs.training.state import Checkpoint
+from dyngs.training.views import training_cameras
+
+LOSS_DB = 0.025
+"""By how much the PSNR of training pictures may fall. That of others falls by up to twice as much."""
+COMPARED = 6
+"""Training views in which the change is measured."""
+SMALLEST_CHANGE = 0.01
+"""Grey levels of 255; less is of no use."""
+LOOKED_AT = 50
+"""Training views in which it is measured how much each Gaussian shows."""
+
+Pictures = Callable[[Scene], list[Tensor]]
+"""Draws a scene, always from the same cameras at the same times: (H, W, 3) each."""
+
+
+@dataclass(frozen=True)
+class StoragePlan:
+    """How a scene is stored.
+
+    Attributes:
+        precision: steps, and how much the pictures change.
+        coarseness: (N,) uint8 of the Gaussians, or None.
+        pictures: draws what was compared; None where no picture can be drawn.
+    """
+
+    precision: Precision
+    coarseness: Tensor | None = None
+    pictures: Pictures | None = None
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """What one training picture shows: a camera and a time."""
+
+    cameras: Cameras
+    time: float | None
+
+
+def storage_plan(config: Config, checkpoint: Checkpoint, scene: Scene, max_change: float | None) -> StoragePlan:
+    """Return how exactly ``scene`` must be stored: measured where the run's capture can be read.
+
+    Args:
+        config: of the run.
+        checkpoint: of ``scene``.
+        scene: N Gaussians.
+        max_change: root mean square over all values of some training pictures, grey levels of 255. None: what lowers
+            their PSNR by ``LOSS_DB``, if it is independent of the scene's own errors.
+    """
+    try:
+        capture = read_capture(config.data)
+    except DyngsError:
+        return StoragePlan(assumed_precision(scene.gaussians))
+    coarseness = coarseness_of(_visibility(scene, _shots(config, capture, scene, LOOKED_AT)))
+    _, background = evaluation_background(config.data.background, capture.has_alpha)
+    shots, options = _shots(config, capture, scene, COMPARED), render_options(config.model)
+
+    @torch.no_grad()
+    def pictures(drawn: Scene) -> list[Tensor]:
+        return [drawn.render(shot.cameras, shot.time, options=options, background=background).rgb[0] for shot in shots]
+
+    def redrawn(tensors: Mapping[str, Tensor]) -> list[Tensor]:
+        return pictures(restored_scene(replace(checkpoint, tensors=dict(tensors)), config.model))
+
+    wanted = pictures(scene)
+    if max_change is None:
+        loader = PictureLoader(_chosen(capture, COMPARED), config.data)
+        truth = (loader[i].composite(background) for i in range(len(loader)))
+        errors = [float((x.clamp(0, 1) - y).square().mean()) for x, y in zip(wanted, truth, strict=True)]
+        max_change = GREY_LEVELS * math.sqrt((10 ** (LOSS_DB / 10) - 1) * fmean(errors))
+    exact = drawable(scene) | {COARSENESS: coarseness}
+    return StoragePlan(
+        measured_precision(exact, wanted, redrawn, max(max_change, SMALLEST_CHANGE)), coarseness, pictures
+    )
+
+
+def _shots(config: Config, capture: Capture, scene: Scene, count: int) -> list[_Shot]:
+    """At most ``count`` training views, evenly chosen; where they have no times, those of the scene."""
+    chosen = _chosen(capture, count)
+    times: Sequence[float | None] = [view.time for view in chosen]
+    if scene.times and None in times:
+        times = [scene.times[(2 * i + 1) * len(scene.times) // (2 * len(chosen))] for i in range(len(chosen))]
+    cameras = training_cameras(chosen, config.data)
+    return [_Shot(camera, time) for camera, time in zip(cameras, times, strict=True)]
+
+
+def _chosen(capture: Capture, count: int) -> list[View]:
+    """At most ``count`` training views, evenly chosen."""
+    views = capture.splits["train"]
+    count = min(count, len(views))
+    return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
+
+
+def _visibility(scene: Scene, shots: Sequence[_Shot]) -> Tensor:
+    """Return (N,) sums of blending weights over the pictures."""
+    scene = scene.unmasked()
+    total = torch.zeros(len(scene), device=scene.gaussians.means.device)
+    for shot in shots:
+        total += contributions(scene.at(shot.time), shot.cameras, scene.options)[0]
+    return total

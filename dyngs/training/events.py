@@ -1,0 +1,143 @@
+"""What training tells while it goes: typed events, and those who listen.
+
+A progress bar, a log, limits on the result and a viewer are all listeners; training knows none of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from dyngs.data.loader import Picture
+from dyngs.metrics import psnr
+
+if TYPE_CHECKING:
+    from dyngs.training.loop import Loop
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """One step of training.
+
+    Attributes:
+        step: its number, from 1.
+        loss: regularizers included.
+        picture: what was trained on.
+        rendered, truth: (H, W, 3) on the same background.
+        finding: a line about what was found out after the step, or None.
+    """
+
+    step: int
+    loss: float
+    picture: Picture
+    rendered: Tensor
+    truth: Tensor
+    finding: str | None = None
+
+    @cached_property
+    def psnr(self) -> float:
+        """Of the picture, dB; NaN or infinite where its mask leaves nothing, or it is exact."""
+        return psnr(self.rendered, self.truth, self.picture.mask)
+
+
+@dataclass(frozen=True)
+class Started:
+    """Training begins or goes on after ``step`` steps, of ``total``."""
+
+    step: int
+    total: int
+
+
+@dataclass(frozen=True)
+class StepDone:
+    """A step is done. What is not in the report is as it is when it is asked for: an earlier listener may change it.
+
+    Attributes:
+        report: of the step.
+        loop: that did it; a viewer finds what is trained in ``loop.trainer``.
+    """
+
+    report: StepReport
+    loop: Loop
+
+    @property
+    def step(self) -> int:
+        return self.report.step
+
+    @property
+    def total(self) -> int:
+        """Steps there will be."""
+        return self.loop.total
+
+    @property
+    def is_last(self) -> bool:
+        return self.step >= self.total
+
+    @property
+    def num_gaussians(self) -> int:
+        return self.loop.trainer.num_gaussians
+
+    @property
+    def num_moving(self) -> int:
+        return self.loop.trainer.num_moving
+
+    @property
+    def bad_gradients(self) -> int:
+        """How often so far a Gaussian was left out of a step because its gradient was not finite."""
+        return self.loop.trainer.bad_gradients
+
+    @property
+    def seconds(self) -> float:
+        """Of training so far, over all resumes."""
+        return self.loop.watch.seconds
+
+
+@dataclass(frozen=True)
+class TopologyChanged:
+    """The set of Gaussians has changed outside the strategy: pruned, or limited."""
+
+    step: int
+    before: int
+    after: int
+
+
+@dataclass(frozen=True)
+class TotalChanged:
+    """There will be another number of steps."""
+
+    total: int
+
+
+@dataclass(frozen=True)
+class Saved:
+    """A checkpoint of ``step`` is in the file ``path``."""
+
+    step: int
+    path: Path
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """Mean scores of a split after ``step``; they took ``seconds``, which do not count as training."""
+
+    step: int
+    split: str
+    psnr: float
+    ssim: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Message:
+    """A line for people."""
+
+    text: str
+
+
+Event = Started | StepDone | TopologyChanged | TotalChanged | Saved | Evaluated | Message
+Listener = Callable[[Event], None]

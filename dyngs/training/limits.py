@@ -1,0 +1,102 @@
+"""Limits on the number of Gaussians, and what limits together are possible (docs/budget.md).
+
+A limit on the file's size is one on the number of Gaussians first: so few that they fit when stored as exactly as is
+usual.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from dyngs.config import Config, DeformField
+from dyngs.config.kinds import added_for_motion, field_of, network_of, person_of, stored_sh_degree
+from dyngs.conventions import num_sh_terms
+from dyngs.deform.field import FieldSetup
+from dyngs.deform.fields import new_field
+from dyngs.errors import DyngsError
+
+SEED_SHARE = 0.1
+"""Of the limit that is kept free for the Gaussians with which motion begins."""
+SHAPE_BYTES, HARMONIC_BYTES, FIELD_BYTES = 16.0, 0.35, 1.0
+"""Per Gaussian, per value of its harmonics, per number of a field: a little more than docs/storage.md measured."""
+CLOSE = 0.8
+"""Share of the limit from which on it is taken to have held growth back."""
+FEWEST = 500
+"""Gaussians; a limit on the size that has no room for them is refused."""
+
+
+def require_possible(config: Config) -> None:
+    """Raise DyngsError where limits of ``config`` contradict it or each other."""
+    budget = config.budget
+    given = [name for name, value in budget.model_dump().items() if value is not None]
+    if given and network_of(config) is not None:
+        raise DyngsError(f"budget.{given[0]}: a network has no budget; leave it out")
+    if budget.max_minutes is not None and config.prune.is_wanted:
+        raise DyngsError(
+            "budget.max_minutes: how long the stage of prune.* takes cannot be foreseen; leave that out and run "
+            "`dyngs compact` afterwards"
+        )
+
+
+def within_cap(config: Config, num_times: int) -> Config:
+    """``config`` with what decides the number of Gaussians lowered to its limits; the same object where it has none.
+
+    Args:
+        config: of a run.
+        num_times: distinct times of training; fewer than two: nothing will move.
+
+    Raises:
+        DyngsError: a size that has no room for a scene.
+    """
+    cap, changes = most_gaussians(config, num_times), {}
+    if cap is None:
+        return config
+    added = added_for_motion(config)
+    if added:
+        added = min(added, int(SEED_SHARE * cap))
+        changes["model"] = config.model.model_copy(update={"num_random_moving": added})
+    cap -= added
+    return config.model_copy(update=changes | {"strategy": config.strategy.limited(cap)})
+
+
+def most_gaussians(config: Config, num_times: int) -> int | None:
+    """How many Gaussians a run may end with by its limits; None: as many as it wants.
+
+    Args:
+        config: of a run.
+        num_times: distinct times of training.
+
+    Raises:
+        DyngsError: a size that has no room for a scene.
+    """
+    limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
+    if config.budget.max_mb is not None and person_of(config) is None:
+        limits.append(room(config, num_times, config.budget.max_mb))
+    return min(limits, default=None)
+
+
+def room(config: Config, num_times: int, megabytes: float) -> int:
+    """How many Gaussians a file of so many 1e6 bytes holds, stored as exactly as is usual.
+
+    Raises:
+        DyngsError: fewer than ``FEWEST``; says which size has room for them.
+    """
+    fixed, moves_by = 0.0, field_of(config)
+    each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(stored_sh_degree(config)) - 1)
+    if moves_by is not None and num_times > 1:
+        one, two = (_field_values(moves_by, num_times, count) for count in (1, 2))
+        fixed, each = FIELD_BYTES * (2 * one - two), each + FIELD_BYTES * (two - one)
+    found = int((1e6 * megabytes - fixed) / each)
+    if found < FEWEST:
+        field = f", of which the field takes {1e-6 * fixed:.2g}" if fixed else ""
+        raise DyngsError(
+            f"budget.max_mb={megabytes:g}: has no room for {FEWEST} Gaussians; "
+            f"{1e-6 * (fixed + FEWEST * each) * 1.05:.2g} would do{field}"
+        )
+    return found
+
+
+def _field_values(options: DeformField, num_times: int, num_moving: int) -> int:
+    """Numbers that a field learns."""
+    setup = FieldSetup(torch.zeros(3), torch.ones(3), num_times, num_moving, 1.0)
+    return new_field(options, setup, torch.Generator()).parameters.num_values

@@ -1,0 +1,118 @@
+"""The training loop: steps until the end, and events that tell of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from dyngs.errors import DyngsError
+from dyngs.training.events import Event, Listener, Message, Started, StepDone, StepReport, TotalChanged
+from dyngs.training.state import Checkpoint
+
+
+class Trainable(Protocol):
+    """What the loop trains: a scene, or a network that predicts scenes."""
+
+    done: int
+    """Steps done."""
+    bad_gradients: int
+    """How often something was left out of a step because its gradient was not finite."""
+
+    @property
+    def num_gaussians(self) -> int: ...
+
+    @property
+    def num_moving(self) -> int:
+        """Gaussians that depend on time or pose."""
+        ...
+
+    @property
+    def has_test_views(self) -> bool: ...
+
+    def step(self) -> StepReport:
+        """Train on one picture, or one choice of them.
+
+        Raises:
+            DyngsError: the loss is not finite.
+        """
+        ...
+
+    def checkpoint(self) -> Checkpoint:
+        """Return everything that ``restore`` needs."""
+        ...
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go back to where ``checkpoint`` was taken.
+
+        Raises:
+            DyngsError: it belongs to something else, or its tensors do not fit together.
+        """
+        ...
+
+
+class Stopwatch:
+    """Seconds of training: from reading the capture on, over all resumes, without evaluations."""
+
+    def __init__(self) -> None:
+        self._since = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self._since
+
+    def pause(self, seconds: float) -> None:
+        """Leave ``seconds`` out (negative: count them in)."""
+        self._since += seconds
+
+
+class Loop:
+    """Steps of a trainer, told to listeners in their order.
+
+    Args:
+        trainer: what is trained.
+        total: steps that there will be.
+        watch: seconds of training.
+        advice: added to the message of a step that fails.
+
+    Attributes:
+        trainer: a listener may exchange it for one on other schedules.
+    """
+
+    def __init__(
+        self, trainer: Trainable, total: int, watch: Stopwatch, advice: Callable[[], str] | None = None
+    ) -> None:
+        self.trainer, self.total, self.watch = trainer, total, watch
+        self._advice = advice
+        self._listeners: list[Listener] = []
+
+    def subscribe(self, *listeners: Listener) -> None:
+        """Tell these, too, after those that there are."""
+        self._listeners += listeners
+
+    def tell(self, event: Event) -> None:
+        """Tell all listeners."""
+        for listener in self._listeners:
+            listener(event)
+
+    def expect(self, total: int) -> None:
+        """Do another number of steps from now on."""
+        self.total = total
+        self.tell(TotalChanged(total))
+
+    def run(self, is_stopped: Callable[[], bool] = lambda: False) -> None:
+        """Step until the end, or until ``is_stopped`` between two steps."""
+        self.tell(Started(self.trainer.done, self.total))
+        while self.trainer.done < self.total and not is_stopped():
+            report = self._step()
+            if report.finding is not None:
+                self.tell(Message(f"step {report.step}: {report.finding}"))
+            self.tell(StepDone(report, self))
+
+    def _step(self) -> StepReport:
+        try:
+            return self.trainer.step()
+        except DyngsError as error:
+            if self._advice is None:
+                raise
+            raise DyngsError(f"{error}. {self._advice()}") from error

@@ -1,0 +1,302 @@
+"""Training of the network that predicts people from a few pictures, on captures of several (GHG, Kwon et al. 2024)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from dyngs.config import Config, DataConfig, HumanModel, HumanPredictorModel
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.read import read_capture
+from dyngs.errors import DyngsError, reading
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.prediction.network import AtlasNetwork
+from dyngs.human.prediction.person import CapturedPerson, captured_person, spread_views
+from dyngs.human.prediction.predict import PredictedAvatar, num_input_channels, predict_gaussians
+from dyngs.human.prediction.texel_maps import TexelMaps, observe_texels, to_atlas
+from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.load import load_template
+from dyngs.ops.loss import l1_ssim_loss
+from dyngs.scene import render_options
+from dyngs.static.rates import Rates
+from dyngs.tensor_checks import require_tensor
+from dyngs.training.background import background_colour, evaluation_background
+from dyngs.training.events import StepReport
+from dyngs.training.sampler import ViewSampler
+from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
+
+MEAN_VIEWS = 8
+"""Pictures of each person that the mean colours are taken from."""
+
+_LOWEST = 1e-3
+"""Last rate over the highest."""
+
+
+@dataclass
+class Filmed:
+    """A person to train on: pictures, and the choices of those that are predicted from, with their maps once known."""
+
+    sitter: CapturedPerson
+    pictures: PictureLoader
+    choices: list[list[int]]
+    _maps: dict[int, TexelMaps] = field(default_factory=dict)
+
+    def maps(self, choice: int) -> TexelMaps:
+        """What the pictures of that choice show; kept."""
+        if choice not in self._maps:
+            self._maps[choice] = self.look(self.choices[choice])
+        return self._maps[choice]
+
+    def look(self, views: list[int]) -> TexelMaps:
+        """What these pictures show."""
+        return observe_texels(
+            self.sitter, ((self.pictures[i], self.sitter.posing(self.sitter.views[i])) for i in views)
+        )
+
+
+@dataclass
+class NetworkTrainer:
+    """A run in memory, as ``dyngs.training.step.Trainer``.
+
+    Attributes:
+        people: to train on, at least one.
+        network: what is trained.
+        mean: (3, S, S) colours of the people.
+        background: "white", "black" or "random".
+        generator: the only source of randomness.
+        done: steps done.
+        num_gaussians: of the last person.
+    """
+
+    config: Config
+    model: HumanPredictorModel
+    people: list[Filmed]
+    network: AtlasNetwork
+    mean: Tensor
+    optimizer: torch.optim.AdamW
+    sampler: ViewSampler
+    background: str
+    generator: torch.Generator
+    done: int = 0
+    num_gaussians: int = 0
+    bad_gradients: int = 0
+    has_test_views: bool = False
+
+    @property
+    def num_moving(self) -> int:
+        """All of them: a person moves as a whole."""
+        return self.num_gaussians
+
+    def step(self) -> StepReport:
+        """Train on one person: predicted from one choice of pictures, compared with others of one moment.
+
+        Raises:
+            DyngsError: the loss is not finite.
+        """
+        options, step = self.config.train, self.done + 1
+        person = self.people[self.sampler.next(self.generator, lambda _: True)]
+        choice = self._draw(len(person.choices))
+        targets = self._targets(person, person.choices[choice])
+        background, drawing = (
+            background_colour(self.background, self.generator),
+            replace(render_options(self.model), nonfinite="trust"),
+        )
+        avatar = predict_gaussians(
+            person.sitter, person.maps(choice), self.mean, self.network, self.model.min_silhouette_share
+        )
+        scene, training = scene_of(human_options(self.model), avatar, Rates(1))
+        moment = training.moment(scene, targets[0], step)
+        total = torch.zeros(())
+        for picture in targets:
+            rendering = scene.render(picture.cameras, moment, options=drawing, background=background)
+            truth = picture.composite(background)
+            loss = l1_ssim_loss(rendering.rgb[0], truth, options.ssim_weight, picture.mask)
+            if options.alpha_weight > 0 and picture.alpha is not None:
+                loss = loss + options.alpha_weight * (rendering.alpha[0] - picture.alpha).abs().mean()
+            total = total + loss / len(targets)
+        if not math.isfinite(float(total.detach())):
+            raise DyngsError(f"step {step}, {person.sitter.name}: the loss is {float(total.detach())}; lower model.lr")
+        self._update(total, step)
+        self.done, self.num_gaussians = step, len(avatar.gaussians)
+        return StepReport(step, float(total.detach()), picture, rendering.rgb[0].detach(), truth)
+
+    def checkpoint(self) -> Checkpoint:
+        """Everything that ``restore`` needs."""
+        tensors = {f"model.network.{name}": x for name, x in self.network.state_dict().items()}
+        tensors |= {"model.mean": self.mean, "rng": self.generator.get_state()}
+        tensors |= {f"sampler.{name}": x for name, x in self.sampler.state().items()}
+        for name, parameter in self.network.named_parameters():
+            moments = self.optimizer.state.get(parameter, {})
+            tensors |= {f"optimizer.{key}.{name}": x for key, x in moments.items()}
+        mode = self.model.rasterize_mode.value
+        return Checkpoint(CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), self.background, mode), tensors)
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go back to where ``checkpoint`` was taken.
+
+        Raises:
+            DyngsError: it belongs to another network.
+        """
+        self.mean = load_network(self.network, checkpoint, self.model.resolution)
+        with reading(checkpoint.name, OTHER_CONFIG):
+            self.sampler.load_state(checkpoint.part("sampler"))
+            self.generator.set_state(checkpoint.tensors["rng"])
+            for name, parameter in self.network.named_parameters():
+                shapes = {"step": (), "exp_avg": tuple(parameter.shape), "exp_avg_sq": tuple(parameter.shape)}
+                self.optimizer.state[parameter] = {
+                    key: require_tensor(name, checkpoint.tensors[f"optimizer.{key}.{name}"], shape)
+                    for key, shape in shapes.items()
+                }
+        self.done = checkpoint.info.step
+
+    def _targets(self, person: Filmed, inputs: list[int]) -> list[Picture]:
+        """Pictures of one moment that were not predicted from, where there are any."""
+        views = person.sitter.views
+        others = [i for i in range(len(views)) if i not in inputs] or inputs
+        frame = views[others[self._draw(len(others))]].frame
+        shown = [i for i in others if views[i].frame == frame]
+        order = torch.randperm(len(shown), generator=self.generator).tolist()
+        return [person.pictures[shown[i]] for i in order[: self.model.target_views]]
+
+    def _update(self, loss: Tensor, step: int) -> None:
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        length = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.model.clip)
+        if not bool(length.isfinite()):
+            self.bad_gradients += 1
+            return
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate_at(self.model, step, self.config.train.steps)
+        self.optimizer.step()
+
+    def _draw(self, count: int) -> int:
+        return int(torch.randint(count, (1,), generator=self.generator))
+
+
+def assemble_network(config: Config, model: HumanPredictorModel) -> NetworkTrainer:
+    """The trainer of ``model.kind: human_predictor``: captures read, nothing trained.
+
+    Raises:
+        DyngsError: ``data.root`` has no captures of people, or settings that do not go together.
+    """
+    body, generator = load_template(human_options(model)), torch.Generator().manual_seed(config.run.seed)
+    network = new_network(model, generator)
+    people = [filmed(data, model, body) for data in captures_in(config.data)]
+    for person in people:
+        person.choices = _choices(person.sitter, model, generator)
+    background = config.data.background
+    return NetworkTrainer(
+        config=config,
+        model=model,
+        people=people,
+        network=network,
+        mean=mean_colours(people, model.resolution),
+        optimizer=torch.optim.AdamW(network.parameters(), lr=model.lr, weight_decay=model.weight_decay),
+        sampler=ViewSampler(len(people)),
+        background=background if background == "random" else evaluation_background(background, True)[0],
+        generator=generator,
+    )
+
+
+def new_network(model: HumanPredictorModel, generator: torch.Generator) -> AtlasNetwork:
+    """The untrained network of ``model``.
+
+    Raises:
+        DyngsError: widths or a resolution that do not suit it.
+    """
+    factor = 2 ** len(model.widths)
+    if model.resolution % factor:
+        raise DyngsError(
+            f"model.resolution={model.resolution} must be a multiple of {factor} for {len(model.widths)} model.widths"
+        )
+    scaffolds = len(set(model.scaffold_heights))
+    return AtlasNetwork(num_input_channels(scaffolds), scaffolds, model.widths, generator)
+
+
+def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
+    """The mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the ``resolution``.
+
+    Raises:
+        DyngsError: the checkpoint is of something else, or of another network.
+    """
+    weights, mean = checkpoint.part("model.network"), checkpoint.tensors.get("model.mean")
+    own = network.state_dict()
+    if mean is None or {k: x.shape for k, x in weights.items()} != {k: x.shape for k, x in own.items()}:
+        raise DyngsError(f"{checkpoint.name} is not of this network; was its config changed?")
+    with reading(checkpoint.name, OTHER_CONFIG):
+        for name, x in weights.items():
+            require_tensor(name, x, tuple(x.shape), own[name].dtype)
+        network.load_state_dict(weights)
+        return require_tensor("mean", mean, (3, resolution, resolution))
+
+
+def human_options(model: HumanPredictorModel) -> HumanModel:
+    """The section of one person with the same template, texels and scaffolds; nothing of it is learned."""
+    shared = ("body", "uv", "resolution", "scaffold_heights", "min_silhouette_share")
+    drawn = ("near", "eps2d", "rasterize_mode", "alpha_min", "transmittance_min")
+    none = {"refine": False, "offset_weight": 0, "scale_weight": 0, "rigidity": 0, "smoothness": 0}
+    return HumanModel.model_validate({"sh_degree": 0, **none} | {name: getattr(model, name) for name in shared + drawn})
+
+
+def captures_in(data: DataConfig) -> list[DataConfig]:
+    """Where the captures in the folders of ``data.root`` are, by name.
+
+    Raises:
+        DyngsError: there is no folder in it.
+    """
+    root = data.root
+    folders = sorted(f for f in root.iterdir() if f.is_dir() and not f.name.startswith(".")) if root.is_dir() else []
+    if not folders:
+        raise DyngsError(f"{root}: holds no folders; give one that holds a capture of a person in each of its folders")
+    return [data.model_copy(update={"root": folder}) for folder in folders]
+
+
+def filmed(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> Filmed:
+    """The person of one capture, without choices of pictures.
+
+    Raises:
+        DyngsError: no capture there, or not one of a person.
+    """
+    capture = read_capture(data)
+    return Filmed(
+        captured_person(capture, human_options(model), body), PictureLoader(capture.splits["train"], data), []
+    )
+
+
+def mean_colours(people: list[Filmed], resolution: int) -> Tensor:
+    """(3, S, S) mean over people of the colours that their pictures show of the lowest scaffold.
+
+    Where nobody is seen: the mean of all that is.
+    """
+    total, count = torch.zeros(3, resolution, resolution), torch.zeros(1, resolution, resolution)
+    for person in people:
+        sitter = person.sitter
+        maps = person.look(spread_views(sitter, MEAN_VIEWS))
+        is_seen = (maps.seen[0] > 0).float()[:, None]
+        total += to_atlas(maps.rgb[0] * is_seen, sitter.texels)
+        count += to_atlas(is_seen, sitter.texels)
+    overall = total.sum((1, 2)) / count.sum().clamp_min(1)
+    return torch.where(count > 0, total / count.clamp_min(1), overall[:, None, None])
+
+
+def rate_at(model: HumanPredictorModel, step: int, steps: int) -> float:
+    """Of AdamW: up along a line, then down along one (one cycle; Smith and Topin 2017)."""
+    top = max(1, round(model.warm_up * steps))
+    share = step / top if step <= top else (steps - step) / max(steps - top, 1)
+    return model.lr * max(share, _LOWEST)
+
+
+def _choices(sitter: CapturedPerson, model: HumanPredictorModel, generator: torch.Generator) -> list[list[int]]:
+    """Views to predict from: of a random moment each, one of them random, the others such that much is seen."""
+    firsts = torch.randint(len(sitter.views), (model.source_sets,), generator=generator).tolist()
+    return [spread_views(sitter, model.source_views, first) for first in firsts]
+
+
+def scene_of(model: HumanModel, avatar: PredictedAvatar, rates: Rates) -> tuple[HumanScene, HumanTraining]:
+    """Return a predicted avatar as a scene, and how it is trained on."""
+    training = HumanTraining(model, avatar.subject.footage.frames, rates)
+    return training.first_scene(avatar.gaussians, avatar.subject), training

@@ -1,0 +1,54 @@
+"""What a training must keep to go on later."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from torch import Tensor
+
+from dyngs.state import part_of
+
+OTHER_CONFIG = "was its config changed? Otherwise train anew"
+"""Advice where a checkpoint and its run do not fit together."""
+
+
+@dataclass(frozen=True)
+class CheckpointInfo:
+    """What a checkpoint says of itself.
+
+    Attributes:
+        step: steps done.
+        extent: of the scene, world units.
+        world_offset: add it to the means to get the capture's own coordinates.
+        background: resolved choice: "white", "black" or "random".
+        rasterize_mode: how the Gaussians want to be drawn.
+    """
+
+    step: int
+    extent: float
+    world_offset: tuple[float, float, float]
+    background: str
+    rasterize_mode: str
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Everything that a run needs to go on: named tensors and a few values.
+
+    Attributes:
+        path: of the file that it was read from; None: of none.
+    """
+
+    info: CheckpointInfo
+    tensors: dict[str, Tensor]
+    path: Path | None = field(default=None, compare=False)
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return f"the checkpoint of step {self.info.step}" if self.path is None else str(self.path)
+
+    def part(self, prefix: str) -> dict[str, Tensor]:
+        """Return the tensors whose names start with ``prefix.``, without it."""
+        return part_of(self.tensors, prefix)

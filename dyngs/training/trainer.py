@@ -1,0 +1,245 @@
+"""Training of a scene, step by step. It knows Gaussians and pictures, not what kind of scene lies between them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dyngs.colour.network import network_of
+from dyngs.colour.training import ColourTraining, TrainingLooks
+from dyngs.colour.view_dependence import MeasuredView
+from dyngs.config import Config
+from dyngs.conventions import SH_C0
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.errors import DyngsError, reading
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.ops.loss import l1_ssim_loss
+from dyngs.rendering import RenderOptions
+from dyngs.scene import Scene, SceneTraining
+from dyngs.state import Role, State, prefixed, tensors_of, with_role
+from dyngs.static.densify import Densifier
+from dyngs.static.fixed import FixedDensifier
+from dyngs.static.optimizer import GaussianOptimizer
+from dyngs.training.background import background_colour
+from dyngs.training.events import StepReport
+from dyngs.training.sampler import ViewSampler
+from dyngs.training.schedule import active_sh_degree, means_rate, picture_divisor, rates_of
+from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
+
+
+@dataclass
+class Trainer:
+    """A run in memory: everything that a step reads and changes.
+
+    Attributes:
+        scene: what is trained; its Gaussians are the optimizer's parameters.
+        training: how its kind is trained.
+        densifier: the strategy, which adds and removes Gaussians.
+        options: how training pictures are drawn.
+        background: "white", "black" or "random" (a new colour in each step, behind render and truth alike).
+        generator: the only source of randomness, on the CPU.
+        done: steps done.
+        bad_gradients: how often a Gaussian was left out of a step because its gradient was not finite.
+    """
+
+    config: Config
+    scene: Scene
+    training: SceneTraining[Any]
+    optimizer: GaussianOptimizer
+    densifier: Densifier
+    colours: ColourTraining
+    pictures: PictureLoader
+    sampler: ViewSampler
+    options: RenderOptions
+    background: str
+    extent: float
+    world_offset: tuple[float, float, float]
+    has_test_views: bool
+    generator: torch.Generator
+    done: int = 0
+    bad_gradients: int = 0
+
+    @property
+    def num_gaussians(self) -> int:
+        return len(self.scene)
+
+    @property
+    def num_moving(self) -> int:
+        return self.scene.num_moving
+
+    def step(self) -> StepReport:
+        """Train on one picture.
+
+        Raises:
+            DyngsError: the loss is not finite; says which term, and leaves the parameters as they were.
+        """
+        config, step, scene = self.config, self.done + 1, self.scene
+        divisor = picture_divisor(config.train, step)
+        index = self.sampler.next(self.generator, self._wanted(step))
+        picture = self.pictures[index].shrunk(divisor)
+        background = background_colour(self.background, self.generator)
+        moment = self.training.moment(scene, picture, step)
+        probe = torch.zeros(1, len(scene), 4, requires_grad=True) if self.densifier.wants_signal(step) else None
+        if scene.num_moving:
+            _require_finite(moment.gaussians, step, picture, self.training.moves_by)
+        rendering = scene.render(
+            picture.cameras, moment, options=self._options(step), background=background, probe=probe
+        )
+        rendered, truth = rendering.rgb[0], picture.composite(background)
+        terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
+        if config.train.alpha_weight > 0 and picture.alpha is not None:
+            terms["alpha"] = config.train.alpha_weight * (rendering.alpha[0] - picture.alpha).abs().mean()
+        terms |= moment.penalties
+        terms |= self.densifier.regularizers(scene.gaussians) | self.colours.penalties(scene.gaussians)
+        loss = _finite_sum(terms, step, picture)
+        sum(terms.values(), torch.zeros(())).backward()
+        if probe is not None and probe.grad is not None:
+            size = (picture.cameras.width, picture.cameras.height)
+            # Fewer Gaussians suit small pictures: a gradient counts for less there.
+            self.densifier.after_backward(step, probe.grad / divisor, rendering.radii, size)
+        finding = self._update(step)
+        return StepReport(step, loss, picture, rendered.detach(), truth, finding)
+
+    def keep(self, kept: Tensor) -> None:
+        """Leave only the Gaussians where ``kept`` (N,) is true."""
+        self._apply(EditResult(TopologyEdit.select(kept)))
+        self.scene = self.training.after_step(self.scene, self.done, True)
+        self.scene.changed()
+
+    def state(self) -> State:
+        """Return everything that training needs to go on, by name, with its role."""
+        state = self.scene.state() | prefixed("model", self.training.state())
+        state |= prefixed("model.colour", self.colours.state()) | self.optimizer.state()
+        state |= prefixed("strategy", with_role(self.densifier.state(), Role.TRAINING))
+        state |= prefixed("sampler", with_role(self.sampler.state(), Role.TRAINING))
+        return state | with_role({"rng": self.generator.get_state()}, Role.TRAINING)
+
+    def checkpoint(self) -> Checkpoint:
+        """Return everything that ``restore`` needs."""
+        mode = self.config.model.rasterize_mode.value
+        info = CheckpointInfo(self.done, self.extent, self.world_offset, self.background, mode)
+        return Checkpoint(info, tensors_of(self.state()))
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go back to where ``checkpoint`` was taken.
+
+        Raises:
+            DyngsError: it belongs to another model or strategy, or its tensors do not fit together.
+        """
+        with reading(checkpoint.name, OTHER_CONFIG):
+            try:
+                gaussians = Gaussians.stored(checkpoint.part("gaussians"))
+                optimizer = self.optimizer.restored(gaussians, checkpoint.tensors)
+                colour = checkpoint.part("model.colour")
+                network_of(colour)  # raises where its tensors do not fit together
+                self.colours.restore(colour, len(gaussians))
+                scene = self.training.restored(optimizer.parameters, checkpoint.part("model"), self.scene)
+                if checkpoint.info.step >= self.config.train.steps:
+                    self.densifier = FixedDensifier()
+                self.densifier.load_state(checkpoint.part("strategy"))
+                self.sampler.load_state(checkpoint.part("sampler"))
+                self.generator.set_state(checkpoint.tensors["rng"])
+            except KeyError as missing:
+                raise DyngsError(f"{checkpoint.name} lacks {missing}; {OTHER_CONFIG}") from None
+        self.optimizer, self.scene = optimizer, replace(scene, colour=self.colours.network)
+        self.done = checkpoint.info.step
+
+    def _options(self, step: int) -> RenderOptions:
+        """Return how pictures are drawn in ``step``."""
+        degree = active_sh_degree(self.config.train, step, self.scene.gaussians.sh_degree)
+        return replace(self.options, sh_degree=degree)
+
+    def _update(self, step: int) -> str | None:
+        """Optimize, let the strategy act, and count the step; return a line about what was found, or None."""
+        lr_means = means_rate(self.config.optim, rates_of(self.config).progress(step), self.extent)
+        frozen, dense = self.colours.frozen_rest(), self.densifier.touches_all
+        self.bad_gradients += self.optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen)
+        self.bad_gradients += self.colours.optimize(step) + self.training.optimize(self.scene, step)
+        result = self.densifier.edit(step, self.optimizer.parameters, self.generator)
+        if result is not None:
+            self._apply(result)
+        self.densifier.perturb(self.optimizer.parameters, lr_means, self.generator)
+        self.scene = self.training.after_step(self.scene, step, result is not None)
+        grown = self.training.grown(self.scene, step)
+        if grown is not None:
+            self.scene, result = grown
+            self.optimizer.apply(result)
+            self.scene = self.scene.with_gaussians(self.optimizer.parameters)
+            self._follow(result)
+        self.done = step
+        finding = self._drop_harmonics(step)
+        self.scene.changed()
+        return finding
+
+    def _apply(self, result: EditResult) -> None:
+        """Change the set of Gaussians, and everything that is stored per Gaussian with it."""
+        self.optimizer.apply(result)
+        if result.edit is not None:
+            self.scene = self.scene.edited(result.edit)
+        self.scene = self.scene.with_gaussians(self.optimizer.parameters)
+        self._follow(result)
+
+    def _follow(self, result: EditResult) -> None:
+        if result.edit is not None:
+            self.colours.follow(result.edit)
+            self.training.follow(result.edit)
+
+    def _drop_harmonics(self, step: int) -> str | None:
+        """Drop harmonics that do not pay, if it is time to measure that; return a line about what was found."""
+        if not self.scene.gaussians.sh_degree:
+            return None
+        found = self.colours.measured(step, lambda: self._looks(step))
+        if found is not None and found.rows is not None and found.offsets is not None:
+            base = self.scene.gaussians.sh.detach()[:, 0] + found.offsets / SH_C0
+            self.optimizer.drop_rest(base, found.rows)
+            self.scene = self.scene.with_gaussians(self.optimizer.parameters)
+        return None if found is None else found.text
+
+    def _looks(self, step: int) -> TrainingLooks:
+        """Return the training views as they are drawn after ``step``."""
+        colour = background_colour(self.background)
+
+        def views(indices: Sequence[int]) -> Iterator[MeasuredView]:
+            for picture in (self.pictures[i] for i in indices):
+                gaussians = self.training.moment(self.scene, picture, step).gaussians.detach()
+                yield MeasuredView(gaussians, picture.cameras, picture.composite(colour), picture.mask)
+
+        may_train = [i for i, time in enumerate(self.pictures.times) if self.training.trains_on(time, step)]
+        return TrainingLooks(may_train, views, self._options(step), colour)
+
+    def _wanted(self, step: int) -> Callable[[int], bool]:
+        """Return which views may be trained on in ``step``."""
+        times = self.pictures.times
+
+        def may_train(index: int) -> bool:
+            return self.training.trains_on(times[index], step)
+
+        def is_wanted(index: int) -> bool:
+            return may_train(index) and not self.colours.holds_out(index, step)
+
+        return is_wanted if any(is_wanted(i) for i in range(len(self.pictures))) else may_train
+
+
+def _finite_sum(terms: dict[str, Tensor], step: int, picture: Picture) -> float:
+    values = {name: float(term.detach()) for name, term in terms.items()}
+    for name, value in values.items():
+        if not math.isfinite(value):
+            what = "look at that picture; lower the rates in optim" if name == "picture" else "lower its weight or rate"
+            raise DyngsError(f"step {step}, view {picture.name!r}: the loss term {name!r} is {value}; {what}")
+    return sum(values.values())
+
+
+def _require_finite(gaussians: Gaussians, step: int, picture: Picture, moves_by: tuple[str, str]) -> None:
+    """A field may explode unseen, because Gaussians that are not finite are not drawn."""
+    broken = [name for name, x in gaussians.tensors().items() if not bool(x.detach().isfinite().all())]
+    if broken:
+        what, section = moves_by
+        raise DyngsError(
+            f"step {step}, view {picture.name!r}: the {what} makes {', '.join(broken)} at {picture.time or 0:g} not "
+            f"finite; lower the rates in {section}"
+        )

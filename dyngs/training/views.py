@@ -1,0 +1,54 @@
+"""What training needs to know of a capture: cameras, times, surroundings, background."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from dyngs.camera import Cameras
+from dyngs.config import Config, DataConfig
+from dyngs.data.capture import Capture, View
+from dyngs.data.geometry.intrinsics import scaled_intrinsics
+from dyngs.data.pictures.images import target_size
+from dyngs.static.init import Surroundings
+
+AROUND_ORIGIN = ("blender", "body_json")
+"""Formats whose scenes lie around the origin by convention."""
+
+
+def surroundings(capture: Capture) -> Surroundings:
+    """What initialisation needs to know of a capture."""
+    poses = np.stack([view.cam_from_world for view in capture.splits["train"]])
+    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    points = capture.points
+    return Surroundings(
+        camera_centers=centers,
+        points=None if points is None else points.xyz,
+        points_rgb=None if points is None else points.rgb,
+        around_origin=capture.format in AROUND_ORIGIN,
+    )
+
+
+def resolved_background(config: Config, capture: Capture) -> str:
+    """White, black or random; "auto" is white where pictures have alpha, as 3DGS has it, and black otherwise."""
+    if config.data.background == "auto":
+        return "white" if capture.has_alpha else "black"
+    return config.data.background
+
+
+def training_cameras(views: Sequence[View], options: DataConfig) -> list[Cameras]:
+    """The cameras of ``views`` as pictures of their training size, one each; no picture is read."""
+    cameras = []
+    for view in views:
+        width, height = target_size(view.width, view.height, options.downscale, options.longest_side)
+        intrinsics = scaled_intrinsics(view.intrinsics, width / view.width, height / view.height)
+        pose = torch.from_numpy(view.cam_from_world).float()
+        cameras.append(Cameras(pose[None], torch.from_numpy(intrinsics).float()[None], width, height))
+    return cameras
+
+
+def training_times(capture: Capture) -> tuple[float, ...]:
+    """Times of the training views in [0, 1], ascending; empty without times."""
+    return tuple(sorted(view.time for view in capture.splits["train"] if view.time is not None))

@@ -1,0 +1,103 @@
+"""Which Gaussians can be seen around a moment: bits at key times (the temporal filter of 4DGS-1K, Yuan et al. 2025).
+
+Local letters: K key times, A Gaussians active at a time.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyngs.state import Role, State, with_role
+
+BITS = 8
+
+
+@dataclass(frozen=True)
+class VisibilityMasks:
+    """For each of N Gaussians, at which of K >= 2 key times it is seen.
+
+    Attributes:
+        times: distinct, ascending, in [0, 1].
+        bits: (K, ceil(N / 8)) uint8; Gaussian i is bit i % 8 of byte i // 8.
+        count: N.
+    """
+
+    times: tuple[float, ...]
+    bits: Tensor
+    count: int
+
+    @staticmethod
+    def pack(times: tuple[float, ...], seen: Tensor) -> VisibilityMasks:
+        """The masks of ``seen`` (K, N) bool."""
+        padded = torch.nn.functional.pad(seen, (0, -seen.shape[1] % BITS)).unflatten(1, (-1, BITS))
+        return VisibilityMasks(times, (padded * _places()).sum(2).to(torch.uint8), seen.shape[1])
+
+    @property
+    def seen(self) -> Tensor:
+        """(K, N) bool."""
+        return _unpacked(self.bits, self.count)
+
+    def interval(self, time: float) -> int:
+        """k such that ``time`` lies between key times k and k + 1, the nearest two where it lies outside all."""
+        return min(max(bisect_right(self.times, time) - 1, 0), len(self.times) - 2)
+
+    def active(self, interval: int) -> Tensor:
+        """(A,) ascending indices of the Gaussians seen at one end of an interval at least."""
+        either = self.bits[interval] | self.bits[interval + 1]
+        return torch.nonzero(_unpacked(either[None], self.count)[0])[:, 0]
+
+    def select(self, index: Tensor) -> VisibilityMasks:
+        """The masks of the Gaussians at ``index`` (long)."""
+        return VisibilityMasks.pack(self.times, self.seen[:, index])
+
+    def state(self) -> State:
+        """Return times, packed bits and the number of Gaussians."""
+        times = torch.tensor(self.times, dtype=torch.float64, device="cpu")
+        count = torch.tensor([self.count], device="cpu")
+        return with_role({"times": times, "bits": self.bits, "count": count}, Role.SHARED)
+
+    @staticmethod
+    def restored(state: Mapping[str, Tensor], count: int | None = None) -> VisibilityMasks | None:
+        """What ``state()`` returned as masks; None of an empty one.
+
+        Args:
+            state: by name.
+            count: N; None: as the state says.
+
+        Raises:
+            KeyError: something is missing.
+            ValueError: they are not masks of so many Gaussians.
+        """
+        if not state:
+            return None
+        times, bits = state["times"], state["bits"]
+        count = int(state["count"]) if count is None else count
+        ascends = times.ndim == 1 and len(times) > 1 and bool((times[1:] > times[:-1]).all())
+        of_all = bits.dtype == torch.uint8 and bits.shape == (times.numel(), -(-count // BITS))
+        if not (ascends and of_all and state["count"].tolist() == [count]):
+            raise ValueError("the masks are not those of the Gaussians")
+        return VisibilityMasks(tuple(times.tolist()), bits, count)
+
+
+def matched(rows: Tensor, active: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Places in ``rows`` of what is in both, and their places in ``active``; both ascending indices below ``count``."""
+    place = torch.full((count,), -1)
+    place[rows] = torch.arange(len(rows))
+    found = place[active]
+    places = torch.nonzero(found >= 0)[:, 0]
+    return found[places], places
+
+
+def _places() -> Tensor:
+    return 2 ** torch.arange(BITS, dtype=torch.int64)
+
+
+def _unpacked(bits: Tensor, count: int) -> Tensor:
+    """(K, N) bool of packed bits (K, ceil(N / 8))."""
+    places = torch.arange(BITS, dtype=torch.uint8)
+    return ((bits[..., None] >> places) & 1).bool().flatten(1)[:, :count]

@@ -1,0 +1,149 @@
+"""Limits on the number of Gaussians: never exceeded, and refused where they cannot be kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_fields import busy_config, tiny_options, write_tiny_capture
+
+from dyngs.training.limits import most_gaussians, require_possible, room, within_cap
+from dyngs.build import assemble
+from dyngs.config import (
+    BudgetConfig,
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    DynamicModel,
+    HumanPredictorModel,
+    McmcStrategy,
+    PruneConfig,
+    RandomInit,
+    RunConfig,
+    StaticModel,
+    TrainConfig,
+)
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.errors import DyngsError
+from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.training.step import Trainer
+from dyngs.api.train import train
+
+NOTHING = Config(data=DataConfig(root=Path("nowhere")))
+BUSY = DefaultStrategy(start=1, stop=30_000, every=2, grad_threshold=1e-9)
+BUSY_MCMC = McmcStrategy(start=1, stop=30_000, every=2)
+
+
+def limited(config: Config = NOTHING, **limits: float) -> Config:
+    return config.model_copy(update={"budget": BudgetConfig.model_validate(limits)})
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture")
+    write_still_capture(folder, StillOptions(size=16, num_train=4, num_test=1, samples=1))
+    return folder
+
+
+def still_config(capture: Path, run_dir: Path, strategy: DefaultStrategy | McmcStrategy = BUSY) -> Config:
+    return Config(
+        data=DataConfig(root=capture),
+        model=StaticModel(sh_degree=1),
+        init=RandomInit(num_random=60),
+        strategy=strategy,
+        train=TrainConfig(steps=8, log_every=1),
+        run=RunConfig(dir=run_dir, threads=1),
+    )
+
+
+def largest_count(trainer: Trainer) -> int:
+    """The largest number after any step."""
+    counts = []
+    while trainer.done < trainer.config.train.steps:
+        trainer.step()
+        counts.append(len(trainer.optimizer.parameters))
+    return max(counts)
+
+
+@pytest.mark.parametrize(("cap", "most"), [(40, 60), (90, 90)])
+@pytest.mark.parametrize("strategy", [BUSY, BUSY_MCMC], ids=["default", "mcmc"])
+def test_none_are_added_beyond_a_cap(
+    still: Path, tmp_path: Path, strategy: DefaultStrategy | McmcStrategy, cap: int, most: int
+) -> None:
+    """The run begins with 60."""
+    config = still_config(still, tmp_path, strategy)
+    assert largest_count(assemble(config)) > 90
+    assert largest_count(assemble(limited(config, max_gaussians=cap))) == most
+
+
+def test_a_cap_holds_where_motion_adds_some(tmp_path: Path) -> None:
+    config = busy_config(write_tiny_capture(tmp_path / "capture"), tmp_path / "run", "trajectory")
+    assert isinstance(config.model, DynamicModel)
+    free = largest_count(assemble(config))
+    cap = free - config.model.num_random_moving
+    trainer = assemble(limited(config, max_gaussians=cap))
+    assert cap - config.model.num_random_moving <= largest_count(trainer) <= cap
+    assert trainer.model.num_moving(cap) > 0
+
+
+def test_without_limits_the_run_is_the_same(still: Path, tmp_path: Path) -> None:
+    config = still_config(still, tmp_path / "free")
+    assert within_cap(config, 0) is config
+    wide = limited(still_config(still, tmp_path / "wide"), max_gaussians=10**6, max_minutes=1000.0)
+    free, kept = (checkpoint_paths(train(c))[-1].read_bytes() for c in (config, wide))
+    assert free == kept, "limits that are far away change nothing"
+
+
+@given(cap=st.integers(1, 10**7), own=st.integers(1, 10**7))
+def test_limits_only_lower_and_are_settled_at_once(cap: int, own: int) -> None:
+    base = NOTHING.model_copy(update={"strategy": DefaultStrategy(max_gaussians=own), "model": DynamicModel()})
+    config = within_cap(limited(base, max_gaussians=cap), 5)
+    assert isinstance(config.model, DynamicModel)
+    assert config.strategy.max_gaussians + config.model.num_random_moving <= min(
+        cap, own + DynamicModel().num_random_moving
+    )
+    assert 1 <= config.strategy.max_gaussians <= own
+    assert within_cap(config, 5) == config
+
+
+def test_room_grows_with_the_size_and_shrinks_with_what_is_stored() -> None:
+    assert room(NOTHING, 0, 5.0) == pytest.approx(5e6 / (16 + 0.35 * 45), abs=1)
+    assert room(NOTHING, 0, 10.0) == pytest.approx(2 * room(NOTHING, 0, 5.0), abs=1)
+    flat = NOTHING.model_copy(update={"model": StaticModel(sh_degree=0)})
+    assert room(flat, 0, 5.0) == 5e6 / 16
+    fixed, each = (
+        flat.model_copy(update={"model": DynamicModel(sh_degree=0, deform=tiny_options(kind))})
+        for kind in ("hexplane", "trajectory")
+    )
+    assert room(fixed, 1, 5.0) == room(each, 1, 5.0) == 5e6 / 16, "nothing moves at one time"
+    per_gaussian = (3 + 4 + 3 + 1 + 3) * (2 + 2 * 1)  # moved attributes, terms of the series
+    assert 5e6 / room(each, 10, 5.0) == pytest.approx(16 + per_gaussian, abs=0.01)
+    less = 5e6 / 16 - room(fixed, 10, 5.0)
+    assert 0 < less == pytest.approx(1e7 / 16 - room(fixed, 10, 10.0), abs=1)
+
+
+@pytest.mark.parametrize("model", [StaticModel(), DynamicModel()])
+def test_a_size_without_room_is_refused_and_the_one_named_is_not(model: StaticModel | DynamicModel) -> None:
+    config = NOTHING.model_copy(update={"model": model})
+    with pytest.raises(DyngsError, match=r"budget.max_mb=0.001: .* would do") as refused:
+        within_cap(limited(config, max_mb=0.001), 20)
+    would_do = float(str(refused.value).split(";")[1].split()[0])
+    assert room(config, 20, would_do) >= 500
+
+
+def test_what_contradicts_is_refused(tmp_path: Path) -> None:
+    require_possible(NOTHING)
+    with pytest.raises(DyngsError, match=r"budget.max_mb: a network"):
+        require_possible(limited(NOTHING.model_copy(update={"model": HumanPredictorModel()}), max_mb=5.0))
+    both = NOTHING.model_copy(update={"prune": PruneConfig(share=0.5), "run": RunConfig(dir=tmp_path / "run")})
+    with pytest.raises(DyngsError, match=r"budget.max_minutes: .*dyngs compact"):
+        train(limited(both, max_minutes=5.0))
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_lowest_limit_counts() -> None:
+    assert most_gaussians(NOTHING, 0) is None
+    assert most_gaussians(limited(max_gaussians=1000, max_mb=5.0), 0) == 1000
+    assert most_gaussians(limited(max_gaussians=10**6, max_mb=5.0), 0) == room(NOTHING, 0, 5.0)

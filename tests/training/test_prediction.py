@@ -1,0 +1,106 @@
+"""Training of the network: the same bytes, exact resuming, what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_people import NET, people
+
+from dyngs.config import Config, DataConfig
+from dyngs.errors import DyngsError
+from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint
+from dyngs.training.prediction import NetworkTrainer, assemble_network, captures_in, mean_colours, rate_at
+from dyngs.api.train import train
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return people(tmp_path_factory.mktemp("people"), (1, 2))
+
+
+def config(folder: Path, run: Path, **changes: object) -> Config:
+    """Four steps with a checkpoint after every two, with some changes of the model section."""
+    return Config.model_validate(
+        {
+            "data": {"root": folder},
+            "model": NET.model_dump() | changes,
+            "train": {"steps": 4, "save_every": 2, "alpha_weight": 0.1},
+            "run": {"dir": run, "threads": 1},
+        }
+    )
+
+
+def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+    whole = train(config(folder, tmp_path / "whole"))
+    again = train(config(folder, tmp_path / "again"))
+    middle, last = checkpoint_paths(whole)
+    assert last.read_bytes() == checkpoint_paths(again)[-1].read_bytes()
+    checkpoint_paths(again)[-1].unlink()
+    resumed = train(config(folder, tmp_path / "again"), resume_from=again)
+    assert checkpoint_paths(resumed)[-1].read_bytes() == last.read_bytes()
+    before, after = (load_checkpoint(path).part("model.network") for path in (middle, last))
+    assert any(not torch.equal(before[name], after[name]) for name in before)
+    with pytest.raises(DyngsError, match="not of this network"):
+        assemble_network(config(folder, tmp_path, widths=(8, 16))).restore(load_checkpoint(last))
+
+
+def test_training_lowers_the_loss(folder: Path, tmp_path: Path) -> None:
+    """Of the same person, pictures and background, before and after 20 steps."""
+    long = config(folder, tmp_path)
+    trainer = assemble_network(long.model_copy(update={"train": long.train.model_copy(update={"steps": 30})}))
+    assert isinstance(trainer, NetworkTrainer)
+    losses = [trainer.step().loss for _ in range(24)]
+    assert sum(losses[-8:]) < 0.9 * sum(losses[:8])
+    assert trainer.num_gaussians > 500
+
+
+@pytest.mark.parametrize("factor", [1e25, float("nan")])
+def test_a_gradient_too_large_to_square_leaves_the_step_out(folder: Path, tmp_path: Path, factor: float) -> None:
+    """Its length, which is to be cut, is infinite: weights and moments stay as they are, and the next step is good."""
+    trainer = assemble_network(config(folder, tmp_path))
+    trainer.step()
+    before = {name: x.clone() for name, x in trainer.network.state_dict().items()}
+    loss = factor * sum(x.sum() for x in trainer.network.parameters())
+    assert isinstance(loss, torch.Tensor)
+    trainer._update(loss, 2)
+    assert trainer.bad_gradients == 1
+    assert all(torch.equal(x, before[name]) for name, x in trainer.network.state_dict().items())
+    trainer.step()
+    assert trainer.bad_gradients == 1
+    assert not all(torch.equal(x, before[name]) for name, x in trainer.network.state_dict().items())
+
+
+def test_choices_are_as_many_as_asked_for(folder: Path, tmp_path: Path) -> None:
+    trainer = assemble_network(config(folder, tmp_path, inputs=4, views=2))
+    assert [len(person.choices) for person in trainer.people] == [4, 4]
+    assert {len(choice) for person in trainer.people for choice in person.choices} == {2}
+    assert [person.sitter.name for person in trainer.people] == ["p1", "p2"]
+
+
+def test_mean_colours_are_those_of_the_people(folder: Path, tmp_path: Path) -> None:
+    """Of one person they are what is seen; of two they lie between; the atlas is filled everywhere."""
+    trainer = assemble_network(config(folder, tmp_path))
+    one, other, both = (mean_colours(some, 32) for some in ([trainer.people[0]], trainer.people[1:], trainer.people))
+    assert torch.equal(both, trainer.mean)
+    low, high = torch.minimum(one, other), torch.maximum(one, other)
+    within = ((both >= low - 1e-5) & (both <= high + 1e-5)).all(0)
+    assert within.float().mean() > 0.9, "texels that one of them does not show are the other's"
+    assert (both > 0.02).any(0).all()
+
+
+def test_the_rate_goes_up_and_down() -> None:
+    rates = [rate_at(NET, step, 100) for step in range(1, 101)]
+    assert max(rates) == pytest.approx(NET.lr) == rates[4]
+    assert rates[0] < rates[3] < rates[4] > rates[5] > rates[98] > rates[99] > 0
+
+
+def test_what_cannot_be_trained_on_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="holds no folders"):
+        captures_in(DataConfig.model_validate({"root": tmp_path}))
+    (tmp_path / "junk").mkdir()
+    with pytest.raises(DyngsError, match="junk: no capture found"):
+        assemble_network(config(tmp_path, tmp_path / "run"))
+    with pytest.raises(DyngsError, match="multiple of 4"):
+        assemble_network(config(folder, tmp_path / "run", resolution=30))

@@ -1,0 +1,157 @@
+"""Schedules: exactly the published numbers at 30,000 steps, and sensible ones at any other length."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dyngs.config import DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, TrainConfig
+from dyngs.static.rates import Rates
+from dyngs.training.schedule import (
+    MAX_GROWTH,
+    MIN_RESET_GAP,
+    active_sh_degree,
+    deform_schedule,
+    densify_schedule,
+    filter_steps,
+    grad_threshold,
+    growth_per_change,
+    means_rate,
+    picture_divisor,
+)
+
+
+def test_at_30000_steps_it_is_the_published_one() -> None:
+    schedule = densify_schedule(DefaultStrategy(), 30_000, white_background=False)
+    changes = [step for step in range(30_001) if schedule.densifies_at(step)]
+    assert changes == list(range(600, 15_000, 100))
+    assert schedule.resets == (3000, 6000, 9000, 12_000)
+    assert schedule.prune_scale_after == 3000
+    assert densify_schedule(DefaultStrategy(), 30_000, white_background=True).resets == (500, 3000, 6000, 9000, 12_000)
+    mcmc = densify_schedule(McmcStrategy(), 30_000, white_background=True)
+    assert [step for step in range(30_001) if mcmc.densifies_at(step)] == list(range(600, 25_000, 100))
+    assert mcmc.resets == ()
+    assert growth_per_change(McmcStrategy(), 30_000) == 0.05
+    assert filter_steps(DefaultStrategy(), 30_000) == range(15_000, 29_901, 100)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 60_000), st.booleans())
+def test_resets_leave_time_to_recover(steps: int, white: bool) -> None:
+    schedule = densify_schedule(DefaultStrategy(), steps, white)
+    resets = (*schedule.resets, schedule.stop)
+    gaps = [b - a for a, b in pairwise(resets)]
+    assert all(gap >= MIN_RESET_GAP for gap in gaps)
+    assert schedule.start >= 100
+    assert schedule.stop <= max(1, steps // 2 + 1)
+
+
+def test_without_resets_nothing_is_lowered_or_too_large() -> None:
+    schedule = densify_schedule(DefaultStrategy(reset_every=None), 5000, white_background=True)
+    assert schedule.resets == ()
+    assert schedule.prune_scale_after == 5000
+    assert densify_schedule(DefaultStrategy(reset_every=10**6), 5000, white_background=True).resets == ()
+
+
+def test_short_runs() -> None:
+    schedule = densify_schedule(DefaultStrategy(), 2000, white_background=False)
+    assert (schedule.start, schedule.stop, schedule.resets) == (100, 1000, (400,))
+    assert densify_schedule(DefaultStrategy(), 7000, white_background=True).resets == (1400,)
+    assert densify_schedule(DefaultStrategy(), 10, white_background=True).resets == ()
+
+
+def test_short_runs_densify_from_a_lower_gradient_on() -> None:
+    strategy = DefaultStrategy()
+    assert grad_threshold(strategy, 30_000) == grad_threshold(strategy, 60_000) == strategy.grad_threshold
+    thresholds = [grad_threshold(strategy, steps) for steps in (500, 2000, 7000, 29_999)]
+    assert thresholds == sorted(thresholds)
+    assert thresholds[0] > 0.25 * strategy.grad_threshold
+
+
+def test_means_rate_is_log_linear_times_the_extent() -> None:
+    options = OptimConfig()
+    assert means_rate(options, 0.0, 2.0) == pytest.approx(3.2e-4)
+    assert means_rate(options, 0.5, 2.0) == pytest.approx(2 * 1.6e-5)
+    assert means_rate(options, 1.0, 2.0) == pytest.approx(3.2e-6)
+
+
+@pytest.mark.parametrize(("steps", "every"), [(30_000, 1000), (7000, 233), (2000, 67), (10, 1)])
+def test_sh_degree_rises_at_the_scaled_steps(steps: int, every: int) -> None:
+    options = TrainConfig(steps=steps)
+    degrees = [active_sh_degree(options, step, 3) for step in (1, every, 2 * every, 3 * every, 9 * every)]
+    assert degrees == ([0, 1, 2, 3, 3] if every > 1 else [1, 1, 2, 3, 3])
+    assert active_sh_degree(options, steps, 0) == 0
+
+
+@pytest.mark.parametrize("steps", [2000, 7000, 15_000, 30_000])
+def test_mcmc_can_reach_its_cap_at_any_length(steps: int) -> None:
+    schedule = densify_schedule(McmcStrategy(), steps, white_background=False)
+    changes = sum(schedule.densifies_at(step) for step in range(steps))
+    assert (1 + growth_per_change(McmcStrategy(), steps)) ** changes > 15
+
+
+@pytest.mark.parametrize(("growth", "steps"), [(0.5, 20), (1e300, 1), (1e-300, 1), (0.01, 7000), (0.5, 30_000)])
+def test_growth_is_what_is_asked_or_more_up_to_a_quarter_at_any_length(growth: float, steps: int) -> None:
+    """Powers that no float holds included."""
+    found = growth_per_change(McmcStrategy(growth=growth), steps)
+    assert growth <= found <= max(growth * (1 + 1e-12), MAX_GROWTH)
+
+
+def test_the_filter_is_refreshed_after_densification_only() -> None:
+    steps = filter_steps(DefaultStrategy(), 7000)
+    assert (steps[0], steps[-1], steps.step) == (3500, 6900, 100)
+    assert len(filter_steps(DefaultStrategy(), 50)) == 0
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(1, 30_000), st.floats(0, 1), st.floats(0, 1))
+def test_phases_of_a_dynamic_model_come_in_order(steps: int, coarse: float, time_window_full_at: float) -> None:
+    """Coarse, fine, all times, splits; each within the run, and never is there none before motion begins."""
+    model = DynamicModel(motion_from=coarse, time_window_full_at=time_window_full_at)
+    schedule = deform_schedule(model, Rates(steps))
+    assert schedule.rates.steps == steps
+    assert 1 <= schedule.fine <= schedule.full <= steps
+    assert all(schedule.full < split <= steps for split in schedule.splits)
+    assert list(schedule.splits) == sorted(set(schedule.splits))
+    assert deform_schedule(model.model_copy(update={"freeze_below_px": 0.0}), Rates(steps)).splits == ()
+
+
+def test_phases_of_runs_of_usual_lengths() -> None:
+    """Splits come after a tenth, three tenths and a half of the steps that see all times."""
+    schedule = deform_schedule(DynamicModel(motion_from=0.13, time_window_full_at=0.4), Rates(20_000))
+    assert (schedule.fine, schedule.full, schedule.splits) == (2600, 8000, (9200, 11_600, 14_000))
+    assert deform_schedule(DynamicModel(time_window_full_at=0.69), Rates(1000)).splits == (721, 783, 845)
+    assert deform_schedule(DynamicModel(), Rates(1)).fine == 1
+
+
+@pytest.mark.parametrize(("steps", "fine"), [(300, 100), (2000, 666), (5000, 1000), (10_000, 1300)])
+def test_short_runs_stay_still_for_longer(steps: int, fine: int) -> None:
+    """1000 steps, but no more than a third of the run, unless a larger share is asked for."""
+    assert deform_schedule(DynamicModel(motion_from=0.13), Rates(steps)).fine == fine
+    assert deform_schedule(DynamicModel(motion_from=0.5), Rates(steps)).fine == steps // 2
+
+
+@pytest.mark.parametrize(
+    ("coarsest", "expected"), [(1, {1}), (2, {2, 1}), (8, {8, 4, 2, 1})], ids=["never", "one level", "three levels"]
+)
+def test_pictures_sharpen_in_even_steps(coarsest: int, expected: set[int]) -> None:
+    options = TrainConfig.model_validate(
+        {"steps": 1000, "initial_downscale": coarsest, "resolution_grows_from": 0.3, "resolution_full_at": 0.6}
+    )
+    divisors = [picture_divisor(options, step) for step in range(1, 1001)]
+    assert set(divisors) == expected
+    assert divisors == sorted(divisors, reverse=True)
+    assert set(divisors[:299]) == {coarsest}
+    assert set(divisors[600:]) == {1}
+    if coarsest == 8:
+        assert [divisors.index(x) + 1 for x in (4, 2, 1)] == [300, 450, 600]
+
+
+def test_pictures_may_sharpen_at_once() -> None:
+    """Also where the last halving is asked for before the first."""
+    for to in (0.5, 0.2):
+        options = TrainConfig(steps=10, initial_downscale=4, resolution_grows_from=0.5, resolution_full_at=to)
+        assert [picture_divisor(options, step) for step in range(1, 11)] == [4] * 4 + [1] * 6

@@ -1,0 +1,363 @@
+"""One step: any model that keeps the protocol is trained, on the right background, and bad gradients do no harm."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import torch
+from moving_scene import TRAIN_TIMES, write_timed_capture
+from torch import Tensor
+
+from dyngs.build import assemble
+from dyngs.config import (
+    AutoColour,
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    NetworkColour,
+    RandomInit,
+    RunConfig,
+    StaticModel,
+    TrainConfig,
+)
+from dyngs.data.loader import Picture
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.errors import DyngsError
+from dyngs.files.tensor_file import write_tensors
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.rendering import RenderOptions, render
+from dyngs.runs.checkpoint import _KIND, load_checkpoint, stored_scene
+from dyngs.scene import moment_of, num_colour_values
+from dyngs.static.densify import EditResult
+from dyngs.static.model import Drawn
+from dyngs.training.step import Trainer
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture")
+    write_still_capture(folder, StillOptions(size=16, num_train=2, num_test=1, samples=1))
+    return folder
+
+
+def _trainer(capture: Path, **data: object) -> Trainer:
+    return assemble(
+        Config(
+            data=DataConfig(root=capture, **data),  # type: ignore[arg-type]
+            model=StaticModel(sh_degree=1),
+            init=RandomInit(num_random=50),
+            train=TrainConfig(steps=100),
+            run=RunConfig(threads=1),
+        )
+    )
+
+
+class _Lifted:
+    """A model of another kind: all Gaussians are drawn a little higher than they are stored."""
+
+    def __init__(self) -> None:
+        self.steps: list[int] = []
+        self.penalty = 0.0
+
+    def trains_on(self, time: float | None, step: int) -> bool:
+        return True
+
+    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
+        lifted = parameters.replace(means=parameters.means + torch.tensor([0.0, 0.0, 0.1]))
+        penalties = {"height": self.penalty * parameters.means[:, 2].abs().sum()} if self.penalty else {}
+        return Drawn(lifted, penalties)
+
+    def after_step(self, parameters: Gaussians, step: int, result: EditResult | None) -> int:
+        self.steps.append(step)
+        return 3
+
+    def edit(self, parameters: Gaussians, step: int) -> EditResult | None:
+        return None
+
+    def num_moving(self, num_gaussians: int) -> int:
+        return num_gaussians
+
+    def state(self) -> dict[str, Tensor]:
+        return {"steps": torch.tensor(self.steps)}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self.steps = state["steps"].tolist()
+
+
+def test_a_model_of_another_kind_is_trained(capture: Path) -> None:
+    trainer = _trainer(capture)
+    trainer.model = _Lifted()
+    before = trainer.optimizer.parameters.means.detach().clone()
+    losses = [trainer.step().loss for _ in range(30)]
+    assert trainer.model.steps == list(range(1, 31))
+    assert sum(losses[-4:]) < sum(losses[:4])
+    assert not torch.equal(trainer.optimizer.parameters.means, before)
+    other = _trainer(capture)
+    other.model = _Lifted()
+    other.restore(trainer.checkpoint())
+    assert other.step().loss == trainer.step().loss
+    assert trainer.bad_gradients == 3 * 31
+
+
+def test_penalties_of_the_model_are_part_of_the_loss(capture: Path) -> None:
+    plain, penalized = (_trainer(capture) for _ in range(2))
+    plain.model, penalized.model = _Lifted(), _Lifted()
+    penalized.model.penalty = 0.01
+    heights = plain.optimizer.parameters.means.detach()[:, 2].abs()
+    assert penalized.step().loss == pytest.approx(plain.step().loss + 0.01 * float(heights.sum()), rel=1e-5)
+    for _ in range(20):
+        penalized.step()
+    assert penalized.optimizer.parameters.means.detach()[:, 2].abs().mean() < heights.mean()
+
+
+class _Growing(_Lifted):
+    """It wants each Gaussian once more after step 2."""
+
+    def edit(self, parameters: Gaussians, step: int) -> EditResult | None:
+        assert self.steps[-1] == step, "it has followed the step already"
+        if step != 2:
+            return None
+        num = len(parameters)
+        return EditResult(TopologyEdit(torch.arange(2 * num) % num, torch.arange(2 * num) >= num))
+
+
+def test_a_model_may_change_the_set(capture: Path) -> None:
+    """At once, and the run goes on with it; new rows have no moments."""
+    trainer = _trainer(capture)
+    trainer.model = _Growing()
+    counts = []
+    for _ in range(4):
+        trainer.step()
+        counts.append(len(trainer.optimizer.parameters))
+        if trainer.done == 2:
+            moments = trainer.optimizer.state()["exp_avg_sq.means"]
+            assert moments[:50].any()
+            assert not moments[50:].any()
+            other = _trainer(capture)
+            other.model = _Growing()
+            other.restore(trainer.checkpoint())
+    assert counts == [50, 100, 100, 100]
+    for _ in range(2):
+        other.step()
+    assert torch.equal(other.optimizer.parameters.means, trainer.optimizer.parameters.means)
+
+
+# --- kinds of colour --------------------------------------------------------------------------------------------------
+
+MEASURED_AFTER = 24
+COLOURS = {
+    "network": NetworkColour(width=8, depth=1, warm_up=5, opacity_entropy=1e-3),
+    "none pays": AutoColour(measure_at=0.6, tolerance=300.0),
+    "some pay": AutoColour(measure_at=0.6, tolerance=0.0),
+}
+
+
+@pytest.fixture(scope="module")
+def seven_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture")
+    write_still_capture(folder, StillOptions(size=16, num_train=7, num_test=1, samples=1))
+    return folder
+
+
+def _coloured(capture: Path, colour: NetworkColour | AutoColour, strategy: DefaultStrategy | None = None) -> Trainer:
+    return assemble(
+        Config(
+            data=DataConfig(root=capture),
+            model=StaticModel(sh_degree=1),
+            init=RandomInit(num_random=50),
+            colour=colour,
+            strategy=strategy or DefaultStrategy(),
+            train=TrainConfig(steps=40, sh_every=1),
+            run=RunConfig(threads=1),
+        )
+    )
+
+
+@pytest.mark.parametrize("name", COLOURS)
+def test_every_kind_of_colour_learns_and_goes_on_exactly(seven_views: Path, name: str) -> None:
+    """From a checkpoint before the harmonics are measured, and from one after."""
+    whole = _coloured(seven_views, COLOURS[name])
+    losses = []
+    for step in range(1, 41):
+        if step in (20, 31):
+            resumed = _coloured(seven_views, COLOURS[name])
+            resumed.restore(whole.checkpoint())
+        losses.append(whole.step().loss)
+        if step > 20:
+            resumed.step()
+    assert sum(losses[-7:]) < sum(losses[:7])
+    wanted, found = whole.checkpoint().tensors, resumed.checkpoint().tensors
+    assert wanted.keys() == found.keys()
+    assert all(torch.equal(x, found[key]) for key, x in wanted.items())
+
+
+@pytest.mark.parametrize("name", ["none pays", "some pay"])
+def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> None:
+    """For good: they stay zero while the set changes; the view that tells is not trained on before."""
+    busy = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=1_000_000)
+    trainer = _coloured(seven_views, COLOURS[name], busy)
+    seen, findings, counts = set(), {}, set()
+    for step in range(1, 41):
+        report = trainer.step()
+        counts.add(len(trainer.optimizer.parameters))
+        if report.finding is not None:
+            findings[step] = report.finding
+            dropped = trainer.colours.frozen_rest()
+        if step <= MEASURED_AFTER:
+            seen.add(report.picture.name)
+    assert len(seen) == 6
+    assert list(findings) == [MEASURED_AFTER]
+    assert len(counts) > 4
+    sh, frozen = trainer.optimizer.parameters.sh, trainer.colours.frozen_rest()
+    if name == "none pays":
+        assert "does not pay" in findings[MEASURED_AFTER]
+        assert sh.shape[1] == 1
+    else:
+        assert dropped is not None
+        assert frozen is not None
+        assert 0 < int(frozen.sum()) < len(frozen) == len(sh)
+        assert torch.equal((sh[:, 1:] == 0).flatten(1).all(1), frozen)
+
+
+def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> None:
+    """And what was trained is drawn with it."""
+    trainer = _coloured(seven_views, COLOURS["network"])
+    for _ in range(30):
+        trainer.step()
+    assert trainer.optimizer.parameters.sh_degree == 0
+    scene = stored_scene(trainer.checkpoint(), trainer.config.model)
+    camera = trainer.pictures[0].cameras
+    gaussians, shader = trainer.optimizer.parameters.detach(), trainer.colours.shader(None, None)
+    drawn = moment_of(scene, None).seen_by(camera, RenderOptions()).rgb
+    assert torch.equal(drawn, render(gaussians, camera, shader=shader).rgb.detach())
+    assert not torch.equal(drawn, render(gaussians, camera).rgb)
+    assert scene.colour is not None
+    assert num_colour_values(scene) == 3 * len(gaussians) + scene.colour.num_values
+
+
+class _Exploding(_Lifted):
+    """From step 3 on it draws positions and rotations that are not finite."""
+
+    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
+        if step < 3:
+            return super().gaussians_at(parameters, batch, step)
+        factor = float("nan")
+        return Drawn(parameters.replace(means=parameters.means * factor, quats=parameters.quats * factor))
+
+
+class _Overweight(_Lifted):
+    """From step 3 on it has an infinite penalty."""
+
+    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
+        self.penalty = 0.0 if step < 3 else float("inf")
+        return super().gaussians_at(parameters, batch, step)
+
+
+def _stops_in_step_3(trainer: Trainer) -> str:
+    """The error's message; the trainer is left as after step 2."""
+    trainer.step()
+    trainer.step()
+    before = {name: x.detach().clone() for name, x in trainer.optimizer.parameters.tensors().items()}
+    with pytest.raises(DyngsError) as caught:
+        trainer.step()
+    assert trainer.done == 2
+    assert all(torch.equal(x, before[name]) for name, x in trainer.optimizer.parameters.tensors().items())
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("timed", [False, True])
+def test_what_is_not_finite_is_named_in_one_line(capture: Path, tmp_path: Path, timed: bool) -> None:
+    """Step, view, attributes, and the time; the parameters stay as they were."""
+    trainer = _trainer(write_timed_capture(tmp_path / "timed") if timed else capture)
+    trainer.model = _Exploding()
+    time = "(0|0.25|0.5|0.75|1)" if timed else "0"
+    assert re.fullmatch(
+        rf"step 3, view 'train/r_00\d': the field makes means, quats at {time} not finite; lower .*model\.deform",
+        _stops_in_step_3(trainer),
+    )
+
+
+def test_a_term_that_is_not_finite_is_named_in_one_line(capture: Path) -> None:
+    trainer = _trainer(capture)
+    trainer.model = _Overweight()
+    message = _stops_in_step_3(trainer)
+    assert re.fullmatch(
+        r"step 3, view 'train/r_00\d': the loss term 'height' is inf; lower its weight or rate", message
+    )
+
+
+def test_only_times_that_the_model_wants_are_trained_on(tmp_path: Path) -> None:
+    class _Early(_Lifted):
+        def trains_on(self, time: float | None, step: int) -> bool:
+            return time is not None and time <= 0.1 * step
+
+    trainer = _trainer(write_timed_capture(tmp_path))
+    trainer.model = _Early()
+    seen = [trainer.step().picture.time for _ in range(40)]
+    assert all(time is not None and time <= 0.1 * (i + 1) for i, time in enumerate(seen))
+    assert set(seen[20:]) == set(TRAIN_TIMES)
+
+
+@pytest.mark.parametrize(("choice", "value"), [("white", 1.0), ("black", 0.0), ("auto", 1.0)])
+def test_truth_and_render_share_the_background(capture: Path, choice: str, value: float) -> None:
+    report = _trainer(capture, background=choice).step()
+    assert report.picture.alpha is not None
+    empty = report.picture.alpha == 0
+    assert empty.any()
+    assert (report.truth[empty] == value).all()
+
+
+def test_a_random_background_is_new_in_each_step(capture: Path) -> None:
+    trainer = _trainer(capture, background="random")
+    colours = []
+    for _ in range(3):
+        report = trainer.step()
+        assert report.picture.alpha is not None
+        shown = report.truth[report.picture.alpha == 0].unique(dim=0)
+        assert len(shown) == 1
+        colours.append(tuple(shown[0].tolist()))
+    assert len(set(colours)) == 3
+
+
+def test_a_checkpoint_of_another_model_is_refused(capture: Path) -> None:
+    trainer = _trainer(capture)
+    checkpoint = trainer.checkpoint()
+    del checkpoint.tensors["sampler.order"]
+    with pytest.raises(DyngsError, match="lacks 'order'"):
+        trainer.restore(checkpoint)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("exp_avg.means", lambda x: x[1:], r"'exp_avg.means' is float32 \(49, 3\), not float32 \(50, 3\)"),
+        ("exp_avg_sq.sh", lambda x: x[:, :1], "'exp_avg_sq.sh' is float32"),
+        ("exp_avg.quats", lambda x: x.double(), "'exp_avg.quats' is float64"),
+        ("exp_avg_sq.means", lambda x: x / 0, "'exp_avg_sq.means' holds NaN"),
+        ("gaussians.quats", lambda x: x[:, :3], "quats must be"),
+        ("sampler.order", lambda x: torch.tensor([7]), "'order' names something beyond the 2"),
+        ("sampler.position", lambda x: x + 99, "'position' names something beyond"),
+        ("strategy.seen", lambda x: x.long(), "'seen' is int64"),
+        ("rng", lambda x: x[:9], "cannot be read"),
+        ("rng", lambda x: x.float(), "cannot be read"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_one_line(
+    capture: Path, tmp_path: Path, name: str, change: Callable[[Tensor], Tensor], said: str
+) -> None:
+    trainer = _trainer(capture)
+    trainer.step()
+    whole = trainer.checkpoint()
+    path = tmp_path / "checkpoints" / "step_0000001.safetensors"
+    path.parent.mkdir()
+    tensors = whole.tensors | {name: change(whole.tensors[name])}
+    write_tensors(path, _KIND, {name: x.contiguous() for name, x in tensors.items()}, asdict(whole.info))
+    with pytest.raises(DyngsError, match=said) as caught:
+        trainer.restore(load_checkpoint(path))
+    assert str(caught.value).startswith(str(path))
+    trainer.restore(whole)
+    trainer.step()
