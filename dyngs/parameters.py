@@ -40,6 +40,10 @@ class Parameters:
     def __getitem__(self, name: str) -> Tensor:
         return self._tensors[name]
 
+    def get(self, name: str) -> Tensor | None:
+        """Return the tensor of that name, None without one."""
+        return self._tensors.get(name)
+
     def __contains__(self, name: str) -> bool:
         return name in self._tensors
 
@@ -87,7 +91,9 @@ class Parameters:
         return {name: StateTensor(x, self._roles[name]) for name, x in self.values().items()} | self._adam.state()
 
     def restored(self, tensors: Mapping[str, Tensor], rows: Mapping[str, int] | None = None) -> Parameters:
-        """Return what ``state`` returned as parameters like these. Without any moments, as files for drawing are, all are 0.
+        """Return what ``state`` returned as parameters like these.
+
+        Where no moments are stored, as in files for drawing, they are 0.
 
         Args:
             tensors: names to values and moments.

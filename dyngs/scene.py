@@ -58,7 +58,7 @@ class Scene(ABC):
 
     gaussians: Gaussians
     colour: ColourNetwork | None = None
-    options: RenderOptions = RenderOptions()
+    options: RenderOptions = field(default_factory=RenderOptions)
     background: Tensor | None = None
     masks: VisibilityMasks | None = None
     _derived: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -249,7 +249,7 @@ class SceneTraining(Protocol[S]):
         ...
 
     def grown(self, scene: S, step: int) -> tuple[S, EditResult] | None:
-        """Return the scene with Gaussians that its kind adds after ``step``, and the edit that adds them; None: none."""
+        """Return the scene with Gaussians that its kind adds after ``step``, and the edit; None: none are added."""
         ...
 
     def window(self, step: int) -> tuple[float, float]:
@@ -261,7 +261,7 @@ class SceneTraining(Protocol[S]):
         ...
 
     def all_moving(self, scene: S, extent: float) -> S:
-        """Return ``scene`` as expensive to draw as it may become: all Gaussians moved, by an untrained field if need be.
+        """Return ``scene`` as expensive to draw as it may become: all Gaussians move, by an untrained field if need be.
 
         Args:
             scene: N Gaussians.

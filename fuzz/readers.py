@@ -155,7 +155,7 @@ def read_splats(root: Path) -> object:
 
 def read_a_run(root: Path) -> object:
     """The scene of a run at two moments, drawn, and its times."""
-    from dyngs.evaluate.report import render_options
+    from dyngs.scene import render_options
     from dyngs.runs.checkpoint import load_run, seconds_at
 
     run = load_run(root)
@@ -164,7 +164,7 @@ def read_a_run(root: Path) -> object:
 
 def read_a_person(root: Path) -> object:
     """The avatar, drawn."""
-    from dyngs.evaluate.report import render_options
+    from dyngs.scene import render_options
     from dyngs.export.avatar import read_avatar
 
     run = read_avatar(only(root))

@@ -13,15 +13,15 @@ from moving_scene import camera
 from tiny_fields import KINDS, cloud, stirred_field, tiny_options, tiny_setup
 from torch import Tensor
 
-from dyngs.colour.colours import NetworkColours
+from dyngs.colour.training import NetworkTraining
 from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.deform.fields import field_state
-from dyngs.visibility import VisibilityMasks
 from dyngs.rendering import RenderOptions
 from dyngs.scene import Scene, moment_of
 from dyngs.storage.coding import compressed
 from dyngs.storage.file import _DTYPES, MAGIC, MAX_HEADER, SceneInfo, _Header, _stored
 from dyngs.storage.tensors import Coding, Kind
+from dyngs.visibility import VisibilityMasks
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]
@@ -133,7 +133,7 @@ def contents(kind: str) -> tuple[Tensors, SceneModel]:
     if kind == "network":
         gaussians = gaussians.replace(sh=gaussians.sh[:, :1].contiguous())
         box, options = torch.stack([torch.zeros(3), torch.ones(3)]), NetworkColour(width=8, depth=2)
-        colours = NetworkColours(options, 10, box, torch.Generator().manual_seed(0), sees_time=True)
+        colours = NetworkTraining(options, 10, box, torch.Generator().manual_seed(0), sees_time=True)
         state |= {f"colour.{name}": x for name, x in colours.state().items()}
     elif kind != "static":
         field = "trajectory" if kind == "masked" else kind

@@ -15,9 +15,9 @@ from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.field import FieldSetup, Offsets, chosen
 from dyngs.deform.fields import field_state, new_field
-from dyngs.deform.learned import LearnedTensors
-from dyngs.deform.trained import TrainedScene
+from dyngs.deform.scene import TrainedScene
 from dyngs.gaussians import Gaussians
+from dyngs.parameters import Parameters
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 
 MOVING_ROWS = (1, 3)
@@ -31,7 +31,7 @@ class Sliding:
 
     speed: float = 1.0
     calls: int = 0
-    learned: LearnedTensors = field(default_factory=lambda: LearnedTensors({}, {}))
+    learned: Parameters = field(default_factory=lambda: Parameters({}, {}))
     buffers: dict[str, Tensor] = field(default_factory=dict)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:

@@ -35,12 +35,12 @@ from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
-from dyngs.deform.model import DynamicScene
 from dyngs.deform.residual import residuals_of
+from dyngs.deform.training import DynamicScene
 from dyngs.static.densify import DefaultDensifier
 from dyngs.static.fixed import FixedDensifier
 from dyngs.static.mcmc import McmcDensifier
-from dyngs.static.model import StaticScene
+from dyngs.static.training import StaticScene
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_parts_follow_the_config(capture: Path) -> None:
     assert (trainer.options.mode, trainer.options.eps2d, trainer.options.near) == (RasterizeMode.ANTIALIASED, 0.1, 0.5)
     assert trainer.options.absgrad
     assert trainer.options.alpha_min == 0.01
-    assert trainer.optimizer.parameters.sh.shape == (40, 9, 3)
+    assert trainer.scene.gaussians.sh.shape == (40, 9, 3)
     assert (trainer.background, trainer.has_test_views, len(trainer.pictures)) == ("white", True, 5)
     mcmc = assemble(config.model_copy(update={"strategy": McmcStrategy(max_gaussians=30)}))
     assert isinstance(mcmc.densifier, McmcDensifier)
@@ -98,7 +98,7 @@ def test_a_fixed_set_of_gaussians_stays(capture: Path) -> None:
     trainer = assemble(config)
     assert isinstance(trainer.densifier, FixedDensifier)
     trainer.step()
-    assert len(trainer.optimizer.parameters) == 30, "a limit on their number removes some later on, none are added"
+    assert len(trainer.scene.gaussians) == 30, "a limit on their number removes some later on, none are added"
 
 
 def test_auto_background_is_white_only_behind_alpha(capture: Path) -> None:
@@ -168,7 +168,7 @@ def test_motion_is_looked_for_in_pictures_from_all_over_the_clip(capture: Path, 
     root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
     trainer = assemble(_dynamic(root, data=DataConfig(root=root, background="white")))
     assert isinstance(trainer.model, DynamicScene)
-    gaussians = trainer.optimizer.parameters.detach()
+    gaussians = trainer.scene.gaussians.detach()
     found = trainer.model.capture.residuals(lambda _: gaussians)
     pictures = [trainer.pictures[i] for i in range(5)]
     expected = residuals_of(lambda _: gaussians, pictures, trainer.options, torch.ones(3))

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.deform.learned import LearnedTensors
+from dyngs.parameters import Parameters
 
 RATES = {"weight": 1e-2, "bias": 3e-3, "planes": 2e-2}
 SHAPES = {"weight": (4, 5), "bias": (3,), "planes": (2, 3, 4, 2)}
@@ -17,7 +17,7 @@ def start_values() -> dict[str, Tensor]:
     return {name: torch.randn(shape, generator=generator) for name, shape in SHAPES.items()}
 
 
-def give_gradients(learned: LearnedTensors, step: int) -> dict[str, Tensor]:
+def give_gradients(learned: Parameters, step: int) -> dict[str, Tensor]:
     """New random gradients, the same for each step."""
     generator = torch.Generator().manual_seed(step)
     found = {}
@@ -29,7 +29,7 @@ def give_gradients(learned: LearnedTensors, step: int) -> dict[str, Tensor]:
 @pytest.mark.parametrize("decay", [1.0, 0.01, 0.0])
 def test_it_is_adam_with_a_falling_rate(decay: float) -> None:
     """The rate is log-linear from the first to the last; where the last is zero, linear."""
-    learned, num_steps = LearnedTensors(start_values(), RATES, decay), 12
+    learned, num_steps = Parameters(start_values(), RATES, decay), 12
     mine = {name: x.clone().requires_grad_() for name, x in start_values().items()}
     adam = torch.optim.Adam([{"params": [x], "lr": RATES[name]} for name, x in mine.items()], eps=1e-15)
     for step in range(1, num_steps + 1):
@@ -47,7 +47,7 @@ def test_it_is_adam_with_a_falling_rate(decay: float) -> None:
 
 
 def test_rows_with_bad_gradients_are_left_out_and_counted() -> None:
-    learned, before = LearnedTensors(start_values(), RATES), start_values()
+    learned, before = Parameters(start_values(), RATES), start_values()
     give_gradients(learned, 1)
     for name, row in (("weight", (2, 1)), ("planes", (1, 2, 3, 0))):
         grad = learned[name].grad
@@ -62,7 +62,7 @@ def test_rows_with_bad_gradients_are_left_out_and_counted() -> None:
 
 
 def test_what_has_no_gradient_stays() -> None:
-    learned = LearnedTensors(start_values(), RATES)
+    learned = Parameters(start_values(), RATES)
     learned["bias"].grad = torch.ones(3)
     learned.step(1, 0.0)
     for name, x in start_values().items():
@@ -73,7 +73,7 @@ def test_what_has_no_gradient_stays() -> None:
 
 
 def test_select_moves_rows_and_starts_new_ones_without_moments() -> None:
-    learned = LearnedTensors(start_values(), RATES)
+    learned = Parameters(start_values(), RATES)
     give_gradients(learned, 1)
     learned.step(1, 0.0)
     before = {name: x.clone() for name, x in learned.state().items()}
@@ -92,7 +92,7 @@ def test_select_moves_rows_and_starts_new_ones_without_moments() -> None:
 
 
 def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
-    first, second = (LearnedTensors(start_values(), RATES, 0.1) for _ in range(2))
+    first, second = (Parameters(start_values(), RATES, 0.1) for _ in range(2))
     for step in (1, 2, 3):
         give_gradients(first, step)
         first.step(step, step / 6)

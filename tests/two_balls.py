@@ -7,7 +7,7 @@ import math
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.deform.trained import TrainedScene
+from dyngs.deform.scene import TrainedScene
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions
 from dyngs.view.camera_paths import CameraPath

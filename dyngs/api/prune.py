@@ -12,8 +12,9 @@ from statistics import fmean, median
 import torch
 
 from dyngs.api.train import num_cores, train
-from dyngs.config import HumanPredictorModel, PruneConfig
+from dyngs.config import PruneConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.config.kinds import network_of
 from dyngs.data.capture import Capture
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture, PictureLoader
@@ -69,7 +70,7 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
     defaults = [f"prune.{key}={value}" for key, value in PruneConfig().model_dump().items()]
     done = [f"train.steps={step}", "budget.max_minutes=null", f"run.dir={out}"]
     config = load_resolved(run_dir, [*done, *defaults, *overrides])
-    if isinstance(config.model, HumanPredictorModel):
+    if network_of(config) is not None:
         raise DyngsError(f"{run_dir}: a network, not a scene; compact what it predicts")
     if not config.prune.is_wanted:
         raise DyngsError("nothing to do: give a share to --prune, or key times to --masks")

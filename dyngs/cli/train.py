@@ -59,16 +59,17 @@ def _next(folder: Path, config: Config) -> str:
 
 def _about_motion(folder: Path, config: Config) -> list[str]:
     """What a dynamic model found to move."""
-    from dyngs.config import DynamicModel
+    from dyngs.config.kinds import freezes_below_px
     from dyngs.runs.checkpoint import load_run
 
-    if not isinstance(config.model, DynamicModel):
+    limit = freezes_below_px(config)
+    if limit is None:
         return []
     scene = load_run(folder).scene
     if not scene.times:
         return ["motion:  the capture has no times (or only one), so this is a static model"]
     if scene.is_still:
-        return [f"motion:  nothing moves by {config.model.freeze_below_px:g} px or more, so this became a static model"]
+        return [f"motion:  nothing moves by {limit:g} px or more, so this became a static model"]
     return [f"motion:  {len(scene.rows):,} of {len(scene):,} Gaussians move ({scene.moving_share:.1%})"]
 
 

@@ -213,7 +213,7 @@ def opacity_entropy(logits: Tensor) -> Tensor:
 
 
 def rate_factor(step: int, steps: int, warm_up: int) -> float:
-    """Return what the rate of ``step``, from 1, is multiplied by: a linear warm-up, then a third after each milestone."""
+    """Return the factor on the rate of ``step``, from 1: a linear warm-up, then a third after each milestone."""
     passed = sum(step > share * steps for share in _MILESTONES)
     return min(1.0, step / warm_up) / 3**passed
 

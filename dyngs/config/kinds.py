@@ -1,4 +1,4 @@
-"""Facts about a configuration that depend on the kinds chosen in it, for code that does not otherwise care for kinds."""
+"""Facts about a configuration that depend on the kinds in it, for code that does not otherwise care for kinds."""
 
 from __future__ import annotations
 
@@ -60,6 +60,17 @@ def added_for_motion(config: Config) -> int:
             return config.model.num_random_moving
         case StaticModel() | HumanModel() | HumanPredictorModel():
             return 0
+        case _:
+            assert_never(config.model)
+
+
+def freezes_below_px(config: Config) -> float | None:
+    """Return the motion in pixels below which Gaussians are frozen; None for models without motion over time."""
+    match config.model:
+        case DynamicModel():
+            return config.model.freeze_below_px
+        case StaticModel() | HumanModel() | HumanPredictorModel():
+            return None
         case _:
             assert_never(config.model)
 

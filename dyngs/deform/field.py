@@ -102,7 +102,7 @@ class DeformationField(Protocol):
         ...
 
     def edited(self, edit: TopologyEdit) -> DeformationField:
-        """Return the field after an edit of the moving Gaussians: row i descends from the old row ``edit.source[i]``."""
+        """Return the field after an edit of the moving Gaussians."""
         ...
 
     def regroup(self) -> None:

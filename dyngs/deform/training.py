@@ -202,7 +202,7 @@ class DynamicTraining:
         return replace(scene, field=left, moving=scene.moving[kept])
 
     def _jittered(self, time: float, step: int) -> float:
-        """Return ``time`` with the annealed noise of Deformable-3DGS (Yang et al. 2024), against frames that overfit."""
+        """Return ``time`` with the annealed noise of Deformable-3DGS (Yang et al. 2024), against overfitting."""
         if self.options.time_jitter == 0:
             return time
         gap = 1 / max(len(self.times) - 1, 1)

@@ -16,7 +16,9 @@ PLAIN_LINES = 10
 
 
 class Progress:
-    """Listener that shows a bar with loss, PSNR, Gaussians, steps per second and time left; plain lines where there is no terminal.
+    """Listener that shows a bar with loss, PSNR, Gaussians, steps per second and time left.
+
+    Where there is no terminal, plain lines.
 
     A context manager; tells nothing where ``total`` steps are already done.
 

@@ -68,7 +68,7 @@ def coarseness_of(visibility: Tensor) -> Tensor:
 
 
 def assumed_precision(gaussians: Gaussians) -> Precision:
-    """Return steps where no picture can be drawn: fine ones, positions by the size of the Gaussians; all else is halves."""
+    """Return steps where no picture can be drawn: fine ones; those of positions follow the size of the Gaussians."""
     log_scales = gaussians.log_scales.detach().double()
     size = float(log_scales.median(1).values.median().exp()) if len(log_scales) else 1.0
     return Precision(

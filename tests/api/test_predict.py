@@ -9,14 +9,14 @@ import pytest
 import torch
 from tiny_people import NET, TINY, people
 
+from dyngs.api.predict import Prediction, network_config, predict_person
+from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.human.avatar.trained import AvatarScene
+from dyngs.human.avatar.scene import HumanScene
 from dyngs.runs.checkpoint import load_run
-from dyngs.api.predict import Prediction, network_config, predict_person
-from dyngs.api.train import train
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 def test_a_prediction_is_a_run_of_a_person(made: Made) -> None:
     """Which is drawn, measured on both splits, and knows its pictures."""
     run = load_run(made.prediction.run_dir)
-    assert isinstance(run.scene, AvatarScene)
+    assert isinstance(run.scene, HumanScene)
     assert (run.config.model.kind, run.step, run.config.data.root) == ("human", 0, made.capture)
     assert len(run.scene) == made.prediction.num_gaussians > 500
     assert bool((run.scene.gaussians.opacities >= 0.02).all())

@@ -8,13 +8,13 @@ import pytest
 from moving_scene import write_moving_run
 from tiny_fields import busy_config, write_tiny_capture
 
+from dyngs.api.prune import compared, prune_run
+from dyngs.api.train import train
 from dyngs.config import PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.api.prune import prune_run, compared
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.api.train import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 ASKED = ("prune.share=0.5", "prune.max_loss=100", "prune.steps=6", "prune.mask_times=3", "run.threads=1")

@@ -9,6 +9,7 @@ import pytest
 from moving_scene import write_moving_run
 from tiny_fields import KINDS, busy_config, tiny_options, write_tiny_capture
 
+from dyngs.api.train import train
 from dyngs.bench.deform import (
     FIELD_STAGES,
     VARIANTS,
@@ -23,7 +24,6 @@ from dyngs.bench.deform import (
 from dyngs.cli import main
 from dyngs.config import DynamicModel, RandomInit, StaticModel
 from dyngs.errors import DyngsError
-from dyngs.api.train import train
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_fields import busy_config
 
+from dyngs.api.train import train
 from dyngs.budget.count import STAGES, CountLimit, stage
 from dyngs.build import assemble
 from dyngs.config import (
@@ -26,7 +27,6 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_resolved
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.api.train import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from dyngs.api.train import train
 from dyngs.budget.size import write_within
 from dyngs.build import assemble
 from dyngs.config import BudgetConfig, Config, DataConfig, RandomInit, RunConfig, StaticModel, TrainConfig
@@ -17,8 +18,7 @@ from dyngs.errors import DyngsError
 from dyngs.prune.stage import quality_of
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, has_only_scene_file, latest_checkpoint, load_run
 from dyngs.runs.folder import SMALL_FOLDER
-from dyngs.training.step import Trainer
-from dyngs.api.train import train
+from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_fields import busy_config
 
+from dyngs.api.train import train
 from dyngs.budget.speed import (
     ACCEPTED,
     GOAL,
@@ -39,8 +40,7 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.temporal import Drawing
 from dyngs.runs.checkpoint import checkpoint_paths, load_run, stored_scene
 from dyngs.scene import Scene
-from dyngs.training.step import Trainer
-from dyngs.api.train import train
+from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -186,7 +186,7 @@ def test_what_never_grows_does_not_begin_to(person: Path, tmp_path: Path) -> Non
     while trainer.done < 8:
         trainer.step()
         limit.after_step(trainer)
-    assert limit.before > len(trainer.optimizer.parameters)
+    assert limit.before > len(trainer.scene.gaussians)
     assert limit.cap == config.strategy.growth_limit == 0
 
 
@@ -211,10 +211,10 @@ def test_a_machine_that_becomes_too_slow_is_told_of(
     trainer = assemble(still_config(still, tmp_path))
     while trainer.done < trainer.config.train.steps:
         trainer.step()
-    count = len(trainer.optimizer.parameters)
+    count = len(trainer.scene.gaussians)
     monkeypatch.setattr("dyngs.budget.speed.drawing_seconds", lambda *_: 1.0)
     assert limit.after_step(trainer) is None
-    assert len(trainer.optimizer.parameters) == count
+    assert len(trainer.scene.gaussians) == count
     with pytest.raises(DyngsError, match=r"budget.min_fps=100: drawn at 1 per second"):
         limit.reached(trainer)
 

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_fields import busy_config, write_tiny_capture
 
+from dyngs.api.train import train
 from dyngs.budget.time import (
     AIM,
     FEWEST_STEPS,
@@ -29,8 +30,7 @@ from dyngs.config import AutoColour, BudgetConfig, Config, DataConfig, DynamicMo
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import load_run
-from dyngs.training.step import StepReport, Trainer
-from dyngs.api.train import train
+from dyngs.training.trainer import StepReport, Trainer
 
 PLAIN = Config(data=DataConfig(root=Path("nowhere")))
 SHRUNK = PLAIN.model_copy(update={"train": TrainConfig(steps=7000, initial_downscale=4)})

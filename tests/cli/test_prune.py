@@ -8,9 +8,9 @@ import pytest
 from refused import error_line
 from tiny_fields import busy_config, write_tiny_capture
 
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config.io import load_resolved
-from dyngs.api.train import train
 
 
 @pytest.mark.usefixtures("one_thread")

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import random_scene
 
-from dyngs.colour.colours import Colours, NetworkColours, opacity_entropy, rate_factor
 from dyngs.colour.network import network_of
+from dyngs.colour.training import Colours, NetworkTraining, opacity_entropy, rate_factor
 from dyngs.config import NetworkColour, ShColour
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import render
@@ -20,10 +20,10 @@ def gaussians() -> Gaussians:
     return Gaussians(**{name: x.float() for name, x in drawn.tensors().items()})
 
 
-def colours(seed: int = 0, **options: object) -> NetworkColours:
+def colours(seed: int = 0, **options: object) -> NetworkTraining:
     box = torch.tensor([[0.0] * 3, [2.0] * 3])
     generator = torch.Generator().manual_seed(seed)
-    return NetworkColours(NetworkColour.model_validate(options), 60, box, generator, sees_time=True)
+    return NetworkTraining(NetworkColour.model_validate(options), 60, box, generator, sees_time=True)
 
 
 def test_plain_colours_do_nothing() -> None:
@@ -80,7 +80,7 @@ def test_state_goes_round_and_training_goes_on_alike() -> None:
     cameras = random_scene(views=1).to(torch.float32).cameras
     shown = torch.ones(1, 30, 2, dtype=torch.int32)
 
-    def train(learner: NetworkColours, first: int, last: int) -> None:
+    def train(learner: NetworkTraining, first: int, last: int) -> None:
         for step in range(first, last + 1):
             (learner.shader(0.1, None)(gaussians(), cameras, shown) - 0.3).square().mean().backward()
             learner.after_step(step)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.colour.thrift import Finding, Look, ThriftyColours, find_thrift, first_worthwhile
+from dyngs.colour.view_dependence import AutoTraining, Finding, Look, find_view_dependent, first_worthwhile
 from dyngs.config import AutoColour
 from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -48,7 +48,7 @@ def looks(angles: list[float], model: Gaussians, truth: Gaussians, mask: Tensor 
 def find(model: Gaussians, truth: Gaussians, tolerance: float = 0.05, mask: Tensor | None = None) -> Finding:
     seen = looks([0.37 * i for i in range(17)], model, truth)
     held_out = looks([0.1 + 0.9 * i for i in range(7)], model, truth, mask)
-    return find_thrift(seen, held_out, RenderOptions(), BLACK, tolerance)
+    return find_view_dependent(seen, held_out, RenderOptions(), BLACK, tolerance)
 
 
 def test_a_matte_scene_keeps_none() -> None:
@@ -83,7 +83,7 @@ def test_the_mean_of_what_is_seen_takes_their_place() -> None:
     lone = model.replace(sh=model.sh.clone())
     lone.sh[:, 2] = 0.5  # along z: one camera sees all from about the same side
     seen = looks([0.0], lone, lone)
-    found = find_thrift(seen, looks([0.01], lone, lone), RenderOptions(), BLACK, 300.0)
+    found = find_view_dependent(seen, looks([0.01], lone, lone), RenderOptions(), BLACK, 300.0)
     assert not found.keeps.any(), "300 dB may be given away"
     plain = model.replace(sh=torch.cat([lone.sh[:, :1] + found.offsets[:, None] / SH_C0, rest], dim=1))
     torch.testing.assert_close(render(plain, camera(0.0)).rgb, render(lone, camera(0.0)).rgb, rtol=0, atol=2e-5)
@@ -112,22 +112,22 @@ def test_the_fewest_that_are_worth_nearly_everything(seed: int, count: int, tole
 
 
 def test_every_eighth_view_is_held_out_until_it_is_measured() -> None:
-    colours = ThriftyColours(AutoColour(measure_at=0.5), 100, 20)
+    colours = AutoTraining(AutoColour(measure_at=0.5), 100, 20)
     assert [i for i in range(20) if colours.holds_out(i, 50)] == [5, 13]
     assert not any(colours.holds_out(i, 51) for i in range(20))
     assert [step for step in range(1, 101) if colours.measures_after(step)] == [50]
-    few = ThriftyColours(AutoColour(), 100, 5)
+    few = AutoTraining(AutoColour(), 100, 5)
     assert not few.held_out
     assert not any(few.measures_after(step) for step in range(101)), "too few views to spare one"
 
 
 def test_the_frozen_follow_the_set_and_go_round() -> None:
-    colours = ThriftyColours(AutoColour(), 100, 20)
+    colours = AutoTraining(AutoColour(), 100, 20)
     assert colours.frozen_rest() is None
     colours.freeze(torch.tensor([True, False, True]))
     colours.follow(TopologyEdit(torch.tensor([1, 2, 2]), torch.tensor([False, False, True])))
     assert colours.frozen_rest() is not None
-    other = ThriftyColours(AutoColour(), 100, 20)
+    other = AutoTraining(AutoColour(), 100, 20)
     other.load_state(colours.state())
     frozen = other.frozen_rest()
     assert frozen is not None

@@ -11,18 +11,18 @@ from tiny_fields import HEADS
 
 from dyngs.config import FieldSection
 from dyngs.deform.decoder import Decoder, head_sizes, split_heads
-from dyngs.deform.learned import LearnedTensors
+from dyngs.parameters import Parameters
 
 SIZES = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1, "colors": 3}
 
 
-def decoder_with(hidden: list[int], *, skip: int | None = None) -> tuple[Decoder, LearnedTensors]:
+def decoder_with(hidden: list[int], *, skip: int | None = None) -> tuple[Decoder, Parameters]:
     """A decoder of 5 features with random weights in all layers."""
     decoder = Decoder(5, hidden, FieldSection(), skip=skip)
     generator = torch.Generator().manual_seed(1)
     values = decoder.start_values(generator)
     values = {name: torch.randn(x.shape, generator=generator) for name, x in values.items()}
-    return decoder, LearnedTensors(values, dict.fromkeys(values, 1.0))
+    return decoder, Parameters(values, dict.fromkeys(values, 1.0))
 
 
 @pytest.mark.parametrize("chosen", list(product([False, True], repeat=len(HEADS))))
@@ -67,7 +67,7 @@ def test_it_starts_at_zero_with_weights_of_glorot(skip: int | None) -> None:
         bound = math.sqrt(6 / sum(weight.shape))
         assert 0.9 * bound < weight.abs().max() <= bound
         assert float(weight.var()) == pytest.approx(bound**2 / 3, rel=0.15)  # of some thousand numbers
-    learned = LearnedTensors(values, dict.fromkeys(values, 1.0))
+    learned = Parameters(values, dict.fromkeys(values, 1.0))
     assert not decoder(torch.randn(4, 20), learned).any()
 
 

@@ -11,8 +11,8 @@ from tiny_fields import cloud, stirred_field
 from torch import Tensor
 
 from dyngs.deform.field import Offsets, deformed
-from dyngs.deform.learned import LearnedTensors
 from dyngs.deform.motion import MAX_SAMPLES, PX_PER_OPACITY, bake_, measure_motion
+from dyngs.parameters import Parameters
 
 TIMES = tuple(i / 10 for i in range(11))
 
@@ -22,7 +22,7 @@ class Scripted:
 
     def __init__(self, script: Callable[[Tensor, float], Offsets]) -> None:
         self.script, self.asked = script, list[float]()
-        self.learned, self.buffers = LearnedTensors({}, {}), dict[str, Tensor]()
+        self.learned, self.buffers = Parameters({}, {}), dict[str, Tensor]()
 
     def offsets(self, means: Tensor, time: float) -> Offsets:
         self.asked.append(time)

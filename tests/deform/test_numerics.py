@@ -19,20 +19,19 @@ from dyngs.config import ControlNodesField, DynamicModel, HexplaneField, StaticM
 from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
 from dyngs.deform.hexplane import Hexplane, time_rows
-from dyngs.deform.model import DynamicScene
 from dyngs.deform.motion import MAX_SAMPLES, measure_motion
+from dyngs.deform.scene import TrainedScene
 from dyngs.deform.seeds import box_of
 from dyngs.deform.skeleton import Skeleton
-from dyngs.deform.trained import TrainedScene
+from dyngs.deform.training import DynamicScene
 from dyngs.deform.window import FRONTIER_VIEWS, TimeWindow
 from dyngs.errors import DyngsError
-from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.planes import PlaneLevel, hexplane_features
 from dyngs.rendering import render
 from dyngs.runs.checkpoint import stored_scene
-from dyngs.static.densify import EditResult
-from dyngs.static.model import StaticScene
-from dyngs.training.step import Trainer
+from dyngs.static.training import StaticScene
+from dyngs.training.trainer import Trainer
 
 LONG = 10_000
 
@@ -177,15 +176,15 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     assert model.field is not None
     model.field.select(model.rows, torch.zeros(2, dtype=torch.bool))
     trainer.step()
-    keep = torch.ones(len(trainer.optimizer.parameters), dtype=torch.bool)
+    keep = torch.ones(len(trainer.scene.gaussians), dtype=torch.bool)
     keep[model.rows] = False
     result = EditResult(TopologyEdit.select(keep))
     trainer.optimizer.apply(result)
     trainer.densifier = assemble(trainer.config).densifier
-    model.after_step(trainer.optimizer.parameters, 11, result)
+    model.after_step(trainer.scene.gaussians, 11, result)
     for _ in range(2):
         assert trainer.step().loss > 0
-        assert model.num_moving(len(trainer.optimizer.parameters)) == 0
+        assert model.num_moving(len(trainer.scene.gaussians)) == 0
     other = assemble(trainer.config)
     other.restore(trainer.checkpoint())
     assert other.step().loss == trainer.step().loss
@@ -308,12 +307,12 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
     assert model.field is not None
     for x in model.field.learned.values().values():
         x.fill_(bad)
-    before = trainer.optimizer.parameters.means.detach().clone()
+    before = trainer.scene.gaussians.means.detach().clone()
     with pytest.raises(
         DyngsError, match=r"^step 11, view '.*': the field makes means.* at [0-9.]+ not finite; .*deform$"
     ):
         trainer.step()
-    assert torch.equal(trainer.optimizer.parameters.means, before)
+    assert torch.equal(trainer.scene.gaussians.means, before)
 
 
 # --- where motion begins ----------------------------------------------------------------------------------------------
@@ -324,7 +323,7 @@ def test_a_picture_that_a_still_model_explains(capture: Path) -> None:
     trainer = fine_trainer(capture, "control_nodes", motion_threshold=10.0)
     assert isinstance(trainer.model, DynamicScene)
     assert trainer.model.field is None
-    assert len(trainer.optimizer.parameters) == len(reference_set(capture))
+    assert len(trainer.scene.gaussians) == len(reference_set(capture))
     assert trainer.step().loss > 0
 
 
@@ -335,7 +334,7 @@ def test_no_seeds(capture: Path) -> None:
         trainer = assemble(busy_config(capture, capture, "trajectory", num_random_moving=seeds))
         for _ in range(8):
             trainer.step()
-        sizes.append(len(trainer.optimizer.parameters))
+        sizes.append(len(trainer.scene.gaussians))
         moving.append(trainer.model.num_moving(sizes[-1]))
         assert trainer.step().loss > 0
     assert sizes[0] == sizes[1] + 12
@@ -348,7 +347,7 @@ def reference_set(capture: Path) -> Gaussians:
     trainer = assemble(config.model_copy(update={"model": StaticModel(sh_degree=1)}))
     for _ in range(10):
         trainer.step()
-    return trainer.optimizer.parameters
+    return trainer.scene.gaussians
 
 
 @pytest.mark.parametrize("filtered", [False, True])

@@ -18,9 +18,8 @@ from dyngs.conventions import RasterizeMode
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Picture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.deform.trained import TrainedScene
+from dyngs.deform.scene import TrainedScene
 from dyngs.errors import DyngsError
-from dyngs.metrics import Lpips, psnr
 from dyngs.evaluate.report import (
     evaluate_run,
     parameter_megabytes,
@@ -30,6 +29,7 @@ from dyngs.evaluate.report import (
     split_views,
 )
 from dyngs.gaussians import Gaussians
+from dyngs.metrics import Lpips, psnr
 from dyngs.rendering import RenderOptions, render
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 

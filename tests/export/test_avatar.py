@@ -13,18 +13,18 @@ from moving_scene import write_moving_run
 from synthetic_bodies import model, write_npz
 from torch import Tensor
 
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig, DefaultStrategy, HumanModel, RunConfig, TrainConfig
 from dyngs.errors import DyngsError
 from dyngs.export import avatar
 from dyngs.export.avatar import read_avatar, write_avatar
 from dyngs.files.tensor_file import read_tensors, write_tensors
-from dyngs.human.avatar.trained import AvatarScene
+from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.api.train import train
 from dyngs.view.animation import at_rest, with_motion
 
 
@@ -70,8 +70,8 @@ def test_the_file_plays_as_the_run(run_dir: Path, file: Path, motion: Path) -> N
             wanted, found = one.scene.at(time).tensors(), other.scene.at(time).tensors()
             for name, x in found.items():
                 torch.testing.assert_close(x, wanted[name], rtol=0, atol=2e-4 if name == "quats" else 1e-5)
-    assert isinstance(read.scene, AvatarScene)
-    assert isinstance(run.scene, AvatarScene)
+    assert isinstance(read.scene, HumanScene)
+    assert isinstance(run.scene, HumanScene)
     assert read.scene.pose_dirs is not None
     assert asdict(read.info) == asdict(run.info)
     assert torch.equal(read.scene.anchors.uv, run.scene.anchors.uv)
@@ -88,7 +88,7 @@ def test_blend_shapes_go_along_and_the_template_is_looked_for_beside_the_file(
         with_motion(read_avatar(file), motion)
     (tmp_path / "elsewhere" / "bodies.npz").write_bytes(body.read_bytes())
     one, other = (with_motion(x, motion).run.scene for x in (run, read_avatar(file)))
-    assert isinstance(other, AvatarScene)
+    assert isinstance(other, HumanScene)
     assert other.shapes is not None
     torch.testing.assert_close(other.at(0.4).means, one.at(0.4).means, rtol=0, atol=1e-5)
     write_npz(tmp_path / "elsewhere" / "bodies.npz", model("smplx", seed=1))

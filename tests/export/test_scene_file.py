@@ -10,11 +10,11 @@ import pytest
 import torch
 from moving_scene import write_moving_run
 
-from dyngs.visibility import VisibilityMasks
 from dyngs.errors import DyngsError
+from dyngs.export.scene_file import write_scene_file
 from dyngs.runs.checkpoint import latest_checkpoint, load_run, save_checkpoint
 from dyngs.storage.precision import Precision
-from dyngs.export.scene_file import write_scene_file
+from dyngs.visibility import VisibilityMasks
 
 
 @pytest.mark.parametrize("moves", [True, False])

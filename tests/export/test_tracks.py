@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from moving_scene import MOVING_ROWS, TRAIN_TIMES, Sliding, moving_scene, row_of_balls, still_scene
 
-from dyngs.deform.trained import TrainedScene
+from dyngs.deform.scene import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.export import tracks as export_tracks
 from dyngs.export.tracks import Tracks, tracks_of, write_tracks

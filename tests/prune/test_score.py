@@ -9,7 +9,7 @@ import torch
 from moving_scene import Blinking, Sliding, camera, moving_scene, row_of_balls, still_scene
 
 from dyngs.deform.field import Offsets
-from dyngs.deform.trained import TrainedScene
+from dyngs.deform.scene import TrainedScene
 from dyngs.prune.score import Survey, Worth, worth
 from dyngs.rendering import RenderOptions, contributions, sensitivities
 

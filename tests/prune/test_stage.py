@@ -10,13 +10,14 @@ from moving_scene import camera
 from tiny_fields import KINDS, busy_config
 from torch import Tensor
 
+from dyngs.api.train import train
 from dyngs.build import assemble
 from dyngs.camera import Cameras
 from dyngs.config import (
-    PruneConfig,
     Config,
     DataConfig,
     McmcStrategy,
+    PruneConfig,
     RandomInit,
     RunConfig,
     StaticModel,
@@ -24,13 +25,12 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_resolved
 from dyngs.data.frame_selection import spread
-from dyngs.deform.model import DynamicScene
-from dyngs.deform.trained import TrainedScene
+from dyngs.deform.scene import TrainedScene
+from dyngs.deform.training import DynamicScene
 from dyngs.prune.stage import Compaction, compact_, distinct_cameras
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
 from dyngs.static.fixed import FixedDensifier
-from dyngs.training.step import Trainer
-from dyngs.api.train import train
+from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STAGE = PruneConfig(share=0.5, max_loss=100.0, steps=6, mask_times=3, mask_below=1.0)
@@ -100,13 +100,13 @@ def test_mcmc_stands_still_in_the_stage(still: Path, tmp_path: Path) -> None:
     """No noise, no relocation: the number stays, and the state of the strategy is gone."""
     strategy = McmcStrategy(start=1, stop=30_000, every=3, max_gaussians=90)
     trainer = trained(still_config(still, tmp_path, strategy=strategy))
-    before = len(trainer.optimizer.parameters)
+    before = len(trainer.scene.gaussians)
     found = compact_(trainer)
     assert found.before == before
     assert isinstance(trainer.densifier, FixedDensifier)
     for _ in range(4):
         trainer.step()
-    assert len(trainer.optimizer.parameters) == found.after == before - before // 2
+    assert len(trainer.scene.gaussians) == found.after == before - before // 2
 
 
 def test_without_a_stage_nothing_changes(still: Path, tmp_path: Path) -> None:
@@ -119,9 +119,9 @@ def test_without_a_stage_nothing_changes(still: Path, tmp_path: Path) -> None:
 def test_every_score_keeps_as_many(score: str, moving: Path, tmp_path: Path) -> None:
     stage = STAGE.model_copy(update={"score": score})
     trainer = trained(moving_config(moving, tmp_path, "trajectory", stage))
-    before = trainer.optimizer.parameters.detach()
+    before = trainer.scene.gaussians.detach()
     found = compact_(trainer)
-    after = trainer.optimizer.parameters
+    after = trainer.scene.gaussians
     assert (found.before, found.after) == (len(before), len(after))
     assert found.after == len(before) - len(before) // 2
     assert _all_rows_of(after.means, before.means)
@@ -149,11 +149,11 @@ def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
     assert isinstance(model, DynamicScene)
     assert model.masks is not None
     picture = trainer.pictures[3]
-    drawn = model.gaussians_at(trainer.optimizer.parameters, picture, trainer.done + 1)
+    drawn = model.gaussians_at(trainer.scene.gaussians, picture, trainer.done + 1)
     active = model.masks.active(model.masks.interval(picture.time or 0.0))
     assert len(drawn.gaussians) == len(active)
     drawn.gaussians.means.sum().backward()
-    grad = trainer.optimizer.parameters.means.grad
+    grad = trainer.scene.gaussians.means.grad
     assert grad is not None
     assert torch.equal(torch.nonzero(grad.any(1))[:, 0], active)
 

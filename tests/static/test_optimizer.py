@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from dyngs.config import OptimConfig
-from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.static.densify import EditResult
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.static.optimizer import GaussianOptimizer
 
 

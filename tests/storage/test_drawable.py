@@ -9,12 +9,12 @@ from tiny_fields import KINDS, cloud, stirred_field, tiny_options, tiny_setup
 
 from dyngs.config import DynamicModel, StaticModel
 from dyngs.deform.fields import field_state
-from dyngs.visibility import VisibilityMasks
-from dyngs.deform.trained import trained_scene
+from dyngs.deform.scene import trained_scene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import render
 from dyngs.storage.drawable import completed, drawable, in_storage_order
+from dyngs.visibility import VisibilityMasks
 
 ROWS = (0, 2, 3, 6)
 

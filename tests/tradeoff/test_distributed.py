@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from moving_scene import write_moving_run
 
+from dyngs.api.train import num_cores
 from dyngs.errors import DyngsError
 from dyngs.tradeoff.distributed import SINGLE_PROCESS, ProcessGroup
 from dyngs.tradeoff.variants import Variant
-from dyngs.api.train import num_cores
 
 VARIANTS = st.builds(
     Variant,

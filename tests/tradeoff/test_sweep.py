@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 from tiny_fields import busy_config, write_tiny_capture
 
+from dyngs.api.train import train
 from dyngs.config import DynamicModel
 from dyngs.config.io import load_resolved, save_config
-from dyngs.deform.trained import TrainedScene
+from dyngs.deform.scene import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run, render_options
 from dyngs.runs.checkpoint import is_compact, load_run
@@ -22,7 +23,6 @@ from dyngs.tradeoff.report import write_report
 from dyngs.tradeoff.sweep import Plan, figures_of, sweep
 from dyngs.tradeoff.variant_runs import VariantRuns, field_changes, run_settings, write_chosen
 from dyngs.tradeoff.variants import Variant, parse_variations
-from dyngs.api.train import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SETTINGS = ("prune=0.5", "mask_times=3", "sh_degree=0", "storage=2", "field_step=64", "alpha_min=0.02", "scale=0.5")

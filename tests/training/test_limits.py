@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_fields import busy_config, tiny_options, write_tiny_capture
 
-from dyngs.training.limits import most_gaussians, require_possible, room, within_cap
+from dyngs.api.train import train
 from dyngs.build import assemble
 from dyngs.config import (
     BudgetConfig,
@@ -28,8 +28,8 @@ from dyngs.config import (
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.training.step import Trainer
-from dyngs.api.train import train
+from dyngs.training.limits import most_gaussians, require_possible, room, within_cap
+from dyngs.training.trainer import Trainer
 
 NOTHING = Config(data=DataConfig(root=Path("nowhere")))
 BUSY = DefaultStrategy(start=1, stop=30_000, every=2, grad_threshold=1e-9)
@@ -63,7 +63,7 @@ def largest_count(trainer: Trainer) -> int:
     counts = []
     while trainer.done < trainer.config.train.steps:
         trainer.step()
-        counts.append(len(trainer.optimizer.parameters))
+        counts.append(len(trainer.scene.gaussians))
     return max(counts)
 
 

@@ -8,11 +8,11 @@ import pytest
 import torch
 from tiny_people import NET, people
 
+from dyngs.api.train import train
 from dyngs.config import Config, DataConfig
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint
 from dyngs.training.prediction import NetworkTrainer, assemble_network, captures_in, mean_colours, rate_at
-from dyngs.api.train import train
 
 
 @pytest.fixture(scope="module")

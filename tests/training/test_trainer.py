@@ -1,373 +1,362 @@
-"""Whole runs on a tiny capture: they learn, they repeat to the byte, they stop and go on as if nothing had happened."""
+"""One step: any model that keeps the protocol is trained, on the right background, and bad gradients do no harm."""
 
 from __future__ import annotations
 
-import json
 import re
-import signal
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 import torch
-from moving_scene import write_timed_capture
-from tiny_fields import KINDS, busy_config, write_tiny_capture
+from moving_scene import TRAIN_TIMES, write_timed_capture
 from torch import Tensor
 
 from dyngs.build import assemble
 from dyngs.config import (
+    AutoColour,
     Config,
     DataConfig,
     DefaultStrategy,
-    McmcStrategy,
+    NetworkColour,
     RandomInit,
     RunConfig,
     StaticModel,
     TrainConfig,
 )
-from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.data.loader import Picture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.deform.model import DynamicScene
 from dyngs.errors import DyngsError
-from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run, save_checkpoint
-from dyngs.training.step import StepReport, Trainer
-from dyngs.api.train import train
-
-# Everything happens within a few steps: changes each third step, a reset at step 5, new SH degrees.
-BUSY = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150)
-BUSY_MCMC = McmcStrategy(start=1, stop=30_000, every=3, max_gaussians=90, min_opacity=0.45)
+from dyngs.files.tensor_file import write_tensors
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.rendering import RenderOptions, render
+from dyngs.runs.checkpoint import _KIND, load_checkpoint, stored_scene
+from dyngs.scene import moment_of, num_colour_values
+from dyngs.static.training import Drawn
+from dyngs.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=16, num_train=4, num_test=1, samples=1))
+    write_still_capture(folder, StillOptions(size=16, num_train=2, num_test=1, samples=1))
     return folder
 
 
-def _config(
-    capture: Path, run_dir: Path, *, steps: int = 14, strategy: DefaultStrategy | McmcStrategy = BUSY, **changes: object
-) -> Config:
-    config = Config(
-        data=DataConfig(root=capture),
-        model=StaticModel(sh_degree=2),
-        init=RandomInit(num_random=60),
-        strategy=strategy,
-        train=TrainConfig(steps=steps, log_every=1),
-        run=RunConfig(dir=run_dir, threads=1),
-    )
-    return config.model_copy(update=changes)
-
-
-def _final_bytes(run_dir: Path) -> bytes:
-    return checkpoint_paths(run_dir)[-1].read_bytes()
-
-
-def _log(run_dir: Path) -> list[dict[str, float]]:
-    return [json.loads(line) for line in (run_dir / "log.jsonl").read_text().splitlines()]
-
-
-def _stopped_and_resumed(config: Config, stop_at: int, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of a run that was interrupted after step ``stop_at`` and then finished."""
-    assert config.run.dir is not None
-    with monkeypatch.context() as patch:
-        _interrupt_after(stop_at, patch)
-        with pytest.raises(KeyboardInterrupt, match="--resume"):
-            train(config)
-    assert load_run(config.run.dir).step == stop_at
-    return train(load_resolved(config.run.dir), resume_from=config.run.dir)
-
-
-def _interrupt_after(step: int, monkeypatch: pytest.MonkeyPatch, which: signal.Signals = signal.SIGINT) -> None:
-    """Send ``which`` to this process during ``step``, once."""
-    real = Trainer.step
-
-    def stepping(trainer: Trainer) -> StepReport:
-        if trainer.done + 1 == step:
-            signal.raise_signal(which)
-        return real(trainer)
-
-    monkeypatch.setattr(Trainer, "step", stepping)
-
-
-def test_a_run_learns_and_leaves_its_folder(capture: Path, tmp_path: Path) -> None:
-    config = _config(capture, tmp_path / "run", steps=60, strategy=DefaultStrategy())
-    folder = train(config)
-    assert folder == tmp_path / "run"
-    assert load_resolved(folder) == config
-    run = load_run(folder)
-    assert run.step == 60
-    assert run.seconds_train > 0
-    log = _log(folder)
-    assert [record["step"] for record in log] == list(range(1, 61))
-    losses = torch.tensor([record["loss"] for record in log])
-    assert losses[-8:].mean() < 0.6 * losses[:8].mean()
-
-
-def test_the_default_folder_has_the_name_of_the_run(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    config = _config(capture, tmp_path, steps=1, run=RunConfig(name="pond", threads=1))
-    assert train(config) == Path("runs/pond")
-    assert checkpoint_paths(tmp_path / "runs" / "pond")
-
-
-@pytest.mark.parametrize("strategy", [BUSY, BUSY_MCMC], ids=["default", "mcmc"])
-def test_the_seed_decides_every_byte_and_threads_none(
-    capture: Path, tmp_path: Path, strategy: DefaultStrategy | McmcStrategy
-) -> None:
-    results = {}
-    for name, seed, threads in (("a", 1, 1), ("again", 1, 1), ("two threads", 1, 2), ("other seed", 2, 1)):
-        run = RunConfig(dir=tmp_path / name, seed=seed, threads=threads)
-        results[name] = _final_bytes(train(_config(capture, tmp_path, strategy=strategy, run=run)))
-    assert results["a"] == results["again"] == results["two threads"]
-    assert results["a"] != results["other seed"]
-    counts = {record["num_gaussians"] for record in _log(tmp_path / "a")}
-    assert len(counts) > 2, "the set of Gaussians must change, or this test shows little"
-
-
-def test_threads_decide_nothing_above_the_grain_of_torch(capture: Path, tmp_path: Path) -> None:
-    """torch shares work among threads from 32,768 elements on; some of its functions then round otherwise."""
-    results = []
-    for threads in (1, 2):
-        config = _config(
-            capture,
-            tmp_path,
-            steps=7,
-            strategy=BUSY.model_copy(update={"max_gaussians": 150_000}),
-            model=StaticModel(sh_degree=1, filter_3d=True),
-            init=RandomInit(num_random=100_003),
-            run=RunConfig(dir=tmp_path / str(threads), threads=threads),
+def _trainer(capture: Path, **data: object) -> Trainer:
+    return assemble(
+        Config(
+            data=DataConfig(root=capture, **data),  # type: ignore[arg-type]
+            model=StaticModel(sh_degree=1),
+            init=RandomInit(num_random=50),
+            train=TrainConfig(steps=100),
+            run=RunConfig(threads=1),
         )
-        results.append(_final_bytes(train(config)))
-    assert results[0] == results[1]
+    )
 
 
-@pytest.mark.parametrize("stop_at", [2, 8])
-@pytest.mark.parametrize("kind", ["default", "mcmc", "filtered", "absgrad"])
-def test_resumed_equals_uninterrupted(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, stop_at: int
-) -> None:
-    strategy = {"mcmc": BUSY_MCMC, "absgrad": BUSY.model_copy(update={"absgrad": True})}.get(kind, BUSY)
-    changes = {
-        "model": StaticModel(sh_degree=2, filter_3d=kind == "filtered"),
-        "data": DataConfig(root=capture, background="random"),
-    }
-    whole = train(_config(capture, tmp_path / "whole", strategy=strategy, **changes))
-    config = _config(capture, tmp_path / "parts", strategy=strategy, **changes)
-    resumed = _stopped_and_resumed(config, stop_at, monkeypatch)
-    assert _final_bytes(resumed) == _final_bytes(whole)
-    same = ("step", "loss", "psnr", "num_gaussians")
-    assert [[r[k] for k in same] for r in _log(resumed)] == [[r[k] for k in same] for r in _log(whole)]
+class _Lifted:
+    """A model of another kind: all Gaussians are drawn a little higher than they are stored."""
+
+    def __init__(self) -> None:
+        self.steps: list[int] = []
+        self.penalty = 0.0
+
+    def trains_on(self, time: float | None, step: int) -> bool:
+        return True
+
+    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
+        lifted = parameters.replace(means=parameters.means + torch.tensor([0.0, 0.0, 0.1]))
+        penalties = {"height": self.penalty * parameters.means[:, 2].abs().sum()} if self.penalty else {}
+        return Drawn(lifted, penalties)
+
+    def after_step(self, parameters: Gaussians, step: int, result: EditResult | None) -> int:
+        self.steps.append(step)
+        return 3
+
+    def edit(self, parameters: Gaussians, step: int) -> EditResult | None:
+        return None
+
+    def num_moving(self, num_gaussians: int) -> int:
+        return num_gaussians
+
+    def state(self) -> dict[str, Tensor]:
+        return {"steps": torch.tensor(self.steps)}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self.steps = state["steps"].tolist()
 
 
-def test_sigterm_saves_too(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _interrupt_after(3, monkeypatch, signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt, match="stopped after step 3"):
-        train(_config(capture, tmp_path / "run"))
-    assert load_run(tmp_path / "run").step == 3
+def test_a_model_of_another_kind_is_trained(capture: Path) -> None:
+    trainer = _trainer(capture)
+    trainer.model = _Lifted()
+    before = trainer.scene.gaussians.means.detach().clone()
+    losses = [trainer.step().loss for _ in range(30)]
+    assert trainer.model.steps == list(range(1, 31))
+    assert sum(losses[-4:]) < sum(losses[:4])
+    assert not torch.equal(trainer.scene.gaussians.means, before)
+    other = _trainer(capture)
+    other.model = _Lifted()
+    other.restore(trainer.checkpoint())
+    assert other.step().loss == trainer.step().loss
+    assert trainer.bad_gradients == 3 * 31
 
 
-def test_time_adds_up_over_resumes(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run_dir = tmp_path / "run"
-    with monkeypatch.context() as patch:
-        _interrupt_after(3, patch)
-        with pytest.raises(KeyboardInterrupt):
-            train(_config(capture, run_dir))
-    before = load_run(run_dir).seconds_train
-    (run_dir / "timing.json").write_text(json.dumps({"seconds_train": {"3": before + 1000}}))
-    train(load_resolved(run_dir), resume_from=run_dir)
-    assert 1000 + before < load_run(run_dir).seconds_train < 1060 + before
+def test_penalties_of_the_model_are_part_of_the_loss(capture: Path) -> None:
+    plain, penalized = (_trainer(capture) for _ in range(2))
+    plain.model, penalized.model = _Lifted(), _Lifted()
+    penalized.model.penalty = 0.01
+    heights = plain.optimizer.parameters.means.detach()[:, 2].abs()
+    assert penalized.step().loss == pytest.approx(plain.step().loss + 0.01 * float(heights.sum()), rel=1e-5)
+    for _ in range(20):
+        penalized.step()
+    assert penalized.optimizer.parameters.means.detach()[:, 2].abs().mean() < heights.mean()
 
 
-def test_a_run_is_never_overwritten(capture: Path, tmp_path: Path) -> None:
-    config = _config(capture, tmp_path / "run", steps=2)
-    train(config)
-    before = _final_bytes(tmp_path / "run")
-    with pytest.raises(DyngsError, match=r"already holds a run.*--resume"):
-        train(config)
-    assert train(config, resume_from=tmp_path / "run") == tmp_path / "run"  # finished: nothing to do
-    assert _final_bytes(tmp_path / "run") == before
+class _Growing(_Lifted):
+    """It wants each Gaussian once more after step 2."""
+
+    def edit(self, parameters: Gaussians, step: int) -> EditResult | None:
+        assert self.steps[-1] == step, "it has followed the step already"
+        if step != 2:
+            return None
+        num = len(parameters)
+        return EditResult(TopologyEdit(torch.arange(2 * num) % num, torch.arange(2 * num) >= num))
 
 
-def test_bad_input_leaves_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError):
-        train(_config(tmp_path / "nothing here", tmp_path / "run"))
-    with pytest.raises(DyngsError, match="no checkpoints"):
-        train(_config(tmp_path, tmp_path / "run"), resume_from=tmp_path / "run")
-    assert not (tmp_path / "run").exists()
+def test_a_model_may_change_the_set(capture: Path) -> None:
+    """At once, and the run goes on with it; new rows have no moments."""
+    trainer = _trainer(capture)
+    trainer.model = _Growing()
+    counts = []
+    for _ in range(4):
+        trainer.step()
+        counts.append(len(trainer.scene.gaussians))
+        if trainer.done == 2:
+            moments = trainer.optimizer.state()["exp_avg_sq.means"]
+            assert moments[:50].any()
+            assert not moments[50:].any()
+            other = _trainer(capture)
+            other.model = _Growing()
+            other.restore(trainer.checkpoint())
+    assert counts == [50, 100, 100, 100]
+    for _ in range(2):
+        other.step()
+    assert torch.equal(other.optimizer.parameters.means, trainer.scene.gaussians.means)
 
 
-def test_a_loss_that_is_not_finite_stops_the_run(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from dyngs.train import step
+# --- kinds of colour --------------------------------------------------------------------------------------------------
 
-    real, calls = step.l1_ssim_loss, []
-
-    def failing(rendered: Tensor, target: Tensor, weight: float, mask: Tensor | None) -> Tensor:
-        calls.append(0)
-        return real(rendered, target, weight, mask) * (float("nan") if len(calls) == 6 else 1.0)
-
-    monkeypatch.setattr(step, "l1_ssim_loss", failing)
-    config = _config(capture, tmp_path / "run", train=TrainConfig(steps=14, save_every=4))
-    with pytest.raises(DyngsError, match=r"step 6, view .*'picture' is nan.*step_0000004"):
-        train(config)
-    assert load_run(tmp_path / "run").step == 4
-
-
-def test_checkpoints_and_scores_come_when_asked(capture: Path, tmp_path: Path) -> None:
-    options = TrainConfig(steps=9, save_every=3, eval_every=6, log_every=100)
-    folder = train(_config(capture, tmp_path / "run", train=options))
-    assert [path.stem for path in checkpoint_paths(folder)] == ["step_0000006", "step_0000009"]
-    assert [(record["step"], "split" in record) for record in _log(folder)] == [(6, True), (9, False)]
-    assert json.loads((folder / "metrics.json").read_text())["num_views"] == 1
-
-
-# --- scenes that move -------------------------------------------------------------------------------------------------
+MEASURED_AFTER = 24
+COLOURS = {
+    "network": NetworkColour(width=8, depth=1, warm_up=5, opacity_entropy=1e-3),
+    "none pays": AutoColour(measure_at=0.6, tolerance=300.0),
+    "some pay": AutoColour(measure_at=0.6, tolerance=0.0),
+}
 
 
 @pytest.fixture(scope="module")
-def moving_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tiny_capture(tmp_path_factory.mktemp("moving") / "capture")
+def seven_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture")
+    write_still_capture(folder, StillOptions(size=16, num_train=7, num_test=1, samples=1))
+    return folder
 
 
-@pytest.fixture(scope="module", params=KINDS)
-def whole_run(request: pytest.FixtureRequest, moving_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An uninterrupted run of each kind of field."""
-    return train(busy_config(moving_capture, tmp_path_factory.mktemp(request.param) / "run", request.param))
-
-
-def _kind_of(run_dir: Path) -> str:
-    return run_dir.parent.name.rstrip("0123456789")
-
-
-def test_a_moving_run_goes_through_its_phases(whole_run: Path) -> None:
-    log = _log(whole_run)
-    moving = [record["num_moving"] / record["num_gaussians"] for record in log]
-    assert moving[:7] == [0.0] * 7
-    assert all(0 < share < 1 for share in moving[7:]), "a part of them must move, or the tests below show little"
-    assert log[7]["num_moving"] > 12, "not only the seeds"
-    assert log[-1]["num_moving"] != log[13]["num_moving"], "some must have been frozen since"
-    assert len({record["num_gaussians"] for record in log}) > 3
-    losses = torch.tensor([record["loss"] for record in log])
-    assert losses[-4:].mean() < losses[:4].mean()
-    assert log[-1]["bad_gradients"] == 0
-    scene = load_run(whole_run).scene
-    assert scene.moving_share == moving[-1]
-    assert len(scene.times) == 16
-
-
-def test_a_moving_run_repeats_its_bytes(whole_run: Path, moving_capture: Path, tmp_path: Path) -> None:
-    again = train(busy_config(moving_capture, tmp_path / "run", _kind_of(whole_run)))
-    assert _final_bytes(again) == _final_bytes(whole_run)
-
-
-@pytest.mark.parametrize("stop_at", [2, 8, 11, 18], ids=["coarse", "begin", "fine", "split"])
-def test_a_resumed_moving_run_equals_an_uninterrupted_one(
-    whole_run: Path, moving_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int
-) -> None:
-    config = busy_config(moving_capture, tmp_path / "parts", _kind_of(whole_run))
-    resumed = _stopped_and_resumed(config, stop_at, monkeypatch)
-    assert _final_bytes(resumed) == _final_bytes(whole_run)
-    same = ("step", "loss", "psnr", "num_gaussians", "num_moving")
-    assert [[r[k] for k in same] for r in _log(resumed)] == [[r[k] for k in same] for r in _log(whole_run)]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("steps", [2, 8, 11, 20], ids=["coarse", "begin", "fine", "split"])
-def test_what_is_loaded_is_what_the_trainer_draws(moving_capture: Path, tmp_path: Path, kind: str, steps: int) -> None:
-    """At any time, with the 3D filter."""
-    config = busy_config(moving_capture, tmp_path, kind, filter_3d=True, time_jitter=0.0, freeze_below_px=0.1)
-    trainer = assemble(config)
-    for _ in range(steps):
-        trainer.step()
-    save_config(config, tmp_path / RESOLVED_NAME)
-    save_checkpoint(tmp_path, trainer.checkpoint(), 1.0)
-    scene = load_run(tmp_path).scene
-    assert scene.is_still == (steps == 2)
-    parameters = trainer.optimizer.parameters
-    for time in (0.0, 0.37, 1.0):
-        picture = replace(trainer.pictures[0], time=time)
-        drawn = trainer.model.gaussians_at(parameters, picture, steps + 1).gaussians
-        for name, x in scene.at(time).tensors().items():
-            torch.testing.assert_close(x, drawn.tensors()[name].detach(), rtol=1e-6, atol=1e-7)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_where_nothing_moves_no_field_is_kept(tmp_path: Path, kind: str) -> None:
-    """A capture with times of a scene that stands still: after the split it is static, in the run and on disk."""
-    capture = write_timed_capture(tmp_path / "capture")
-    run = train(busy_config(capture, tmp_path / "run", kind, freeze_below_px=1e6))
-    assert [record["num_moving"] > 0 for record in _log(run)] == [8 <= step <= 14 for step in range(1, 25)]
-    assert load_run(run).scene.is_still
-    tensors = load_checkpoint(checkpoint_paths(run)[-1]).part("model")
-    assert tensors.keys() == {"times"}
-
-
-@pytest.mark.parametrize("stop_at", [8, 12])
-def test_where_a_still_model_explains_all_the_run_stays_static(
-    moving_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int
-) -> None:
-    """No seeds, no field, resumed or not, as if no error were large enough."""
-    changes = {"motion_threshold": 10.0, "time_window": 1.0}
-    whole = train(busy_config(moving_capture, tmp_path / "whole", "control_nodes", **changes))
-    assert {record["num_moving"] for record in _log(whole)} == {0}
-    assert load_checkpoint(checkpoint_paths(whole)[-1]).part("model").keys() == {"times"}
-    config = busy_config(moving_capture, tmp_path / "parts", "control_nodes", **changes)
-    with monkeypatch.context() as patch:
-        _interrupt_after(stop_at, patch)
-        with pytest.raises(KeyboardInterrupt):
-            train(config)
-    resumed = train(config, resume_from=tmp_path / "parts")
-    assert _final_bytes(resumed) == _final_bytes(whole)
-    still = config.model_copy(
-        update={"model": StaticModel(sh_degree=1), "run": RunConfig(dir=tmp_path / "s", threads=1)}
-    )
-    assert [record["loss"] for record in _log(train(still))] == [record["loss"] for record in _log(whole)]
-
-
-def test_a_field_that_is_no_number_stops_the_run(
-    whole_run: Path, moving_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With or without penalties that would notice. One line; the last good checkpoint is kept."""
-    _spoil_in_step(11, monkeypatch, float("nan"))
-    for sparsity in (0.01, 0.0):
-        run_dir = tmp_path / str(sparsity)
-        config = busy_config(moving_capture, run_dir, _kind_of(whole_run), motion_sparsity=sparsity)
-        with pytest.raises(DyngsError) as caught:
-            train(config.model_copy(update={"train": TrainConfig(steps=24, save_every=4)}))
-        message = str(caught.value)
-        assert "\n" not in message
-        pattern = (
-            r"step 11, view 'train/r_0\d\d': the field makes means, .* at [0-9.]+ not finite; lower .*model\.deform"
+def _coloured(capture: Path, colour: NetworkColour | AutoColour, strategy: DefaultStrategy | None = None) -> Trainer:
+    return assemble(
+        Config(
+            data=DataConfig(root=capture),
+            model=StaticModel(sh_degree=1),
+            init=RandomInit(num_random=50),
+            colour=colour,
+            strategy=strategy or DefaultStrategy(),
+            train=TrainConfig(steps=40, sh_every=1),
+            run=RunConfig(threads=1),
         )
-        assert re.match(pattern, message)
-        assert message.endswith("step_0000008.safetensors")
-        assert load_run(run_dir).step == 8
-        assert load_run(run_dir).scene.at(0.5).means.isfinite().all()
+    )
 
 
-def test_a_field_that_is_huge_stops_the_run(
-    whole_run: Path, moving_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", COLOURS)
+def test_every_kind_of_colour_learns_and_goes_on_exactly(seven_views: Path, name: str) -> None:
+    """From a checkpoint before the harmonics are measured, and from one after."""
+    whole = _coloured(seven_views, COLOURS[name])
+    losses = []
+    for step in range(1, 41):
+        if step in (20, 31):
+            resumed = _coloured(seven_views, COLOURS[name])
+            resumed.restore(whole.checkpoint())
+        losses.append(whole.step().loss)
+        if step > 20:
+            resumed.step()
+    assert sum(losses[-7:]) < sum(losses[:7])
+    wanted, found = whole.checkpoint().tensors, resumed.checkpoint().tensors
+    assert wanted.keys() == found.keys()
+    assert all(torch.equal(x, found[key]) for key, x in wanted.items())
+
+
+@pytest.mark.parametrize("name", ["none pays", "some pay"])
+def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> None:
+    """For good: they stay zero while the set changes; the view that tells is not trained on before."""
+    busy = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=1_000_000)
+    trainer = _coloured(seven_views, COLOURS[name], busy)
+    seen, findings, counts = set(), {}, set()
+    for step in range(1, 41):
+        report = trainer.step()
+        counts.add(len(trainer.scene.gaussians))
+        if report.finding is not None:
+            findings[step] = report.finding
+            dropped = trainer.colours.frozen_rest()
+        if step <= MEASURED_AFTER:
+            seen.add(report.picture.name)
+    assert len(seen) == 6
+    assert list(findings) == [MEASURED_AFTER]
+    assert len(counts) > 4
+    sh, frozen = trainer.scene.gaussians.sh, trainer.colours.frozen_rest()
+    if name == "none pays":
+        assert "does not pay" in findings[MEASURED_AFTER]
+        assert sh.shape[1] == 1
+    else:
+        assert dropped is not None
+        assert frozen is not None
+        assert 0 < int(frozen.sum()) < len(frozen) == len(sh)
+        assert torch.equal((sh[:, 1:] == 0).flatten(1).all(1), frozen)
+
+
+def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> None:
+    """And what was trained is drawn with it."""
+    trainer = _coloured(seven_views, COLOURS["network"])
+    for _ in range(30):
+        trainer.step()
+    assert trainer.scene.gaussians.sh_degree == 0
+    scene = stored_scene(trainer.checkpoint(), trainer.config.model)
+    camera = trainer.pictures[0].cameras
+    gaussians, shader = trainer.scene.gaussians.detach(), trainer.colours.shader(None, None)
+    drawn = moment_of(scene, None).seen_by(camera, RenderOptions()).rgb
+    assert torch.equal(drawn, render(gaussians, camera, shader=shader).rgb.detach())
+    assert not torch.equal(drawn, render(gaussians, camera).rgb)
+    assert scene.colour is not None
+    assert num_colour_values(scene) == 3 * len(gaussians) + scene.colour.num_values
+
+
+class _Exploding(_Lifted):
+    """From step 3 on it draws positions and rotations that are not finite."""
+
+    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
+        if step < 3:
+            return super().gaussians_at(parameters, batch, step)
+        factor = float("nan")
+        return Drawn(parameters.replace(means=parameters.means * factor, quats=parameters.quats * factor))
+
+
+class _Overweight(_Lifted):
+    """From step 3 on it has an infinite penalty."""
+
+    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
+        self.penalty = 0.0 if step < 3 else float("inf")
+        return super().gaussians_at(parameters, batch, step)
+
+
+def _stops_in_step_3(trainer: Trainer) -> str:
+    """The error's message; the trainer is left as after step 2."""
+    trainer.step()
+    trainer.step()
+    before = {name: x.detach().clone() for name, x in trainer.scene.gaussians.tensors().items()}
+    with pytest.raises(DyngsError) as caught:
+        trainer.step()
+    assert trainer.done == 2
+    assert all(torch.equal(x, before[name]) for name, x in trainer.scene.gaussians.tensors().items())
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("timed", [False, True])
+def test_what_is_not_finite_is_named_in_one_line(capture: Path, tmp_path: Path, timed: bool) -> None:
+    """Step, view, attributes, and the time; the parameters stay as they were."""
+    trainer = _trainer(write_timed_capture(tmp_path / "timed") if timed else capture)
+    trainer.model = _Exploding()
+    time = "(0|0.25|0.5|0.75|1)" if timed else "0"
+    assert re.fullmatch(
+        rf"step 3, view 'train/r_00\d': the field makes means, quats at {time} not finite; lower .*model\.deform",
+        _stops_in_step_3(trainer),
+    )
+
+
+def test_a_term_that_is_not_finite_is_named_in_one_line(capture: Path) -> None:
+    trainer = _trainer(capture)
+    trainer.model = _Overweight()
+    message = _stops_in_step_3(trainer)
+    assert re.fullmatch(
+        r"step 3, view 'train/r_00\d': the loss term 'height' is inf; lower its weight or rate", message
+    )
+
+
+def test_only_times_that_the_model_wants_are_trained_on(tmp_path: Path) -> None:
+    class _Early(_Lifted):
+        def trains_on(self, time: float | None, step: int) -> bool:
+            return time is not None and time <= 0.1 * step
+
+    trainer = _trainer(write_timed_capture(tmp_path))
+    trainer.model = _Early()
+    seen = [trainer.step().picture.time for _ in range(40)]
+    assert all(time is not None and time <= 0.1 * (i + 1) for i, time in enumerate(seen))
+    assert set(seen[20:]) == set(TRAIN_TIMES)
+
+
+@pytest.mark.parametrize(("choice", "value"), [("white", 1.0), ("black", 0.0), ("auto", 1.0)])
+def test_truth_and_render_share_the_background(capture: Path, choice: str, value: float) -> None:
+    report = _trainer(capture, background=choice).step()
+    assert report.picture.alpha is not None
+    empty = report.picture.alpha == 0
+    assert empty.any()
+    assert (report.truth[empty] == value).all()
+
+
+def test_a_random_background_is_new_in_each_step(capture: Path) -> None:
+    trainer = _trainer(capture, background="random")
+    colours = []
+    for _ in range(3):
+        report = trainer.step()
+        assert report.picture.alpha is not None
+        shown = report.truth[report.picture.alpha == 0].unique(dim=0)
+        assert len(shown) == 1
+        colours.append(tuple(shown[0].tolist()))
+    assert len(set(colours)) == 3
+
+
+def test_a_checkpoint_of_another_model_is_refused(capture: Path) -> None:
+    trainer = _trainer(capture)
+    checkpoint = trainer.checkpoint()
+    del checkpoint.tensors["sampler.order"]
+    with pytest.raises(DyngsError, match="lacks 'order'"):
+        trainer.restore(checkpoint)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("exp_avg.means", lambda x: x[1:], r"'exp_avg.means' is float32 \(49, 3\), not float32 \(50, 3\)"),
+        ("exp_avg_sq.sh", lambda x: x[:, :1], "'exp_avg_sq.sh' is float32"),
+        ("exp_avg.quats", lambda x: x.double(), "'exp_avg.quats' is float64"),
+        ("exp_avg_sq.means", lambda x: x / 0, "'exp_avg_sq.means' holds NaN"),
+        ("gaussians.quats", lambda x: x[:, :3], "quats must be"),
+        ("sampler.order", lambda x: torch.tensor([7]), "'order' names something beyond the 2"),
+        ("sampler.position", lambda x: x + 99, "'position' names something beyond"),
+        ("strategy.seen", lambda x: x.long(), "'seen' is int64"),
+        ("rng", lambda x: x[:9], "cannot be read"),
+        ("rng", lambda x: x.float(), "cannot be read"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_one_line(
+    capture: Path, tmp_path: Path, name: str, change: Callable[[Tensor], Tensor], said: str
 ) -> None:
-    """By what overflows first, a term of the loss or what the field makes of the Gaussians."""
-    _spoil_in_step(11, monkeypatch, 1e30)
-    config = busy_config(moving_capture, tmp_path / "run", _kind_of(whole_run))
-    with pytest.raises(DyngsError, match=r"^step 11, view 'train/r_0\d\d': the (field makes|loss term) .*step_0000008"):
-        train(config.model_copy(update={"train": TrainConfig(steps=24, save_every=4)}))
-    assert load_run(tmp_path / "run").step == 8
-
-
-def _spoil_in_step(step: int, monkeypatch: pytest.MonkeyPatch, value: float) -> None:
-    """Fill all that the field has learned with ``value`` before ``step``."""
-    real = Trainer.step
-
-    def stepping(trainer: Trainer) -> StepReport:
-        if trainer.done + 1 == step and isinstance(trainer.model, DynamicScene) and trainer.model.field is not None:
-            for x in trainer.model.field.learned.values().values():
-                x.fill_(value)
-        return real(trainer)
-
-    monkeypatch.setattr(Trainer, "step", stepping)
+    trainer = _trainer(capture)
+    trainer.step()
+    whole = trainer.checkpoint()
+    path = tmp_path / "checkpoints" / "step_0000001.safetensors"
+    path.parent.mkdir()
+    tensors = whole.tensors | {name: change(whole.tensors[name])}
+    write_tensors(path, _KIND, {name: x.contiguous() for name, x in tensors.items()}, asdict(whole.info))
+    with pytest.raises(DyngsError, match=said) as caught:
+        trainer.restore(load_checkpoint(path))
+    assert str(caught.value).startswith(str(path))
+    trainer.restore(whole)
+    trainer.step()

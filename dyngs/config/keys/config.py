@@ -47,5 +47,8 @@ class Config(Section):
     @property
     def total_steps(self) -> int:
         """Steps of training and of the last stage, if there is one."""
-        prunes = self.prune.is_wanted and not isinstance(self.model, HumanPredictorModel)
-        return self.train.steps + (self.prune.steps if prunes else 0)
+        match self.model:
+            case HumanPredictorModel():
+                return self.train.steps
+            case _:
+                return self.train.steps + (self.prune.steps if self.prune.is_wanted else 0)

@@ -125,7 +125,7 @@ class HumanScene(Scene):
     @property
     def fit(self) -> SharedCorrection:
         """What was learned about all poses."""
-        return SharedCorrection(self.learned["turns"].detach(), float(self.learned["log_scale"]))
+        return SharedCorrection(self.learned["turns"].detach(), float(self.learned["log_scale"].detach()))
 
     @property
     def moves_as(self) -> MotionClip:
@@ -157,7 +157,7 @@ class HumanScene(Scene):
         if given_weights is None:
             posing, skeleton = corrected_pose(self.learned, self.clip, row), corrected_skeleton(self.learned, skeleton)
             weights = corrected_weights(self.learned, self.anchors, len(skeleton.joints))
-            pose_dirs = self.learned["pose_dirs"] if "pose_dirs" in self.learned else None
+            pose_dirs = self.learned.get("pose_dirs")
         else:
             posing, weights = frame_pose(self.clip, row), given_weights
         offsets = rest_offsets(self.anchors, weights, posing, self.shapes, pose_dirs)

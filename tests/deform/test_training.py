@@ -17,16 +17,15 @@ from dyngs.config import DynamicModel, OptimConfig, TrajectoryField
 from dyngs.data.loader import Picture
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import field_state, new_field
-from dyngs.deform.model import DeformSchedule, DynamicScene, Surroundings4D
 from dyngs.deform.residual import Residuals
 from dyngs.deform.seeds import box_of
+from dyngs.deform.training import DeformSchedule, DynamicScene, Surroundings4D
 from dyngs.deform.window import TimeWindow
-from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.rendering import render
-from dyngs.static.densify import EditResult
-from dyngs.static.model import StaticScene
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.rates import Rates
+from dyngs.static.training import StaticScene
 
 FINE, FULL, SPLIT, STEPS = 2, 4, 6, 20
 TIMES = tuple(i / 20 for i in range(21))

@@ -12,11 +12,10 @@ from torch import Tensor
 from dyngs.config import DynamicModel, StaticModel
 from dyngs.deform.field import deformed
 from dyngs.deform.fields import field_state
-from dyngs.visibility import VisibilityMasks
-from dyngs.deform.trained import TrainedScene, trained_scene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.static.filters import fuse_filter
+from dyngs.visibility import VisibilityMasks
 
 ROWS = torch.tensor([1, 4, 5, 8])
 NOTHING = torch.zeros(0, dtype=torch.long)

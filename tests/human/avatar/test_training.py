@@ -6,21 +6,20 @@ from pathlib import Path
 
 import pytest
 import torch
+from dyngs.train.step import Trainer
 from synthetic_bodies import model, write_npz
 from torch import Tensor
 
+from dyngs.api.train import train
 from dyngs.build import assemble
 from dyngs.config import Config, DataConfig, DefaultStrategy, HumanModel, OptimConfig, RunConfig, TrainConfig
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.gaussians import TopologyEdit
-from dyngs.human.avatar.model import HumanScene
-from dyngs.human.avatar.trained import AvatarScene
+from dyngs.gaussians import EditResult, TopologyEdit
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.avatar.training import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import load_run, save_checkpoint, stored_scene
-from dyngs.static.densify import EditResult
-from dyngs.train.step import Trainer
-from dyngs.api.train import train
 from dyngs.view.animation import at_rest, with_motion
 
 BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.11)
@@ -85,8 +84,8 @@ def test_training_learns_and_evaluates_on_both_splits(capture: Path, tmp_path: P
     config = tiny(capture, tmp_path / "run", steps=60)
     start = stored_scene(assemble(config).checkpoint(), config.model)
     run = load_run(train(config))
-    assert isinstance(run.scene, AvatarScene)
-    assert isinstance(start, AvatarScene)
+    assert isinstance(run.scene, HumanScene)
+    assert isinstance(start, HumanScene)
     assert float((run.scene.clip.poses - start.clip.poses).abs().max()) > 0
     for split in ("test", "pose"):
         report = evaluate_run(tmp_path / "run", split)
@@ -105,7 +104,7 @@ def test_what_is_played_back_is_what_was_trained(
     trainer = assemble(tiny(capture, pose_offsets=pose_offsets, body=body))
     assert (human(trainer).subject.shapes is not None) == own_body
     tensors_after(trainer, 8)
-    parameters, picture = trainer.optimizer.parameters, trainer.pictures[4]
+    parameters, picture = trainer.scene.gaussians, trainer.pictures[4]
     drawn = human(trainer).gaussians_at(parameters, picture, trainer.done + 1).gaussians
     scene = stored_scene(trainer.checkpoint(), trainer.config.model)
     played = scene.at(picture.time)
@@ -122,7 +121,7 @@ def test_anchors_and_weights_follow_the_set(capture: Path) -> None:
     points, weights = model.anchors.points, model.corrections.learned["weights"].detach().clone()
     source = torch.tensor([5, 2, 2, 9])
     is_new = torch.tensor([False, False, True, False])
-    model.after_step(trainer.optimizer.parameters, 0, EditResult(TopologyEdit(source, is_new)))
+    model.after_step(trainer.scene.gaussians, 0, EditResult(TopologyEdit(source, is_new)))
     assert torch.equal(model.anchors.points, points[source])
     assert torch.equal(model.corrections.learned["weights"].detach(), weights[source])
     assert len(trainer.model.state()["anchors.size"]) == 4
@@ -135,7 +134,7 @@ def test_without_refinement_nothing_is_learned_about_the_fit(capture: Path) -> N
 
 def test_penalties_are_zero_at_the_start_and_grow_with_offsets(capture: Path) -> None:
     trainer = assemble(tiny(capture))
-    parameters = trainer.optimizer.parameters
+    parameters = trainer.scene.gaussians
     model, picture = human(trainer), trainer.pictures[0]
     first = model.gaussians_at(parameters, picture, 1).penalties
     assert first["offset"].item() == 0

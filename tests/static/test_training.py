@@ -5,10 +5,9 @@ from __future__ import annotations
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.static.densify import EditResult
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.static.filters import filter_std, fuse_filter
-from dyngs.static.model import StaticScene
+from dyngs.static.training import StaticScene
 
 INTRINSICS = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
 

@@ -11,18 +11,18 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import HumanModel
-from dyngs.deform.learned import LearnedTensors
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_pose
-from dyngs.human.avatar.model import HumanScene, Subject
 from dyngs.human.avatar.posing import Skeleton
-from dyngs.human.avatar.trained import AvatarScene, trained_avatar
+from dyngs.human.avatar.scene import HumanScene, trained_avatar
+from dyngs.human.avatar.training import HumanScene, Subject
 from dyngs.human.motion.captured import CapturedMotion
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.load import default_template
+from dyngs.parameters import Parameters
 from dyngs.rendering import render
 from dyngs.static.rates import Rates
 
@@ -34,7 +34,7 @@ def random_clip(frames: int, seed: int = 0) -> MotionClip:
     return MotionClip(times, 0.3 * torch.randn(frames, 55, 3, generator=generator), 0.1 * trans, torch.ones(frames))
 
 
-def stirred() -> tuple[HumanScene, Gaussians, AvatarScene]:
+def stirred() -> tuple[HumanScene, Gaussians, HumanScene]:
     """A model whose corrections are not zero, its Gaussians, and what is stored of it."""
     body = default_template()
     gaussians, anchors = texel_gaussians(atlas_texels(body, 24), (0.0,), 0)
@@ -102,7 +102,7 @@ def test_penalties_pull_corrections_back() -> None:
     terms = model.corrections.penalties()
     assert set(terms) == {"pose", "skinning weights"}
     sum(terms.values()).backward()  # type: ignore[union-attr]
-    learned: LearnedTensors = model.corrections.learned
+    learned: Parameters = model.corrections.learned
     for name in ("poses", "turns", "joints", "weights"):
         grad = learned[name].grad
         assert grad is not None
