@@ -1,8 +1,5 @@
 // Fused Adam: one pass over the memory instead of torch's eight, whole vectors even where rows are short.
 //
-//   m <- m + (1 - beta1) (g - m),   v <- beta2 v + (1 - beta2) g^2
-//   p <- p - rate / (1 - beta1^t) * m / (sqrt(v) / sqrt(1 - beta2^t) + eps)
-//
 // The work is cut into blocks of rows. Where few rows of a block are to be updated and rows are long, that is done run by
 // run, which saves the memory traffic of the rows between; otherwise element by element under a mask, which keeps whole
 // vectors busy.
@@ -13,6 +10,8 @@
 #include <cstring>
 #include <memory>
 
+#include "math/adam.hpp"
+
 namespace dyngs {
 namespace {
 
@@ -20,13 +19,7 @@ constexpr int64_t kBlockFloats = 2048;  // four arrays of it fit the first-level
 constexpr int64_t kLongRow = 16;        // floats; from here on a row alone fills vectors
 constexpr int64_t kSparse = 3;          // runs pay where fewer than one row in three is updated
 
-struct Coefficients {
-  float one_minus_beta1;
-  float beta2;
-  float one_minus_beta2;
-  float inv_sqrt_correction2;
-  float eps;
-};
+using Coefficients = AdamCoefficients<float>;
 
 // Pointers to a piece of the four arrays; `step` holds the bias-corrected rate of each element.
 struct Piece {
@@ -44,14 +37,11 @@ void update_floats(float* __restrict param, const float* __restrict grad, float*
                    float* __restrict exp_avg_sq, const float* __restrict step, const int32_t* __restrict active,
                    int64_t count, Coefficients c) {
   for (int64_t i = 0; i < count; ++i) {
-    const float g = grad[i], p = param[i], m = exp_avg[i], v = exp_avg_sq[i];
-    const float new_m = m + c.one_minus_beta1 * (g - m);
-    const float new_v = c.beta2 * v + c.one_minus_beta2 * g * g;
-    const float new_p = p - step[i] * new_m / (std::sqrt(new_v) * c.inv_sqrt_correction2 + c.eps);
+    const AdamElement<float> old{param[i], exp_avg[i], exp_avg_sq[i]}, next = adam_update(old, grad[i], step[i], c);
     const bool on = !masked || active[i] != 0;
-    exp_avg[i] = on ? new_m : m;
-    exp_avg_sq[i] = on ? new_v : v;
-    param[i] = on ? new_p : p;
+    exp_avg[i] = on ? next.exp_avg : old.exp_avg;
+    exp_avg_sq[i] = on ? next.exp_avg_sq : old.exp_avg_sq;
+    param[i] = on ? next.param : old.param;
   }
 }
 

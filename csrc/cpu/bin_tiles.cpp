@@ -149,7 +149,7 @@ template <class S>
 void append_spans(const Splats<S>& s, const Grid& grid, const int32_t* order, int count, Part& part) {
   int32_t rows[kLanes], begin[kLanes], end[kLanes];
   for (int i = 0; i < kLanes; ++i) rows[i] = order[std::min(i, count - 1)];
-  const Ellipses<S> ellipses = make_ellipses(s, rows);
+  const Ellipse<Packet<S>> ellipses = load_ellipses(s, rows);
   tile_rows(ellipses, grid, begin, end);
   size_t place[kLanes], total = part.spans.size();
   int32_t most = 0;

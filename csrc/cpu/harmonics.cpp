@@ -3,6 +3,7 @@
 
 #include "cpu/kernels.hpp"
 #include "cpu/parallel.hpp"
+#include "cpu/simd.hpp"
 
 namespace dyngs {
 namespace {
@@ -11,20 +12,20 @@ constexpr int64_t kBlock = 32 * kLanes;
 
 template <class S>
 struct Direction {
-  Packet<S> x, y, z, inv_norm;
+  Vec3<Packet<S>> unit;
+  Packet<S> inv_norm;
 };
 
 template <class S>
 Direction<S> view_direction(const Harmonics<S>& in, int64_t view, int64_t first, int count) {
-  Direction<S> d;
+  Vec3<Packet<S>> ray;
   const S* c = in.centers + 3 * view;
   for (int i = 0; i < kLanes; ++i) {
     const S* m = in.means + 3 * (first + std::min(i, count - 1));
-    d.x[i] = m[0] - c[0], d.y[i] = m[1] - c[1], d.z[i] = m[2] - c[2];
+    ray.x[i] = m[0] - c[0], ray.y[i] = m[1] - c[1], ray.z[i] = m[2] - c[2];
   }
-  const Packet<S> norm = sqrt_of(d.x * d.x + d.y * d.y + d.z * d.z);
-  d.inv_norm = Packet<S>(S(1)) / max_of(norm, Packet<S>(S(1e-12)));
-  d.x *= d.inv_norm, d.y *= d.inv_norm, d.z *= d.inv_norm;
+  Direction<S> d;
+  d.unit = normalize(ray, d.inv_norm);
   return d;
 }
 
@@ -33,7 +34,7 @@ void forward_lanes(const Harmonics<S>& in, int64_t view, int64_t first, int coun
   const int terms = (in.degree + 1) * (in.degree + 1);
   const Direction<S> d = view_direction(in, view, first, count);
   Packet<S> basis[kMaxShTerms];
-  sh_basis(in.degree, d.x, d.y, d.z, basis);
+  sh_basis(in.degree, d.unit.x, d.unit.y, d.unit.z, basis);
   for (int i = 0; i < count; ++i) {
     const int64_t row = view * in.num_gaussians + first + i;
     S rgb[3] = {S(0), S(0), S(0)};
@@ -66,7 +67,7 @@ void backward_lanes(const Harmonics<S>& in, int64_t view, int64_t first, int cou
   if (!any_active) return;
   const Direction<S> d = view_direction(in, view, first, count);
   Packet<S> basis[kMaxShTerms], weight[kMaxShTerms];
-  sh_basis(in.degree, d.x, d.y, d.z, basis);
+  sh_basis(in.degree, d.unit.x, d.unit.y, d.unit.z, basis);
   for (int i = 0; i < kLanes; ++i) {
     if (i >= count || !active[i]) {
       for (int k = 0; k < terms; ++k) weight[k][i] = S(0);
@@ -85,16 +86,13 @@ void backward_lanes(const Harmonics<S>& in, int64_t view, int64_t first, int cou
     }
   }
   if (in.degree == 0) return;
-  Packet<S> gx, gy, gz;
-  sh_basis_vjp(in.degree, d.x, d.y, d.z, weight, gx, gy, gz);
-  const Packet<S> along = gx * d.x + gy * d.y + gz * d.z;  // the normalisation lets only the tangent part through
-  gx = (gx - along * d.x) * d.inv_norm;
-  gy = (gy - along * d.y) * d.inv_norm;
-  gz = (gz - along * d.z) * d.inv_norm;
+  Vec3<Packet<S>> by_unit;
+  sh_basis_vjp(in.degree, d.unit.x, d.unit.y, d.unit.z, weight, by_unit.x, by_unit.y, by_unit.z);
+  const Vec3<Packet<S>> by_ray = normalize_vjp(d.unit, d.inv_norm, by_unit);
   for (int i = 0; i < count; ++i) {
     S* out = grad_means + 3 * (first + i);
-    out[0] += gx[i], out[1] += gy[i], out[2] += gz[i];
-    if (center != nullptr) center[0] -= gx[i], center[1] -= gy[i], center[2] -= gz[i];
+    out[0] += by_ray.x[i], out[1] += by_ray.y[i], out[2] += by_ray.z[i];
+    if (center != nullptr) center[0] -= by_ray.x[i], center[1] -= by_ray.y[i], center[2] -= by_ray.z[i];
   }
 }
 

@@ -1,21 +1,6 @@
 // Fused L1 + SSIM loss and its gradient, one pass over tiles that stay in the second-level cache.
 //
-// With x the rendered and y the target picture, G the 11-tap Gaussian blur with zero padding, d = x - y and s = x + y:
-//   P = (G(d)^2 + G(s)^2) / 2 + C1                      = mean_x^2 + mean_y^2 + C1
-//   V_d = G(d^2) - G(d)^2,  V_s = G(s^2) - G(s)^2
-//   Q = (V_d + V_s) / 2 + C2                            = var_x + var_y + C2
-//   P - G(d)^2 = 2 mean_x mean_y + C1,  Q - V_d = 2 cov_xy + C2
-//   SSIM = (1 - G(d)^2 / P) * (1 - V_d / Q)
-// which is the usual formula, but needs four blurs instead of five and has no cancellation where x is close to y:
-// equal pictures give exactly 0 loss.
-//
-// Gradient. Write SSIM = l * c with e = G(d)^2 / P = 1 - l and f = V_d / Q = 1 - c. The partial derivatives by the four
-// blurred maps are, per pixel,
-//   A_dd = dSSIM/dG(d^2) = l * (f / 2 - 1) / Q          A_ss = dSSIM/dG(s^2) = l * (f / 2) / Q
-//   A_d  = dSSIM/dG(d)   = c * (e - 2) / P * G(d) - 2 * G(d) * A_dd
-//   A_s  = dSSIM/dG(s)   = c * e / P * G(s)       - 2 * G(s) * A_ss
-// As dd/dx = ds/dx = 1 and G is its own adjoint (symmetric kernel, zero padding),
-//   dSSIM/dx = G(A_d + A_s) + 2 d G(A_dd) + 2 s G(A_ss).
+// SSIM, its gradient and the letters d, s, G(.) are those of math/ssim.hpp.
 //
 // Precision. V = G(x^2) - G(x)^2 loses digits where x^2 is large beside C2: in float32 0.1% of Q at kLargestInFloat. A
 // tile with more than that anywhere, which no ordinary picture has, is computed again in float64: 0.1% are then reached at
@@ -31,14 +16,15 @@
 #include <cstring>
 #include <memory>
 
+#include "cpu/simd.hpp"
+#include "math/ssim.hpp"
+
 namespace dyngs {
 namespace {
 
 constexpr int kChannels = 3;
 constexpr int kRadius = 5;
 constexpr int kTaps = 2 * kRadius + 1;
-constexpr double kC1 = 0.01 * 0.01;
-constexpr double kC2 = 0.03 * 0.03;
 constexpr double kLargestInFloat = 16;  // of G(d^2) + G(s^2): pictures up to 2
 
 constexpr int kBatch = 4;                        // rows filtered together: each row read serves up to four sums
@@ -47,33 +33,6 @@ constexpr int kRing = 16;                        // rows kept of each map; a pow
 constexpr int kHalo = 2 * kRadius;               // a gradient depends on pixels this far away
 constexpr int kTileRows = 96;
 constexpr int kTilePixels = 256;
-
-#if defined(__AVX512F__)
-constexpr int kLaneBytes = 64;
-#elif defined(__AVX__)
-constexpr int kLaneBytes = 32;
-#else
-constexpr int kLaneBytes = 16;
-#endif
-template <class T>
-struct VectorOf {
-  typedef T type __attribute__((vector_size(kLaneBytes)));
-};
-template <class T>
-using Lanes = typename VectorOf<T>::type;
-template <class T>
-constexpr int kLanes = kLaneBytes / static_cast<int>(sizeof(T));
-
-template <class T>
-inline Lanes<T> load(const T* from) {
-  Lanes<T> x;
-  std::memcpy(&x, from, sizeof x);
-  return x;
-}
-template <class T>
-inline void store(T* to, Lanes<T> x) {
-  std::memcpy(to, &x, sizeof x);
-}
 
 template <class T>
 struct Kernel {
@@ -122,7 +81,8 @@ class Workspace {
   static constexpr int64_t kRingRows = kRingMaps * kRing;
   static constexpr int64_t kRows = kRingRows + kScratchMaps * kBatch + 1;
   static int64_t stride_for(int64_t max_tile_pixels) {
-    return (kChannels * (max_tile_pixels + 2 * kHalo) + kLanes<T> - 1) / kLanes<T> * kLanes<T> + kLanes<T>;
+    constexpr int kWidth = Native<T>::kSize;
+    return (kChannels * (max_tile_pixels + 2 * kHalo) + kWidth - 1) / kWidth * kWidth + kWidth;
   }
   int64_t stride_;
   T* numbers_;
@@ -137,7 +97,7 @@ struct Context {
   T scale;          // 1 / (channels * sum of the mask)
   float* gradient;  // nullptr: value only
   Workspace<T>& rows;
-  Lanes<T> largest = {};  // G(d^2) + G(s^2) so far, lane by lane
+  Native<T> largest = {};  // G(d^2) + G(s^2) so far, lane by lane
 
   int64_t tile_numbers() const { return kChannels * (tile.col_end - tile.col_begin); }
   int64_t row_numbers() const { return tile_numbers() + 2 * kTileStart; }
@@ -146,7 +106,7 @@ struct Context {
 template <class T>
 bool is_precise(const Context<T>& c) {
   bool precise = true;
-  for (int k = 0; k < kLanes<T>; ++k) precise = precise && c.largest[k] <= static_cast<T>(kLargestInFloat);
+  for (int k = 0; k < Native<T>::kSize; ++k) precise = precise && c.largest[k] <= static_cast<T>(kLargestInFloat);
   return precise || sizeof(T) == sizeof(double);
 }
 
@@ -204,11 +164,11 @@ template <bool with_square, class T>
 void blur_columns(Context<T>& c, int ring_map, int64_t row, int to, int square_to = 0) {
   const T* from[kWindow];
   for (int r = 0; r < kWindow; ++r) from[r] = c.rows.ring(ring_map, row - kRadius + r);
-  for (int64_t i = 0; i < c.row_numbers(); i += kLanes<T>) {
-    Lanes<T> sum[kBatch] = {}, square_sum[kBatch] = {};
+  for (int64_t i = 0; i < c.row_numbers(); i += Native<T>::kSize) {
+    Native<T> sum[kBatch] = {}, square_sum[kBatch] = {};
 #pragma GCC unroll 16
     for (int r = 0; r < kWindow; ++r) {
-      const Lanes<T> x = load(from[r] + i), square = x * x;
+      const Native<T> x = load_native(from[r] + i), square = x * x;
 #pragma GCC unroll 4
       for (int b = 0; b < kBatch; ++b) {
         if (r < b || r - b >= kTaps) continue;
@@ -224,42 +184,12 @@ void blur_columns(Context<T>& c, int ring_map, int64_t row, int to, int square_t
 }
 
 template <class T>
-inline Lanes<T> blur_along(const T* centre, const Kernel<T>& kernel) {
-  Lanes<T> sum = load(centre) * kernel.tap[kRadius];
+inline Native<T> blur_along(const T* centre, const Kernel<T>& kernel) {
+  Native<T> sum = load_native(centre) * kernel.tap[kRadius];
 #pragma GCC unroll 8
   for (int k = 1; k <= kRadius; ++k)
-    sum += (load(centre - kChannels * k) + load(centre + kChannels * k)) * kernel.tap[kRadius + k];
+    sum += (load_native(centre - kChannels * k) + load_native(centre + kChannels * k)) * kernel.tap[kRadius + k];
   return sum;
-}
-
-// A variance below zero is rounding; NaN stays NaN.
-template <class V>
-inline V at_least_zero(V x) {
-  return x < 0 ? V{} : x;
-}
-
-template <class T>
-struct SsimTerms {
-  Lanes<T> dissimilarity;                                 // 1 - SSIM
-  Lanes<T> grad_mean, grad_diff_square, grad_sum_square;  // A_d + A_s, A_dd, A_ss
-};
-
-template <class T>
-inline SsimTerms<T> ssim_terms(Lanes<T> mean_d, Lanes<T> mean_s, Lanes<T> square_d, Lanes<T> square_s) {
-  constexpr T one = 1, two = 2, half = T(0.5), c1 = static_cast<T>(kC1), c2 = static_cast<T>(kC2);
-  const Lanes<T> mean_d2 = mean_d * mean_d, mean_s2 = mean_s * mean_s;
-  const Lanes<T> var_d = at_least_zero(square_d - mean_d2), var_s = at_least_zero(square_s - mean_s2);
-  const Lanes<T> inv_p = one / ((mean_d2 + mean_s2) * half + c1);
-  const Lanes<T> inv_q = one / ((var_d + var_s) * half + c2);
-  const Lanes<T> e = mean_d2 * inv_p, f = var_d * inv_q;
-  const Lanes<T> l_over_q = (one - e) * inv_q, c_over_p = (one - f) * inv_p;
-  SsimTerms<T> t;
-  t.dissimilarity = e + f - e * f;
-  t.grad_sum_square = l_over_q * (f * half);
-  t.grad_diff_square = t.grad_sum_square - l_over_q;
-  t.grad_mean = mean_d * (c_over_p * (e - two) - t.grad_diff_square * two) +
-                mean_s * (c_over_p * e - t.grad_sum_square * two);
-  return t;
 }
 
 // Finishes the blur of one row along the row, and turns the four means into SSIM and its partial derivatives.
@@ -271,14 +201,14 @@ double ssim_row(Context<T>& c, int64_t row, int b) {
   const T* square_s = c.rows.scratch(kSquareS, b);
   const T* weight = c.rows.ring(kWeight, row);
   T* dissimilarity = c.rows.line();
-  Lanes<T> largest = c.largest;
-  for (int64_t i = kChannels * kRadius; i < c.row_numbers() - kChannels * kRadius; i += kLanes<T>) {
-    const Lanes<T> e_d2 = blur_along(square_d + i, c.kernel), e_s2 = blur_along(square_s + i, c.kernel);
-    const Lanes<T> squares = e_d2 + e_s2;
-    largest = squares > largest ? squares : largest;
-    const SsimTerms<T> t =
-        ssim_terms<T>(blur_along(mean_d + i, c.kernel), blur_along(mean_s + i, c.kernel), e_d2, e_s2);
-    const Lanes<T> w = load(weight + i);
+  Native<T> largest = c.largest;
+  for (int64_t i = kChannels * kRadius; i < c.row_numbers() - kChannels * kRadius; i += Native<T>::kSize) {
+    const Native<T> e_d2 = blur_along(square_d + i, c.kernel), e_s2 = blur_along(square_s + i, c.kernel);
+    const Native<T> squares = e_d2 + e_s2;
+    largest = max(squares, largest);
+    const SsimTerms<Native<T>> t =
+        ssim_terms(blur_along(mean_d + i, c.kernel), blur_along(mean_s + i, c.kernel), e_d2, e_s2);
+    const Native<T> w = load_native(weight + i);
     store(dissimilarity + i, w * t.dissimilarity);
     store(c.rows.ring(kGradMean, row) + i, w * t.grad_mean);
     store(c.rows.ring(kGradDifferenceSquare, row) + i, w * t.grad_diff_square);
@@ -306,13 +236,6 @@ double ssim_batch(Context<T>& c, int64_t row) {
   return dissimilarity;
 }
 
-// NaN passes through, as 0 does.
-template <class V>
-inline V sign(V x) {
-  const V one = V{} + 1;
-  return x > 0 ? one : (x < 0 ? -one : x);
-}
-
 template <class T>
 void write_gradient_row(Context<T>& c, int64_t row, const T* line) {
   float* to = c.gradient + kChannels * (row * c.input.width + c.tile.col_begin);
@@ -331,12 +254,13 @@ void gradient_batch(Context<T>& c, int64_t row) {
     const T* sum = c.rows.ring(kSum, row + b);
     const T* weight = c.rows.ring(kWeight, row + b);
     T* line = c.rows.line();
-    for (int64_t i = kTileStart; i < c.row_numbers() - kTileStart; i += kLanes<T>) {
-      const Lanes<T> d = load(difference + i), s = load(sum + i);
-      const Lanes<T> ssim = blur_along(c.rows.scratch(kFromMean, b) + i, c.kernel) +
-                         d * T(2) * blur_along(c.rows.scratch(kFromDifference, b) + i, c.kernel) +
-                         s * T(2) * blur_along(c.rows.scratch(kFromSum, b) + i, c.kernel);
-      store(line + i, load(weight + i) * (l1_scale * sign(d) - ssim_scale * ssim));
+    for (int64_t i = kTileStart; i < c.row_numbers() - kTileStart; i += Native<T>::kSize) {
+      const Native<T> d = load_native(difference + i), s = load_native(sum + i);
+      const Native<T> ssim = ssim_grad(d, s, blur_along(c.rows.scratch(kFromMean, b) + i, c.kernel),
+                                       blur_along(c.rows.scratch(kFromDifference, b) + i, c.kernel),
+                                       blur_along(c.rows.scratch(kFromSum, b) + i, c.kernel));
+      const Native<T> l1 = l1_scale * sign(d);
+      store(line + i, load_native(weight + i) * (l1 - ssim_scale * ssim));
     }
     write_gradient_row(c, row + b, line);
   }
@@ -374,8 +298,9 @@ Sums l1_tile(Context<T>& c) {
     sums.l1 += l1_row(c, row);
     if (!c.gradient) continue;
     T* line = c.rows.line();
-    for (int64_t i = kTileStart; i < c.row_numbers() - kTileStart; i += kLanes<T>)
-      store(line + i, c.scale * load(c.rows.ring(kWeight, row) + i) * sign(load(c.rows.ring(kDifference, row) + i)));
+    const T *difference = c.rows.ring(kDifference, row), *weight = c.rows.ring(kWeight, row);
+    for (int64_t i = kTileStart; i < c.row_numbers() - kTileStart; i += Native<T>::kSize)
+      store(line + i, c.scale * load_native(weight + i) * sign(load_native(difference + i)));
     write_gradient_row(c, row, line);
   }
   return sums;

@@ -1,6 +1,7 @@
 #include "cpu/offsets.hpp"
 
 #include "cpu/parallel.hpp"
+#include "math/quaternion.hpp"
 
 namespace dyngs {
 namespace {
@@ -12,14 +13,10 @@ void add3(S* to, const S* by) {
   for (int c = 0; c < 3; ++c) to[c] += by[c];
 }
 
-// The Hamilton product (identity + by) q.
 template <class S>
 void turn(S* q, const S* by) {
-  const S w1 = by[0] + 1, x1 = by[1], y1 = by[2], z1 = by[3], w2 = q[0], x2 = q[1], y2 = q[2], z2 = q[3];
-  q[0] = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2;
-  q[1] = w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2;
-  q[2] = w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2;
-  q[3] = w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2;
+  const Quat<S> turned = Quat<S>{by[0] + 1, by[1], by[2], by[3]} * load_quat(q);
+  q[0] = turned.w, q[1] = turned.x, q[2] = turned.y, q[3] = turned.z;
 }
 
 }  // namespace

@@ -22,6 +22,7 @@
 #endif
 
 #include "cpu/parallel.hpp"
+#include "cpu/simd.hpp"
 
 namespace dyngs {
 namespace {
@@ -31,38 +32,16 @@ constexpr int64_t kParts = 16;  // ranges of blocks with their own sum of parame
 constexpr int64_t kPad = 16;    // widths are padded to a multiple of it, the lanes of the widest vector of floats
 
 #if defined(__AVX512F__)
-constexpr int kVectorBytes = 64;
 constexpr int kMaxVectors = 4;  // columns of a tile, in vectors; with kTileRows this fills 32 registers
 constexpr int kTileRows[] = {8, 8, 8, 6};
 #elif defined(__AVX__)
-constexpr int kVectorBytes = 32;
 constexpr int kMaxVectors = 2;  // 16 registers
 constexpr int kTileRows[] = {8, 6};
 #else
-constexpr int kVectorBytes = 16;
 constexpr int kMaxVectors = 2;
 constexpr int kTileRows[] = {8, 6};
 #endif
 constexpr int kMaxRows = 8;
-
-template <class S>
-struct Native {
-  typedef S Vec __attribute__((vector_size(kVectorBytes)));
-  static constexpr int64_t lanes = kVectorBytes / sizeof(S);
-};
-template <class S>
-using Vec = typename Native<S>::Vec;
-
-template <class S>
-inline Vec<S> load(const S* from) {
-  Vec<S> x;
-  std::memcpy(&x, from, sizeof x);
-  return x;
-}
-template <class S>
-inline void store(S* to, Vec<S> x) {
-  std::memcpy(to, &x, sizeof x);
-}
 
 constexpr int64_t padded(int64_t width) { return (width + kPad - 1) / kPad * kPad; }
 // Distance of rows in memory. One more cache line than needed, or else rows of 2^n would share few sets of the cache.
@@ -97,30 +76,30 @@ struct Product {
 
 template <int kRows, int kVectors, bool kTransposed, class S>
 void tile(const Product<S>& in, int64_t row, int64_t column, const S* b, int64_t b_stride) {
-  constexpr int64_t kLanes = Native<S>::lanes;
-  Vec<S> sum[kRows][kVectors];
+  constexpr int64_t kLanes = Native<S>::kSize;
+  Native<S> sum[kRows][kVectors];
   const S* start = in.start + row * in.start_stride + column;
   for (int r = 0; r < kRows; ++r)
-    for (int v = 0; v < kVectors; ++v) sum[r][v] = load(start + r * in.start_stride + v * kLanes);
+    for (int v = 0; v < kVectors; ++v) sum[r][v] = load_native(start + r * in.start_stride + v * kLanes);
   const int64_t row_step = kTransposed ? 1 : in.a_stride, step = kTransposed ? in.a_stride : 1;
   const S* a = in.a + row * row_step;
   for (int64_t k = 0; k < in.depth; ++k, a += step, b += b_stride) {
-    Vec<S> right[kVectors];
-    for (int v = 0; v < kVectors; ++v) right[v] = load(b + v * kLanes);
+    Native<S> right[kVectors];
+    for (int v = 0; v < kVectors; ++v) right[v] = load_native(b + v * kLanes);
     for (int r = 0; r < kRows; ++r) {
-      const Vec<S> left = a[r * row_step] - Vec<S>{};  // broadcast
+      const Native<S> left(a[r * row_step]);
       for (int v = 0; v < kVectors; ++v) sum[r][v] += left * right[v];
     }
   }
-  const Vec<S> zero = {};
+  const Native<S> zero(S(0));
   if (in.after == After::kRelu) {
     for (int r = 0; r < kRows; ++r)
-      for (int v = 0; v < kVectors; ++v) sum[r][v] = sum[r][v] < zero ? zero : sum[r][v];  // lets NaN through
+      for (int v = 0; v < kVectors; ++v) sum[r][v] = max(zero, sum[r][v]);  // lets NaN through
   } else if (in.after == After::kGate) {
     const S* gate = in.gate + row * in.gate_stride + column;
     for (int r = 0; r < kRows; ++r)
       for (int v = 0; v < kVectors; ++v)
-        sum[r][v] = load(gate + r * in.gate_stride + v * kLanes) <= zero ? zero : sum[r][v];
+        sum[r][v] = select(load_native(gate + r * in.gate_stride + v * kLanes) <= zero, zero, sum[r][v]);
   }
   S* c = in.c + row * in.c_stride + column;
   for (int r = 0; r < kRows; ++r)
@@ -143,7 +122,7 @@ constexpr auto all_tiles() {
 template <bool kTransposed, class S>
 void multiply(const Product<S>& in) {
   static constexpr auto tiles = all_tiles<kTransposed, S>();
-  constexpr int64_t kLanes = Native<S>::lanes;
+  constexpr int64_t kLanes = Native<S>::kSize;
   const Panels panels(in.columns, kLanes);
   for (int64_t p = 0; p < panels.count; ++p) {
     const int64_t column = panels.begin(p) * kLanes, vectors = panels.begin(p + 1) - panels.begin(p);
@@ -161,7 +140,7 @@ void multiply(const Product<S>& in) {
 // The right factor B (depth, columns), B(k, c) = from[k * k_stride + c * c_stride], as panels with zeros in the padding.
 template <class S>
 void pack(const S* from, int64_t depth, int64_t columns, int64_t k_stride, int64_t c_stride, S* to) {
-  constexpr int64_t kLanes = Native<S>::lanes;
+  constexpr int64_t kLanes = Native<S>::kSize;
   const Panels panels(columns, kLanes);
   for (int64_t p = 0; p < panels.count; ++p) {
     const int64_t begin = panels.begin(p) * kLanes, end = panels.begin(p + 1) * kLanes;
@@ -297,9 +276,9 @@ void run_block(const Plan<S>& plan, int64_t rows, const S* x, S* inputs, bool ke
 // sums[c] += the sum over rows of from[r][c].
 template <class S>
 void add_columns(const S* from, int64_t rows, int64_t columns, int64_t stride, S* sums) {
-  for (int64_t c = 0; c < columns; c += Native<S>::lanes) {
-    Vec<S> sum = load(sums + c);
-    for (int64_t r = 0; r < rows; ++r) sum += load(from + r * stride + c);
+  for (int64_t c = 0; c < columns; c += Native<S>::kSize) {
+    Native<S> sum = load_native(sums + c);
+    for (int64_t r = 0; r < rows; ++r) sum += load_native(from + r * stride + c);
     store(sums + c, sum);
   }
 }

@@ -7,7 +7,8 @@
 
 #include "cpu/parallel.hpp"
 #include "cpu/planes.hpp"
-#include "math/packet.hpp"
+#include "cpu/simd.hpp"
+#include "math/planes.hpp"
 
 namespace dyngs {
 namespace {
@@ -48,12 +49,12 @@ double differences(const S* a, const S* b, const S* c, S* to, int64_t n) {
   Sum<S> sum;
   int64_t k = 0;
   for (; k + kLanes <= n; k += kLanes) {
-    const P d = (P::load(a + k) - P::load(b + k)) + (P::load(c + k) - P::load(b + k));
+    const P d = second_difference(P::load(a + k), P::load(b + k), P::load(c + k));
     d.store(to + k);
     sum.lanes += d * d;
   }
   for (; k < n; ++k) {
-    to[k] = (a[k] - b[k]) + (c[k] - b[k]);
+    to[k] = second_difference(a[k], b[k], c[k]);
     sum.rest += double(to[k]) * to[k];
   }
   return sum.total();
@@ -63,14 +64,13 @@ double differences(const S* a, const S* b, const S* c, S* to, int64_t n) {
 template <bool accumulate, class S>
 void gradient_row(const S* a, const S* b, const S* c, S factor, S* to, int64_t n) {
   using P = Packet<S>;
-  const P two(S(2));
   int64_t k = 0;
   for (; k + kLanes <= n; k += kLanes) {
-    const P g = factor * (P::load(a + k) + P::load(c + k) - two * P::load(b + k));
+    const P g = second_difference_vjp(P::load(a + k), P::load(b + k), P::load(c + k), P(factor));
     (accumulate ? P::load(to + k) + g : g).store(to + k);
   }
   for (; k < n; ++k) {
-    const S g = factor * (a[k] + c[k] - S(2) * b[k]);
+    const S g = second_difference_vjp(a[k], b[k], c[k], factor);
     to[k] = accumulate ? to[k] + g : g;
   }
 }
@@ -79,18 +79,18 @@ void gradient_row(const S* a, const S* b, const S* c, S factor, S* to, int64_t n
 template <class S>
 double distance_from_one(const S* p, S factor, S* to, int64_t n) {
   using P = Packet<S>;
-  const P one(S(1)), zero(S(0)), up(factor), down(-factor);
+  const P one(S(1));
   Sum<S> sum;
   int64_t k = 0;
   for (; k + kLanes <= n; k += kLanes) {
     const P d = P::load(p + k) - one;
-    sum.lanes += abs_of(d);
-    if (to) (P::load(to + k) + select(d > zero, up, select(d < zero, down, zero))).store(to + k);
+    sum.lanes += abs(d);
+    if (to) (P::load(to + k) + distance_vjp(d, P(factor))).store(to + k);
   }
   for (; k < n; ++k) {
     const S d = p[k] - S(1);
     sum.rest += std::abs(d);
-    if (to) to[k] += d > 0 ? factor : d < 0 ? -factor : S(0);
+    if (to) to[k] += distance_vjp(d, factor);
   }
   return sum.total();
 }

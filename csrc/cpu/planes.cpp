@@ -8,7 +8,8 @@
 #include <cstring>
 
 #include "cpu/parallel.hpp"
-#include "math/packet.hpp"
+#include "cpu/simd.hpp"
+#include "math/planes.hpp"
 
 namespace dyngs {
 namespace {
@@ -70,37 +71,20 @@ std::vector<Chunk<S>> load_chunks(const PlanePoints<S>& points, const int32_t* o
 // Where the points of a chunk fall between the samples of one level: index + frac, along each axis.
 template <class S>
 struct Cells {
-  typename LaneTypes<S>::Int index[kAxes][kLanes];
+  typename Packet<S>::Int index[kAxes][kLanes];
   Packet<S> frac[kAxes];
 };
 
 template <class S>
-Cells<S> locate(const Chunk<S>& chunk, int64_t size) {
-  using P = Packet<S>;
-  const P one(S(1)), half(static_cast<S>(size - 1) / 2), top(static_cast<S>(std::max<int64_t>(size - 2, 0)));
+Cells<S> locate_chunk(const Chunk<S>& chunk, int64_t size) {
   Cells<S> cells;
   for (int a = 0; a < kAxes; ++a) {
-    P u = P::load(chunk.coords[a]);
-    u = select(u < -one, -one, select(u > one, one, u));  // NaN stays
-    const P x = u * half + half;
-    const P below = truncated(min_of(select(x >= one, x, P(S(0))), top));  // and here goes to 0
-    const auto index = __builtin_convertvector(below.v, typename LaneTypes<S>::IntVec);
+    const Cell<Packet<S>> cell = locate(Packet<S>::load(chunk.coords[a]), size);
+    const auto index = __builtin_convertvector(cell.index.v, typename Packet<S>::IntVec);
     std::memcpy(cells.index[a], &index, sizeof index);
-    cells.frac[a] = x - below;
+    cells.frac[a] = cell.frac;
   }
   return cells;
-}
-
-// Two neighbouring rows of the time planes and where the time lies between them.
-struct TimeRows {
-  int64_t first, second;
-  double weight;  // of the second
-};
-
-TimeRows time_rows(double time, int64_t times) {
-  const double x = std::clamp(time, 0.0, 1.0) * static_cast<double>(times - 1);
-  const int64_t first = std::min<int64_t>(static_cast<int64_t>(x), std::max<int64_t>(times - 2, 0));
-  return {first, std::min(first + 1, times - 1), x - static_cast<double>(first)};
 }
 
 // (3, size, C): the time planes of a level at the one time of the call.
@@ -113,7 +97,7 @@ std::vector<S> lines_at_time(const PlaneLevel<S>& level, int64_t channels, doubl
   for (int a = 0; a < kAxes; ++a) {
     const S* plane = level.time + a * level.times * row_size;
     const S *one = plane + rows.first * row_size, *two = plane + rows.second * row_size;
-    for (int64_t k = 0; k < row_size; ++k) lines[a * row_size + k] = one[k] + weight * (two[k] - one[k]);
+    for (int64_t k = 0; k < row_size; ++k) lines[a * row_size + k] = lerp(one[k], two[k], weight);
   }
   return lines;
 }
@@ -125,50 +109,26 @@ std::vector<std::vector<S>> all_lines(const HexPlane<S>& planes) {
   return lines;
 }
 
-// As many channels as one register holds. Packets of 16 would fill two or four on older processors, and there are too
-// many values alive here for that.
-#if defined(__AVX512F__)
-constexpr int kRegisterBytes = 64;
-#elif defined(__AVX__)
-constexpr int kRegisterBytes = 32;
-#else
-constexpr int kRegisterBytes = 16;
-#endif
-template <class S>
-struct Register {
-  static constexpr int kWidth = kRegisterBytes / sizeof(S);
-  typedef S Vec __attribute__((vector_size(kRegisterBytes)));
-};
-template <class S>
-using Vec = typename Register<S>::Vec;
-
 // All channels of a register, or the first few and zeros.
 template <bool full, class S>
-inline Vec<S> load(const S* from, int width) {
-  Vec<S> r{};
-  if constexpr (full) {
-    std::memcpy(&r, from, sizeof r);
-  } else {
-    for (int i = 0; i < width; ++i) r[i] = from[i];
-  }
+inline Native<S> load(const S* from, int width) {
+  if constexpr (full) return Native<S>::load(from);
+  Native<S> r(S(0));
+  for (int i = 0; i < width; ++i) r[i] = from[i];
   return r;
 }
 template <bool full, class S>
-inline void store(S* to, Vec<S> x, int width) {
+inline void store(S* to, Native<S> x, int width) {
   if constexpr (full) {
-    std::memcpy(to, &x, sizeof x);
+    x.store(to);
   } else {
     for (int i = 0; i < width; ++i) to[i] = x[i];
   }
 }
 template <bool full, class S>
-inline void add(S* to, Vec<S> x, S weight, int width) {
+inline void add(S* to, Native<S> x, S weight, int width) {
   store<full, S>(to, load<full, S>(to, width) + weight * x, width);
 }
-
-// Interpolation is phrased as a + b * c, so that the compiler has no choice which product to fuse.
-template <class S>
-inline Vec<S> lerp(Vec<S> a, Vec<S> b, S t) { return a + t * (b - a); }
 
 // One level as the inner loops see it. A size of 1 has no second sample, so steps are 0 there.
 template <class S>
@@ -203,28 +163,27 @@ struct Places {
 };
 
 template <bool full, class S>
-inline Vec<S> feature(const LevelView<S>& level, const Places<S>& places, int i, int64_t channel, int width) {
-  Vec<S> value[kAxes], line[kAxes];
+inline Native<S> feature(const LevelView<S>& level, const Places<S>& places, int i, int64_t channel, int width) {
+  Native<S> value[kAxes], line[kAxes];
 #pragma GCC unroll 3
   for (int p = 0; p < kAxes; ++p) {
     const S *at = level.space + places.corner[p][i] + channel, *below = at + level.row;
     const S x = places.frac[kFast[p]][i], y = places.frac[kSlow[p]][i];
-    const Vec<S> top = lerp<S>(load<full>(at, width), load<full>(at + level.step, width), x);
-    const Vec<S> bottom = lerp<S>(load<full>(below, width), load<full>(below + level.step, width), x);
-    value[p] = lerp<S>(top, bottom, y);
+    value[p] = bilinear(load<full>(at, width), load<full>(at + level.step, width), load<full>(below, width),
+                        load<full>(below + level.step, width), x, y);
   }
 #pragma GCC unroll 3
   for (int a = 0; a < kAxes; ++a) {
     const S* at = level.lines + places.sample[a][i] + channel;
-    line[a] = lerp<S>(load<full>(at, width), load<full>(at + level.step, width), places.frac[a][i]);
+    line[a] = lerp(load<full>(at, width), load<full>(at + level.step, width), places.frac[a][i]);
   }
-  return (value[0] * value[1] * value[2]) * (line[0] * line[1] * line[2]);
+  return plane_product(value, line);
 }
 
 template <class S>
 void chunk_features(const LevelView<S>& level, const Chunk<S>& chunk, S* features, int64_t row_size) {
-  constexpr int kWidth = Register<S>::kWidth;
-  const Places<S> places(level, locate(chunk, level.size));
+  constexpr int kWidth = Native<S>::kSize;
+  const Places<S> places(level, locate_chunk(chunk, level.size));
   for (int i = 0; i < chunk.count; ++i) {
     S* to = features + chunk.index[i] * row_size;
     int64_t c = 0;
@@ -258,14 +217,9 @@ struct Scatter {
   Packet<S> line_weight[kAxes][2];
 
   Scatter(const LevelView<S>& level, const Cells<S>& cells) {
-    const Packet<S> one(S(1));
     for (int k = 0; k < kAxes; ++k) {
-      const Packet<S> x = cells.frac[kFast[k]], y = cells.frac[kSlow[k]];
-      corner_weight[k][0] = (one - x) * (one - y);
-      corner_weight[k][1] = x * (one - y);
-      corner_weight[k][2] = (one - x) * y;
-      corner_weight[k][3] = x * y;
-      line_weight[k][0] = one - cells.frac[k];
+      bilinear_weights(cells.frac[kFast[k]], cells.frac[kSlow[k]], corner_weight[k]);
+      line_weight[k][0] = Packet<S>(S(1)) - cells.frac[k];
       line_weight[k][1] = cells.frac[k];
       for (int i = 0; i < kLanes; ++i) line[k][i] = (k * level.size + cells.index[k][i]) * kLanes;
     }
@@ -275,39 +229,34 @@ struct Scatter {
 // Gradients by the three coordinates, a register of channels for each.
 template <class S>
 struct CoordGrad {
-  Vec<S> axis[kAxes];
+  Native<S> axis[kAxes];
 };
 
 // Adds the gradients by the planes of point i of a chunk, a register of channels; returns those by its coordinates, if
 // asked for.
 template <bool full, bool with_coords, class S>
 inline CoordGrad<S> point_gradients(const Task<S>& task, const Places<S>& places, const Scatter<S>& scatter, int i,
-                                    Vec<S> g, S* g_lines, int channel, int width) {
-  using V = Vec<S>;
+                                    Native<S> g, S* g_lines, int channel, int width) {
+  using V = Native<S>;
   const int64_t step = task.level.step, row = task.level.row;
-  V value[kAxes], by_fast[kAxes], by_slow[kAxes], line[kAxes], by_line[kAxes];
+  PlaneValue<V> plane[kAxes];
+  V line[kAxes], by_line[kAxes];
 #pragma GCC unroll 3
   for (int p = 0; p < kAxes; ++p) {
     const S *at = task.level.space + places.corner[p][i] + channel, *below = at + row;
     const S x = places.frac[kFast[p]][i], y = places.frac[kSlow[p]][i];
-    const V a = load<full>(at, width), b = load<full>(at + step, width);
-    const V c = load<full>(below, width), d = load<full>(below + step, width);
-    const V top = lerp<S>(a, b, x);
-    by_slow[p] = lerp<S>(c, d, x) - top;
-    by_fast[p] = lerp<S>(b - a, d - c, y);
-    value[p] = top + y * by_slow[p];
+    plane[p] = bilinear_slopes(load<full>(at, width), load<full>(at + step, width), load<full>(below, width),
+                               load<full>(below + step, width), x, y);
   }
 #pragma GCC unroll 3
   for (int a = 0; a < kAxes; ++a) {
     const S* at = task.level.lines + places.sample[a][i] + channel;
-    const V one = load<full>(at, width);
-    by_line[a] = load<full>(at + step, width) - one;
-    line[a] = one + places.frac[a][i] * by_line[a];
+    const V one = load<full>(at, width), two = load<full>(at + step, width);
+    by_line[a] = two - one;
+    line[a] = lerp(one, two, places.frac[a][i]);
   }
-  const V g_planes = g * (line[0] * line[1] * line[2]), g_times = g * (value[0] * value[1] * value[2]);
-  const V g_value[kAxes] = {g_planes * (value[1] * value[2]), g_planes * (value[0] * value[2]),
-                            g_planes * (value[0] * value[1])};
-  const V g_line[kAxes] = {g_times * (line[1] * line[2]), g_times * (line[0] * line[2]), g_times * (line[0] * line[1])};
+  V g_value[kAxes], g_line[kAxes];
+  plane_product_vjp(plane, line, g, g_value, g_line);
 #pragma GCC unroll 3
   for (int p = 0; p < kAxes; ++p) {
     if (!task.owns[p]) continue;
@@ -321,25 +270,22 @@ inline CoordGrad<S> point_gradients(const Task<S>& task, const Places<S>& places
     add<full, S>(of_line, g_line[p], scatter.line_weight[p][0][i], width);
     add<full, S>(of_line + (step ? kLanes : 0), g_line[p], scatter.line_weight[p][1][i], width);
   }
-  if constexpr (!with_coords) return {};
-  return {g_value[0] * by_fast[0] + g_value[1] * by_fast[1] + g_line[0] * by_line[0],
-          g_value[0] * by_slow[0] + g_value[2] * by_fast[2] + g_line[1] * by_line[1],
-          g_value[1] * by_slow[1] + g_value[2] * by_slow[2] + g_line[2] * by_line[2]};
+  CoordGrad<S> by_coords{};
+  if constexpr (with_coords) coordinate_vjp(plane, by_line, g_value, g_line, by_coords.axis);
+  return by_coords;
 }
 
 // Sums over channels, in a fixed order, times d index / d coordinate, which is 0 where the coordinate was clamped.
 template <class S>
 void store_coords(const Task<S>& task, const Chunk<S>& chunk, const CoordGrad<S>* grads, int64_t begin, int64_t count) {
-  constexpr int kWidth = Register<S>::kWidth, kFold = std::min(kWidth, 4);
-  const S half = static_cast<S>(task.level.size - 1) / 2;
+  constexpr int kWidth = Native<S>::kSize, kFold = std::min(kWidth, 4);
   for (int i = 0; i < chunk.count; ++i)
     for (int a = 0; a < kAxes; ++a) {
       S lanes[kWidth], sum = 0;
       std::memcpy(lanes, &grads[i].axis[a], sizeof lanes);
       for (int c = kFold; c < kWidth; ++c) lanes[c % kFold] += lanes[c];
       for (int c = 0; c < kFold; ++c) sum += lanes[c];
-      const S u = chunk.coords[a][i];
-      task.g_coords[a * count + begin + i] = u <= S(-1) || u >= S(1) ? S(0) : half * sum;
+      task.g_coords[a * count + begin + i] = locate_vjp(chunk.coords[a][i], task.level.size, sum);
     }
 }
 
@@ -365,14 +311,14 @@ void store_lines(const Task<S>& task, const S* g_lines) {
 // `g_lines`: room for the gradients of the task's lines.
 template <bool full, bool with_coords, class S>
 void run_task(const Task<S>& given, const std::vector<Chunk<S>>& chunks, int64_t count, int64_t row_size, S* g_lines) {
-  constexpr int kWidth = Register<S>::kWidth;
+  constexpr int kWidth = Native<S>::kSize;
   const Task<S> task = given;
   const int task_width = full ? kLanes : task.width;
   std::fill_n(g_lines, kAxes * task.level.size * kLanes, S(0));
   CoordGrad<S> g_coords[kLanes];
   for (size_t n = 0; n < chunks.size(); ++n) {
     const Chunk<S>& chunk = chunks[n];
-    const Cells<S> cells = locate(chunk, task.level.size);
+    const Cells<S> cells = locate_chunk(chunk, task.level.size);
     const Places<S> places(task.level, cells);
     const Scatter<S> scatter(task.level, cells);
     if (n + 1 < chunks.size())
@@ -383,7 +329,7 @@ void run_task(const Task<S>& given, const std::vector<Chunk<S>>& chunks, int64_t
 #pragma GCC unroll 4
       for (int c = 0; c < task_width; c += kWidth) {
         const int width = full ? kWidth : std::min(kWidth, task_width - c);
-        const Vec<S> g = load<full>(from + c, width);
+        const Native<S> g = load<full>(from + c, width);
         const auto part = point_gradients<full, with_coords>(task, places, scatter, i, g, g_lines, c, width);
         for (int a = 0; a < kAxes; ++a) sum.axis[a] += part.axis[a];
       }

@@ -3,6 +3,7 @@
 
 #include "cpu/kernels.hpp"
 #include "cpu/parallel.hpp"
+#include "cpu/simd.hpp"
 #include "math/projection.hpp"
 
 namespace dyngs {
@@ -16,9 +17,9 @@ Pinhole<S> load_pinhole(const GaussianViews<S>& in, const ProjectOptions<S>& opt
   const S* k = in.intrinsics + view * 9;
   Pinhole<S> cam;
   for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) cam.rotation[i][j] = m[4 * i + j];
-    cam.translation[i] = m[4 * i + 3];
+    for (int j = 0; j < 3; ++j) cam.rotation.m[i][j] = m[4 * i + j];
   }
+  cam.translation = {m[3], m[7], m[11]};
   cam.fx = k[0], cam.fy = k[4], cam.cx = k[2], cam.cy = k[5];
   cam.width = static_cast<S>(options.width), cam.height = static_cast<S>(options.height);
   return cam;
@@ -58,60 +59,28 @@ Loaded<S> load_gaussians(const GaussianViews<S>& in, int64_t first, int count) {
 }
 
 template <class S>
-Packet<S> ceil_lanes(Packet<S> x) {
-  Packet<S> r;
-  for (int i = 0; i < kLanes; ++i) r[i] = std::ceil(x[i]);
-  return r;
-}
-
-// Half extents in px where alpha can reach alpha_min: Mahalanobis^2 <= t = 2 ln(o / alpha_min) (methods: SnugBox).
-template <class S>
-struct Extent {
-  Packet<S> x, y;
-  Mask<S> visible;
-};
-
-template <class S>
-Extent<S> visible_extent(const Splat<Packet<S>>& splat, Packet<S> opacity, Mask<S> in_range,
-                         const ProjectOptions<S>& options) {
-  using P = Packet<S>;
-  const P limit(S(1e9));  // keeps the int32 radii defined
-  const P t = P(S(2)) * log_of(opacity / P(options.alpha_min));
-  Extent<S> e;
-  e.x = min_of(ceil_lanes(sqrt_of(t * splat.var_x)), limit);
-  e.y = min_of(ceil_lanes(sqrt_of(t * splat.var_y)), limit);
-  const P width(static_cast<S>(options.width)), height(static_cast<S>(options.height)), clip(options.radius_clip);
-  const P finite_limit(std::numeric_limits<S>::max());
-  // every comparison is false for NaN
-  e.visible = in_range & (t > P(S(0))) & ((e.x > clip) | (e.y > clip)) & (e.x > P(S(0))) & (e.y > P(S(0))) &
-              (splat.x + e.x > P(S(0))) & (splat.x - e.x < width) & (splat.y + e.y > P(S(0))) &
-              (splat.y - e.y < height) & (splat.u > P(S(0))) & (splat.u <= finite_limit) & (splat.v > P(S(0))) &
-              (splat.v <= finite_limit) & (abs_of(splat.w) <= finite_limit) &
-              (splat.compensation <= finite_limit);
-  return e;
-}
-
-template <class S>
 void project_block(const GaussianViews<S>& in, const ProjectOptions<S>& options, const Pinhole<S>& cam, int64_t view,
                    int64_t first, int count, const Projected<S>& out) {
   using P = Packet<S>;
   const Loaded<S> g = load_gaussians(in, first, count);
   Vec3<P> p = to_camera(cam, g.mean);
-  const Mask<S> in_range = (p.z > P(options.near)) & (p.z < P(options.far));
+  const PacketMask<S> in_range = (p.z > P(options.near)) & (p.z < P(options.far));
   p.z = select(in_range, p.z, P(S(1)));
   ProjectionState<P> state;
   const Splat<P> splat = project(cam, p, g.unit, g.scale, options.eps2d, state);
-  const P opacity = options.antialiased ? g.opacity * splat.compensation : g.opacity;
-  const Extent<S> e = visible_extent(splat, opacity, in_range, options);
-  const auto shown = [&](P x) { return select(e.visible, x, P(S(0))); };
+  const P opacity = options.antialiased ? g.opacity * splat.conic.compensation : g.opacity;
+  const Extent<P> e =
+      visible_extent(splat, opacity, Vec2<S>{cam.width, cam.height}, options.alpha_min, options.radius_clip);
+  const PacketMask<S> visible = in_range & e.visible;
+  const auto shown = [&](P x) { return select(visible, x, P(S(0))); };
   const int64_t row = view * in.num_gaussians + first;
   store_column(shown(splat.x), out.means2d, row, count, 2, 0);
   store_column(shown(splat.y), out.means2d, row, count, 2, 1);
   store_column(shown(splat.depth), out.depths, row, count, 1, 0);
-  store_column(shown(splat.u), out.factors, row, count, 3, 0);
-  store_column(shown(splat.w), out.factors, row, count, 3, 1);
-  store_column(shown(splat.v), out.factors, row, count, 3, 2);
-  store_column(shown(splat.compensation), out.compensations, row, count, 1, 0);
+  store_column(shown(splat.conic.u), out.factors, row, count, 3, 0);
+  store_column(shown(splat.conic.w), out.factors, row, count, 3, 1);
+  store_column(shown(splat.conic.v), out.factors, row, count, 3, 2);
+  store_column(shown(splat.conic.compensation), out.compensations, row, count, 1, 0);
   const P rx = shown(e.x), ry = shown(e.y);
   for (int i = 0; i < count; ++i) {
     out.radii[2 * (row + i)] = static_cast<int32_t>(rx[i]);
@@ -135,7 +104,7 @@ void backward_view(const Pinhole<S>& cam, const Loaded<S>& g, const ProjectOptio
   for (int i = 0; i < count; ++i)
     if (radii[2 * (row + i)] > 0) drawn[i] = S(1), any_drawn = true;
   if (!any_drawn) return;
-  const Mask<S> visible = drawn > P(S(0));
+  const PacketMask<S> visible = drawn > P(S(0));
   const auto load = [&](const S* rows, int stride, int c) {
     return select(visible, load_column(rows, row, count, stride, c), P(S(0)));
   };
@@ -145,15 +114,12 @@ void backward_view(const Pinhole<S>& cam, const Loaded<S>& g, const ProjectOptio
   ProjectionState<P> state;
   const Splat<P> splat = project(cam, p, g.unit, g.scale, options.eps2d, state);
   const SplatGrad<P> gs{load(grads.means2d, 2, 0), load(grads.means2d, 2, 1), load(grads.depths, 1, 0),
-                        load(grads.factors, 3, 0), load(grads.factors, 3, 1), load(grads.factors, 3, 2),
-                        load(grads.compensations, 1, 0)};
+                        {load(grads.factors, 3, 0), load(grads.factors, 3, 1), load(grads.factors, 3, 2),
+                         load(grads.compensations, 1, 0)}};
   ProjectionGrad<P> d = project_vjp(cam, g.unit, g.scale, options.eps2d, state, splat, gs);
   const auto kept = [&](P x) { return select(visible, x, P(S(0))); };  // culled lanes may hold NaN
   d.cam = {kept(d.cam.x), kept(d.cam.y), kept(d.cam.z)};
-  const auto& r = cam.rotation;
-  sum.mean.x += P(r[0][0]) * d.cam.x + P(r[1][0]) * d.cam.y + P(r[2][0]) * d.cam.z;
-  sum.mean.y += P(r[0][1]) * d.cam.x + P(r[1][1]) * d.cam.y + P(r[2][1]) * d.cam.z;
-  sum.mean.z += P(r[0][2]) * d.cam.x + P(r[1][2]) * d.cam.y + P(r[2][2]) * d.cam.z;
+  sum.mean = sum.mean + transposed_times(cam.rotation, d.cam);
   sum.scale.x += kept(d.scale.x), sum.scale.y += kept(d.scale.y), sum.scale.z += kept(d.scale.z);
   sum.unit.w += kept(d.unit.w), sum.unit.x += kept(d.unit.x);
   sum.unit.y += kept(d.unit.y), sum.unit.z += kept(d.unit.z);

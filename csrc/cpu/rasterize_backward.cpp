@@ -1,10 +1,7 @@
-// Backward pass of the blending, back to front (Kerbl et al. 2023). With the background as a last, opaque layer and
-// s_i = <colour_i, dL/dC>, B = what lies behind i (as the same scalar), T_i the transmittance before i:
-//   dL/dalpha_i = T_i (s_i - B),   B <- B + alpha_i (s_i - B).
-// For each Gaussian only sums over pixels are needed: of p = alpha dL/dalpha times 1, u, v, u dx, u dy, v dy (see
-// math/projection.hpp), and of alpha T times dL/dC. They are taken 16 Gaussians at a time after a transpose, added up per
-// tile entry, written to the entry's own slot, and finally summed per Gaussian in slot order: no atomics, the same bytes
-// for any thread count.
+// Backward pass of the blending, back to front (math/blend.hpp). For each Gaussian only sums over pixels are needed: the six
+// moments of p = dL/dlog alpha, and of the blending weights times dL/dC. They are taken 16 Gaussians at a time after a
+// transpose, added up per tile entry, written to the entry's own slot, and finally summed per Gaussian in slot order: no
+// atomics, the same bytes for any thread count.
 //
 // The centre may lie far outside the picture, 1e5 px where the splat is 1 px wide. Moments about it would be differences of
 // numbers 1e10 times larger than they are. So a tile sums moments in x, y about the point of the tile nearest to the centre,
@@ -19,31 +16,25 @@
 namespace dyngs {
 namespace {
 
-enum Moment { kOne, kDx, kDy, kDxDx, kDxDy, kDyDy, kMoments };  // within a tile
-enum SlotMoment { kP, kU, kV, kUDx, kUDy, kVDy };                  // in a slot
-static_assert(kVDy + 1 == kMoments);
 constexpr int kMaxFields = 48;  // moments, channels, two absolute gradients; padded to whole packets
-static_assert(kMoments + kMaxChannels + 2 <= kMaxFields);
+static_assert(kBlendSums + kMaxChannels + 2 <= kMaxFields);
 
 // Fields of one entry's gradient record: moments, D colours, then |d mean x|, |d mean y| if asked for.
 struct Layout {
   int channels;
   bool absolute;
-  int fields() const { return kMoments + channels + (absolute ? 2 : 0); }
+  int fields() const { return kBlendSums + channels + (absolute ? 2 : 0); }
   int packets() const { return (fields() + kLanes - 1) / kLanes; }
 };
 
-template <class S>
-struct Point { S x, y; };
-
 // The pixel centres of a tile nearest to a point, and those of the picture.
 template <class S>
-Point<S> nearest_in_tile(const TileFrame<S>& frame, S x, S y) {
+Vec2<S> nearest_in_tile(const TileFrame<S>& frame, S x, S y) {
   const S x0 = static_cast<S>(frame.x0) + S(0.5), y0 = static_cast<S>(frame.y0) + S(0.5), side = S(kTile - 1);
   return {std::clamp(x, x0, x0 + side), std::clamp(y, y0, y0 + side)};
 }
 template <class S>
-Point<S> nearest_in_picture(const Splats<S>& s, S x, S y) {
+Vec2<S> nearest_in_picture(const Splats<S>& s, S x, S y) {
   return {std::clamp(x, S(0), static_cast<S>(s.width)), std::clamp(y, S(0), static_cast<S>(s.height))};
 }
 
@@ -67,7 +58,8 @@ struct Scratch {
 // A block's pixels: loss gradients and the running state of the backward recursion.
 template <class S>
 struct BlockPixels {
-  Packet<S> transmittance, behind, threshold;
+  BlendBehind<Packet<S>> behind;
+  Packet<S> threshold;
   Packet<S> grad[kMaxChannels];               // dL/dC per channel, lane: pixel
   S grad_rows[kMaxChannels][kLanes];          // the same, to broadcast one pixel
   int32_t stop[kLanes];
@@ -78,21 +70,21 @@ template <class S>
 BlockPixels<S> load_pixels(const Splats<S>& s, const TileFrame<S>& frame, int block, const ImageGrads<S>& image) {
   BlockPixels<S> b;
   const int channels = s.channels;
-  b.transmittance = Packet<S>(S(1)), b.behind = Packet<S>(S(0));
+  b.behind = {Packet<S>(S(1)), Packet<S>(S(0))};
   b.threshold = pixel_threshold(s, frame, block);
   std::fill(b.stop, b.stop + kLanes, 0);
   for (int c = 0; c < channels; ++c) b.grad[c] = Packet<S>(S(0));
   const S* background = image.background ? image.background + frame.view * channels : nullptr;
   for_each_pixel(s, frame, block, [&](int i, int64_t pixel) {
-    b.transmittance[i] = image.final_transmittance[pixel];
+    b.behind.transmittance[i] = image.final_transmittance[pixel];
     b.stop[i] = image.stop[pixel];
     b.last = std::max(b.last, b.stop[i]);
-    S behind = image.transmittance[pixel];
+    S light = image.transmittance[pixel];
     for (int c = 0; c < channels; ++c) {
       b.grad[c][i] = image.color[pixel * channels + c];
-      if (background) behind += background[c] * b.grad[c][i];
+      if (background) light += background[c] * b.grad[c][i];
     }
-    b.behind[i] = behind;
+    b.behind.light[i] = light;
   });
   for (int c = 0; c < channels; ++c) b.grad[c].store(b.grad_rows[c]);
   return b;
@@ -103,22 +95,16 @@ BlockPixels<S> load_pixels(const Splats<S>& s, const TileFrame<S>& frame, int bl
 template <class S>
 void add_moments(const Packet<S> (&p)[kLanes], const Batch<S>& batch, Packet<S>* out) {
   using P = Packet<S>;
-  P one(S(0)), x(S(0)), y(S(0)), xx(S(0)), xy(S(0)), yy(S(0));
+  const P zero(S(0));
+  P sum[] = {zero, zero, zero, zero, zero, zero};
   for (int r = 0; r < kBlockSide; ++r) {
     const P &a = p[4 * r], &b = p[4 * r + 1], &c = p[4 * r + 2], &d = p[4 * r + 3];
     const P row = (a + b) + (c + d), row_x = b + P(S(2)) * c + P(S(3)) * d;
     const P fy(static_cast<S>(r)), fyy(static_cast<S>(r * r));
-    one += row, x += row_x, xx += b + P(S(4)) * c + P(S(9)) * d;
-    y += fy * row, xy += fy * row_x, yy += fyy * row;
+    sum[kOne] += row, sum[kX] += row_x, sum[kXX] += b + P(S(4)) * c + P(S(9)) * d;
+    sum[kY] += fy * row, sum[kXY] += fy * row_x, sum[kYY] += fyy * row;
   }
-  const P &dx = batch.dx, &dy = batch.dy;
-  const P sum_dx = dx * one - x, sum_dy = dy * one - y;
-  out[kOne] = one;
-  out[kDx] = sum_dx;
-  out[kDy] = sum_dy;
-  out[kDxDx] = dx * (sum_dx - x) + xx;
-  out[kDxDy] = dx * sum_dy - dy * x + xy;
-  out[kDyDy] = dy * (sum_dy - y) + yy;
+  moments_about(sum, batch.dx, batch.dy, out);
 }
 
 // Sums over the block's pixels of |p d(log alpha)/d(mean)|: absolute values do not factor into moments.
@@ -128,18 +114,18 @@ void add_absolute(const Packet<S> (&p)[kLanes], const Batch<S>& batch, const Chu
   using P = Packet<S>;
   P u, w, v, first_a, first_b;
   for (int i = 0; i < kLanes; ++i) {
-    const Record<S>& g = chunk.records[batch.index[i]];
+    const BlendGaussian<S>& g = chunk.gaussians[batch.index[i]];
     u[i] = g.u, w[i] = g.w, v[i] = g.v;
     first_a[i] = g.u * (g.x - px) + g.w * (g.y - py), first_b[i] = g.v * (g.y - py);
   }
   P sum_x(S(0)), sum_y(S(0));
   for (int i = 0; i < kLanes; ++i) {
     const P x(static_cast<S>(i % kBlockSide)), y(static_cast<S>(i / kBlockSide));
-    const P a = first_a - u * x - w * y;
-    sum_x += abs_of(p[i] * u * a);
-    sum_y += abs_of(p[i] * (w * a + v * (first_b - v * y)));
+    const Vec2<P> slope = slope_by_mean(p[i], u, w, v, whitened(u, w, v, Vec2<P>{first_a, first_b}, x, y));
+    sum_x += abs(slope.x);
+    sum_y += abs(slope.y);
   }
-  const P unscale(S(2) / S(1.4426950408889634));  // the records hold u, w, v times sqrt(log2(e) / 2)
+  const P unscale(S(2) / S(kLog2E));  // a BlendGaussian holds u, w, v times sqrt(log2(e) / 2)
   out[0] = sum_x * unscale;
   out[1] = sum_y * unscale;
 }
@@ -164,9 +150,9 @@ void flush(const Layout& layout, S px, S py, const BlockPixels<S>& pixels, Scrat
       even += batch.weight[i] * Packet<S>(pixels.grad_rows[c][i]);
       odd += batch.weight[i + 1] * Packet<S>(pixels.grad_rows[c][i + 1]);
     }
-    fields[kMoments + c] = even + odd;
+    fields[kBlendSums + c] = even + odd;
   }
-  if (layout.absolute) add_absolute(batch.p, batch, scratch.chunk, px, py, fields + kMoments + layout.channels);
+  if (layout.absolute) add_absolute(batch.p, batch, scratch.chunk, px, py, fields + kBlendSums + layout.channels);
   const int packets = layout.packets();
   for (int i = layout.fields(); i < packets * kLanes; ++i) fields[i] = Packet<S>(S(0));
   for (int k = 0; k < packets; ++k) {
@@ -193,54 +179,40 @@ void block_backward(const Splats<S>& s, const Layout& layout, const TileFrame<S>
   const S px = frame.block_x[block], py = frame.block_y[block];
   const int channels = D == kDynamic ? layout.channels : D;
   const LaneOffsets<S> lane;
-  const P alpha_max(s.alpha_max), one(S(1)), zero(S(0));
+  const P alpha_max(s.alpha_max);
   const P stop = relative_stop(pixels, chunk_begin);
   Batch<S>& batch = scratch.batch;
-  P transmittance = pixels.transmittance, behind = pixels.behind;
+  BlendBehind<P> behind = pixels.behind;
   for (int k = listed - 1; k >= 0; --k) {
     const int i = scratch.list[k];
-    const Record<S>& g = scratch.chunk.records[i];
-    const S dx = g.x - px, dy = g.y - py;
-    const P x = log2_alpha(g, dx, dy, lane);
-    const Mask<S> drawn = (x >= pixels.threshold) & (P(static_cast<S>(i)) < stop);
-    const P raw = exp2_of(x);
-    const P alpha = select(drawn, min_of(raw, alpha_max), zero);
-    const P restore = one / (one - alpha);  // alpha <= alpha_max < 1; outside the chain of dependences
-    transmittance *= restore;
+    const BlendGaussian<S>& g = scratch.chunk.gaussians[i];
+    const P x = log2_alpha(g, g.x - px, g.y - py, lane.x, lane.y);
+    const PacketMask<S> drawn = (x >= pixels.threshold) & (P(static_cast<S>(i)) < stop);
+    const P raw = exp2(x);
+    const P alpha = clamped_alpha(raw, alpha_max, drawn);
     const S* color = scratch.chunk.template color<D>(i);
     P shade(S(0));
     for (int c = 0; c < channels; ++c) shade += P(color[c]) * pixels.grad[c];
-    const P gap = shade - behind;
-    const P weight = alpha * transmittance;
-    behind += alpha * gap;
-    batch.p[batch.count] = select(raw < alpha_max, weight * gap, zero);  // the clamp stops the gradient
-    batch.weight[batch.count] = weight;
-    const Point<S> anchor = nearest_in_tile(frame, g.x, g.y);
+    const BlendGrad<P> grad = blend_vjp(raw, alpha, alpha_max, shade, behind);
+    batch.p[batch.count] = grad.by_log_alpha;
+    batch.weight[batch.count] = grad.weight;
+    const Vec2<S> anchor = nearest_in_tile(frame, g.x, g.y);
     batch.dx[batch.count] = anchor.x - px, batch.dy[batch.count] = anchor.y - py;
     batch.index[batch.count] = i;
     if (++batch.count == kLanes) flush(layout, px, py, pixels, scratch);
   }
   flush(layout, px, py, pixels, scratch);
-  pixels.transmittance = transmittance;
   pixels.behind = behind;
 }
 
 // Moments of one entry about its anchor in the tile, turned into those of a slot.
 template <class S>
-void write_moments(const Splats<S>& s, const TileFrame<S>& frame, const Record<S>& g, const S* sum, S* to) {
-  const double unscale = 1 / std::sqrt(0.5 * 1.4426950408889634);  // the records hold u, w, v times sqrt(log2(e) / 2)
+void write_moments(const Splats<S>& s, const TileFrame<S>& frame, const BlendGaussian<S>& g, const S* sum, S* to) {
+  const double unscale = 1 / std::sqrt(0.5 * kLog2E);  // a BlendGaussian holds u, w, v times sqrt(log2(e) / 2)
   const double u = g.u * unscale, w = g.w * unscale, v = g.v * unscale;
-  const Point<S> anchor = nearest_in_tile(frame, g.x, g.y), near = nearest_in_picture(s, g.x, g.y);
-  const double far_x = double(g.x) - anchor.x, far_y = double(g.y) - anchor.y;  // 0 where the centre is in the tile
-  const double first_u = u * far_x + w * far_y, first_v = v * far_y;
-  const double dx = sum[kDx], dy = sum[kDy];
-  const double sum_u = first_u * sum[kOne] + u * dx + w * dy, sum_v = first_v * sum[kOne] + v * dy;
-  const double x = double(near.x) - anchor.x, y = double(near.y) - anchor.y;
-  to[kP] = sum[kOne];
-  to[kU] = static_cast<S>(sum_u), to[kV] = static_cast<S>(sum_v);
-  to[kUDx] = static_cast<S>(first_u * dx + u * sum[kDxDx] + w * sum[kDxDy] + x * sum_u);
-  to[kUDy] = static_cast<S>(first_u * dy + u * sum[kDxDy] + w * sum[kDyDy] + y * sum_u);
-  to[kVDy] = static_cast<S>(first_v * dy + v * sum[kDyDy] + y * sum_v);
+  const Vec2<S> anchor = nearest_in_tile(frame, g.x, g.y), near = nearest_in_picture(s, g.x, g.y);
+  const Vec2<double> far{double(g.x) - anchor.x, double(g.y) - anchor.y};  // 0 where the centre is in the tile
+  blend_sums(sum, u, w, v, far, {double(near.x) - anchor.x, double(near.y) - anchor.y}, to);
 }
 
 template <class S>
@@ -250,8 +222,8 @@ void store_chunk(const Splats<S>& s, const Layout& layout, const TileFrame<S>& f
   for (int i = 0; i < scratch.chunk.count; ++i) {
     S* to = slots + int64_t{entries.slots[begin + i]} * fields;
     const S* from = reinterpret_cast<const S*>(scratch.sums + i * packets);
-    write_moments(s, frame, scratch.chunk.records[i], from, to);
-    for (int f = kMoments; f < fields; ++f) to[f] = from[f];
+    write_moments(s, frame, scratch.chunk.gaussians[i], from, to);
+    for (int f = kBlendSums; f < fields; ++f) to[f] = from[f];
   }
 }
 
@@ -288,24 +260,20 @@ void all_tiles_backward(const Splats<S>& s, const Layout& layout, const Entries&
   });
 }
 
-// d(-(u^2 + v^2) / 2) with u = U dx + W dy, v = V dy, dx = mean - pixel, summed over pixels with weights p.
 template <class S>
 void write_gaussian(const Splats<S>& s, int64_t row, const double* sum, const Layout& layout, const SplatGrads<S>& out) {
-  const double u = s.factors[3 * row], w = s.factors[3 * row + 1], v = s.factors[3 * row + 2];
   const S mean_x = s.means2d[2 * row], mean_y = s.means2d[2 * row + 1];
-  const Point<S> near = nearest_in_picture(s, mean_x, mean_y);
-  const double far_x = double(mean_x) - near.x, far_y = double(mean_y) - near.y;
-  const S grad_x = static_cast<S>(-u * sum[kU]), grad_y = static_cast<S>(-(w * sum[kU] + v * sum[kV]));
-  out.means2d[2 * row] = grad_x, out.means2d[2 * row + 1] = grad_y;
-  out.factors[3 * row] = static_cast<S>(-(sum[kUDx] + far_x * sum[kU]));
-  out.factors[3 * row + 1] = static_cast<S>(-(sum[kUDy] + far_y * sum[kU]));
-  out.factors[3 * row + 2] = static_cast<S>(-(sum[kVDy] + far_y * sum[kV]));
-  const double opacity = s.opacities[row];
-  out.opacities[row] = opacity > 0 ? static_cast<S>(sum[kP] / opacity) : S(0);
-  const double* channels = sum + kMoments;
+  const Vec2<S> near = nearest_in_picture(s, mean_x, mean_y);
+  const S* factor = s.factors + 3 * row;
+  const BlendSplatGrad<S> grad = splat_grad<S>(sum, factor[0], factor[1], factor[2], s.opacities[row],
+                                               {double(mean_x) - near.x, double(mean_y) - near.y});
+  out.means2d[2 * row] = grad.mean.x, out.means2d[2 * row + 1] = grad.mean.y;
+  out.factors[3 * row] = grad.u, out.factors[3 * row + 1] = grad.w, out.factors[3 * row + 2] = grad.v;
+  out.opacities[row] = grad.opacity;
+  const double* channels = sum + kBlendSums;
   for (int c = 0; c < layout.channels; ++c) out.colors[row * layout.channels + c] = static_cast<S>(channels[c]);
   if (out.probe == nullptr) return;
-  out.probe[4 * row] = grad_x, out.probe[4 * row + 1] = grad_y;
+  out.probe[4 * row] = grad.mean.x, out.probe[4 * row + 1] = grad.mean.y;
   for (int k = 0; k < 2; ++k)
     out.probe[4 * row + 2 + k] = layout.absolute ? static_cast<S>(channels[layout.channels + k]) : S(0);
 }

@@ -25,7 +25,7 @@ struct Scratch {
 
 // Pixels that the Gaussian would take below transmittance_min are full: it is not added and they take no more.
 template <class S, int D>
-void mark_full(Mask<S> full, int32_t position, BlockState<S, D>& state) {
+void mark_full(PacketMask<S> full, int32_t position, BlockState<S, D>& state) {
   uint32_t bits = to_bits(full);
   state.threshold = select(full, Packet<S>(std::numeric_limits<S>::infinity()), state.threshold);
   for (; bits != 0; bits &= bits - 1) state.stop[__builtin_ctz(bits)] = position;
@@ -42,20 +42,18 @@ void blend_block(const Splats<S>& s, const TileFrame<S>& frame, int block, int32
   BlockState<S, D> state = block_state;
   for (int k = 0; k < listed; ++k) {
     const int i = scratch.list[k];
-    const Record<S>& g = scratch.chunk.records[i];
-    const P x = log2_alpha(g, g.x - px, g.y - py, lane);
-    const Mask<S> drawn = x >= state.threshold;
-    const P alpha = select(drawn, min_of(exp2_of(x), alpha_max), zero);
+    const BlendGaussian<S>& g = scratch.chunk.gaussians[i];
+    const P x = log2_alpha(g, g.x - px, g.y - py, lane.x, lane.y);
+    const PacketMask<S> drawn = x >= state.threshold;
+    const P alpha = clamped_alpha(exp2(x), alpha_max, drawn);
     const P before = state.transmittance;
-    P weight = alpha * before;
-    P next = state.transmittance - weight;
-    const Mask<S> full = next < transmittance_min;  // alpha > 0 there: what is left was not below it before
-    if (any(full)) [[unlikely]] {
-      mark_full(full, chunk_begin + i, state);
-      weight = select(full, zero, weight);
-      next = select(full, before, next);
+    BlendStep<P> step = blend_step(alpha, before, transmittance_min);
+    if (any(step.full)) [[unlikely]] {
+      mark_full(step.full, chunk_begin + i, state);
+      leave_full(before, step);
     }
-    state.transmittance = next;
+    const P weight = step.weight;
+    state.transmittance = step.transmittance;
     const S* color = scratch.chunk.template color<D>(i);
     for (int c = 0; c < channels; ++c) state.color[c] += weight * P(color[c]);
     if constexpr (kTally == Tally::kWeights) scratch.sums[i] += horizontal_sum(weight);
@@ -63,12 +61,11 @@ void blend_block(const Splats<S>& s, const TileFrame<S>& frame, int block, int32
       scratch.sums[i] += static_cast<S>(__builtin_popcount(to_bits(weight > zero)));
     if constexpr (kTally == Tally::kLanes) scratch.sums[i] += static_cast<S>(kLanes);
     if constexpr (kTally == Tally::kSquaredSlopes) {
-      // With s the colour, T the transmittance before it: behind = T (alpha s + (1 - alpha) B), dI/dalpha = T (s - B).
       const S shade = std::accumulate(color, color + channels, S(0));
       const P own = weight * P(shade);
-      const P slope = before * P(shade) - (state.behind - own) / (P(S(1)) - alpha);
-      const P scaled = P(std::exp2(g.log2_opacity)) * slope;
-      const Mask<S> free = drawn & !full & (alpha < alpha_max);  // the clamp stops the gradient
+      const P slope = slope_by_alpha(alpha, before, P(shade), own, state.behind);
+      const P scaled = P(exp2(g.log2_opacity)) * slope;
+      const PacketMask<S> free = drawn & !step.full & (alpha < alpha_max);  // the clamp stops the gradient
       scratch.sums[i] += horizontal_sum(select(free, scaled * scaled, zero));
       state.behind -= own;
     }

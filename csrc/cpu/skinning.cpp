@@ -11,7 +11,8 @@
 #include <vector>
 
 #include "cpu/parallel.hpp"
-#include "math/projection.hpp"
+#include "cpu/simd.hpp"
+#include "math/skinning.hpp"
 
 namespace dyngs {
 namespace {
@@ -21,11 +22,7 @@ constexpr int64_t kNodeGrain = 64;
 constexpr int64_t kMaxParts = 16;
 
 template <class S>
-struct FourOf {
-  typedef S Vec __attribute__((vector_size(4 * sizeof(S))));
-};
-template <class S>
-using Four = typename FourOf<S>::Vec;
+using Four = Simd<S, 4>;
 
 // Rows of the table: the place with minus the rate of decay in the spare lane; R - I, by column in the forward and by
 // row in the backward pass; and in the forward pass the shift and the values.
@@ -35,21 +32,24 @@ constexpr int kByTurn = 0, kByShift = 3, kByValues = 4;
 
 template <class S>
 inline Four<S> load_some(const S* from, int64_t count) {
-  Four<S> r{};
-  if (count >= 4) {
-    std::memcpy(&r, from, sizeof r);
-  } else {
-    for (int i = 0; i < count; ++i) r[i] = from[i];
-  }
+  if (count >= 4) return Four<S>::load(from);
+  Four<S> r(S(0));
+  for (int i = 0; i < count; ++i) r[i] = from[i];
   return r;
 }
 template <class S>
-inline Four<S> load_three(const S* from) { return Four<S>{from[0], from[1], from[2], S(0)}; }
+inline Four<S> four(S x, S y, S z, S w) {
+  return typename Four<S>::Vec{x, y, z, w};
+}
+template <class S>
+inline Four<S> load_three(const S* from) {
+  return four(from[0], from[1], from[2], S(0));
+}
 
 template <class S>
 inline void store_some(S* to, Four<S> x, int64_t count) {
   if (count >= 4) {
-    std::memcpy(to, &x, sizeof x);
+    x.store(to);
   } else {
     for (int i = 0; i < count; ++i) to[i] = x[i];
   }
@@ -59,25 +59,7 @@ inline int64_t fours(int64_t width) { return (width + 3) / 4; }
 
 template <class S>
 Quat<S> quaternion(const SkinNodes<S>& nodes, int64_t node) {
-  const S* q = nodes.motion + 7 * node + 3;
-  return {q[0], q[1], q[2], q[3]};
-}
-
-// R - I, whose diagonal would suffer from rounding if 1 were added and taken away. NaN stays NaN.
-template <class S>
-Mat3<S> turn_of(const Quat<S>& q) {
-  if (std::isnan(q.w) || std::isnan(q.x) || std::isnan(q.y) || std::isnan(q.z)) {
-    Mat3<S> unknown;
-    for (auto& row : unknown.m) std::fill(row, row + 3, std::numeric_limits<S>::quiet_NaN());
-    return unknown;
-  }
-  S inv_norm;
-  const Quat<S> n = normalize(q, inv_norm);
-  Mat3<S> r = rotation_matrix(n);
-  r.m[0][0] = S(-2) * (n.y * n.y + n.z * n.z);
-  r.m[1][1] = S(-2) * (n.x * n.x + n.z * n.z);
-  r.m[2][2] = S(-2) * (n.x * n.x + n.y * n.y);
-  return r;
+  return load_quat(nodes.motion + 7 * node + 3);
 }
 
 template <class S>
@@ -94,10 +76,8 @@ Table<S> node_table(const SkinNodes<S>& nodes, bool forward) {
   Table<S> table{stride, std::vector<Four<S>>(nodes.count * stride)};
   for (int64_t s = 0; s < nodes.count; ++s) {
     Four<S>* row = table.rows.data() + s * stride;
-    const double radius = nodes.radii[s];
-    const double rate = 0.5 * 1.4426950408889634 / (radius * radius);  // of powers of two
     row[kPlace] = load_three(nodes.positions + 3 * s);
-    row[kPlace][3] = -static_cast<S>(std::min<double>(rate, std::numeric_limits<S>::max()));
+    row[kPlace][3] = weight_decay<S>(nodes.radii[s]);
     const Mat3<S> turn = turn_of(quaternion(nodes, s));
     for (int i = 0; i < 3; ++i)
       for (int j = 0; j < 3; ++j) row[kTurn + i][j] = forward ? turn.m[j][i] : turn.m[i][j];
@@ -112,13 +92,11 @@ Table<S> node_table(const SkinNodes<S>& nodes, bool forward) {
 // The exponents of one point's weights, as powers of two, the largest 0. Distances that overflow all count as equal.
 template <class S>
 inline void exponents(const Table<S>& table, const S* coords, const int64_t* followed, int64_t num_nodes, S* to) {
-  constexpr S kLowest = std::numeric_limits<S>::lowest();
   const Four<S> x = load_three(coords);
-  S top = kLowest;
+  S top = std::numeric_limits<S>::lowest();
   for (int64_t b = 0; b < num_nodes; ++b) {
-    const Four<S> place = table[followed[b]][kPlace], arm = x - place;
-    const S exponent = (arm[0] * arm[0] + arm[1] * arm[1] + arm[2] * arm[2]) * place[3];
-    to[b] = exponent < kLowest ? kLowest : exponent;  // NaN stays
+    const Four<S> place = table[followed[b]][kPlace];
+    to[b] = weight_exponent(x - place, place[3]);
     top = top < to[b] ? to[b] : top;
   }
   for (int64_t b = 0; b < num_nodes; ++b) to[b] -= top;
@@ -127,7 +105,7 @@ inline void exponents(const Table<S>& table, const S* coords, const int64_t* fol
 // 2^x in place; NaN stays.
 template <class S>
 void exponentiate(S* values, int64_t count) {
-  const auto power = [](Packet<S> x) { return select(x == x, exp2_of(x), x); };
+  const auto power = [](Packet<S> x) { return select(x == x, exp2(x), x); };
   int64_t i = 0;
   for (; i + kLanes <= count; i += kLanes) power(Packet<S>::load(values + i)).store(values + i);
   if (i == count) return;
@@ -149,16 +127,14 @@ template <class S>
 inline void blend(const Table<S>& table, const S* coords, const int64_t* followed, int64_t num_nodes, const S* weights,
                   S* offset, S* blended, int64_t width) {
   const Four<S> x = load_three(coords);
-  Four<S> sum{};
+  Four<S> sum(S(0));
   for (int64_t b = 0; b < num_nodes; ++b) {
     const Four<S>* row = table[followed[b]];
-    const Four<S> arm = x - row[kPlace];
-    const Four<S> swing = row[kTurn] * arm[0] + row[kTurn + 1] * arm[1] + row[kTurn + 2] * arm[2];
-    sum += weights[b] * (swing + row[kShift]);
+    sum += weights[b] * moved_by(row + kTurn, row[kShift], x - row[kPlace]);
   }
   store_some<S>(offset, sum, 3);
   for (int64_t k = 0; k < fours(width); ++k) {
-    Four<S> values{};
+    Four<S> values(S(0));
     for (int64_t b = 0; b < num_nodes; ++b) values += weights[b] * table[followed[b]][kValues + k];
     store_some<S>(blended + 4 * k, values, width - 4 * k);
   }
@@ -173,16 +149,12 @@ void gather_part(const Table<S>& table, const SkinPoints<S>& points, const Skinn
     const int64_t* followed = points.followed + m * points.nodes;
     const S* weights = g.weights + m * points.nodes;
     const Four<S> x = load_three(points.coords + 3 * m), by_offset = load_three(g.offset + 3 * m);
-    Four<S> by_point{};
+    Four<S> by_point(S(0));
     for (int64_t b = 0; b < points.nodes; ++b) {
       const Four<S>* row = table[followed[b]];
       Four<S>* sum = sums + followed[b] * stride;
       const Four<S> arm = x - row[kPlace], share = weights[b] * by_offset;
-      for (int i = 0; i < 3; ++i) {
-        by_point += row[kTurn + i] * share[i];
-        sum[kByTurn + i] += share * arm[i];
-      }
-      sum[kByShift] += share;
+      moved_by_vjp(row + kTurn, arm, share, sum + kByTurn, sum[kByShift], by_point);
     }
     if (g_points != nullptr) store_some<S>(g_points + 3 * m, by_point, 3);
     for (int64_t k = 0; k < fours(width); ++k) {
@@ -198,12 +170,10 @@ void write_node(const SkinNodes<S>& nodes, int64_t node, const Four<S>* sum, con
   Mat3<S> by_turn;
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) by_turn.m[i][j] = sum[kByTurn + j][i];
-  S inv_norm;
-  const Quat<S> unit = normalize(quaternion(nodes, node), inv_norm);
-  const Quat<S> by_quat = normalize_vjp(unit, inv_norm, rotation_matrix_vjp(unit, by_turn));
+  const Quat<S> by_quat = turn_vjp(quaternion(nodes, node), by_turn);
   S* to = grads.motion + 7 * node;
   store_some<S>(to, sum[kByShift], 3);
-  store_some<S>(to + 3, Four<S>{by_quat.w, by_quat.x, by_quat.y, by_quat.z}, 4);
+  store_some<S>(to + 3, four(by_quat.w, by_quat.x, by_quat.y, by_quat.z), 4);
   for (int64_t k = 0; k < fours(nodes.width); ++k)
     store_some<S>(grads.values + node * nodes.width + 4 * k, sum[kByValues + k], nodes.width - 4 * k);
 }
@@ -247,7 +217,7 @@ void skinning_backward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, c
   const auto sums = std::make_unique_for_overwrite<Four<S>[]>(parts * size);
   parallel_for(parts, 1, num_threads, [&](int64_t part, int64_t) {
     Four<S>* own = sums.get() + part * size;
-    std::fill(own, own + size, Four<S>{});
+    std::fill(own, own + size, Four<S>(S(0)));
     gather_part(table, points, g, nodes.width, points.count * part / parts, points.count * (part + 1) / parts, own,
                 grads.points);
   });

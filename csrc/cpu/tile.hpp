@@ -7,19 +7,14 @@
 #include <limits>
 
 #include "cpu/kernels.hpp"
-#include "math/packet.hpp"
+#include "cpu/simd.hpp"
+#include "math/blend.hpp"
+#include "math/ellipse.hpp"
 
 namespace dyngs {
 
 inline constexpr int kBlockSide = 4, kBlocks = 16;
 inline constexpr int kChunk = 256;  // Gaussians copied at a time: their records stay in the L1 cache
-
-// One Gaussian as the pixel loop reads it. u, w, v are scaled by sqrt(log2(e) / 2), so that
-// alpha = 2^(log2_opacity - u'^2 - v'^2).
-template <class S>
-struct Record {
-  S x, y, u, w, v, log2_opacity;
-};
 
 inline constexpr int kDynamic = 0;        // number of channels known only at run time
 inline constexpr int kInlineChannels = 4;  // colours of up to this many channels are copied beside the records
@@ -27,7 +22,7 @@ inline constexpr int kInlineChannels = 4;  // colours of up to this many channel
 template <class S>
 struct Chunk {
   int count;
-  Record<S> records[kChunk];
+  BlendGaussian<S> gaussians[kChunk];
   S inline_colors[kChunk][kInlineChannels];
   const S* color_rows[kChunk];  // where D is dynamic
   uint16_t masks[kChunk];       // bit b: block b may be touched
@@ -89,25 +84,12 @@ TileFrame<S> tile_frame(const Splats<S>& s, int64_t tile) {
   return f;
 }
 
-template <class P>
-P clamp(P x, P lo, P hi) {
-  return min_of(max_of(x, lo), hi);
-}
-
-// Blocks (lanes) where u^2 + v^2 <= limit somewhere. The quadratic form is convex: its minimum over a box lies at the
-// centre if that is inside, else on the facing vertical or horizontal edge; both are minimised in closed form.
+// Blocks (lanes) that u^2 + v^2 <= limit may reach.
 template <class S>
-uint16_t touched_blocks(const TileFrame<S>& f, const Record<S>& g) {
+uint16_t touched_blocks(const TileFrame<S>& f, const BlendGaussian<S>& g) {
   using P = Packet<S>;
-  const P side(S(kBlockSide - 1)), gx(g.x), gy(g.y), u(g.u), w(g.w), v(g.v);
-  const P x0 = f.block_x - gx, y0 = f.block_y - gy, x1 = x0 + side, y1 = y0 + side;
-  const P zero(S(0));
-  const P edge_x = clamp(zero, x0, x1), edge_y = clamp(zero, y0, y1);
-  const P y_on_edge = clamp(P(-g.u * g.w / (g.w * g.w + g.v * g.v)) * edge_x, y0, y1);
-  const P x_on_edge = clamp(P(-g.w / g.u) * edge_y, x0, x1);
-  const P u1 = u * edge_x + w * y_on_edge, v1 = v * y_on_edge;
-  const P u2 = u * x_on_edge + w * edge_y, v2 = v * edge_y;
-  const P least = min_of(u1 * u1 + v1 * v1, u2 * u2 + v2 * v2);
+  const P side(S(kBlockSide - 1)), x0 = f.block_x - P(g.x), y0 = f.block_y - P(g.y);
+  const P least = least_in_box(g.u, g.w, g.v, x0, y0, x0 + side, y0 + side);
   const S slack = S(1e-3);  // the pixel test decides; this one may only err on the generous side
   return static_cast<uint16_t>(to_bits(least <= P(g.log2_opacity - f.log2_alpha_min + slack)) & f.inside);
 }
@@ -124,20 +106,17 @@ void prefetch(const Splats<S>& s, int64_t row) {
 
 // Copies entries [begin, begin + count) of a tile.
 template <int D, class S>
-void load_chunk(const Splats<S>& s, const Entries& entries, const TileFrame<S>& frame, int64_t begin, int count,
+[[gnu::noinline]] void load_chunk(const Splats<S>& s, const Entries& entries, const TileFrame<S>& frame, int64_t begin, int count,
                 Chunk<S>& chunk) {
-  const S scale = std::sqrt(S(0.5) * S(1.4426950408889634));
   chunk.count = count;
   for (int i = 0; i < count; ++i) {
     if (i + kPrefetch < count) prefetch(s, entries.gaussians[begin + i + kPrefetch]);
     const int64_t row = entries.gaussians[begin + i];
-    Record<S>& r = chunk.records[i];
-    r.x = s.means2d[2 * row], r.y = s.means2d[2 * row + 1];
-    r.u = s.factors[3 * row] * scale, r.w = s.factors[3 * row + 1] * scale, r.v = s.factors[3 * row + 2] * scale;
-    r.log2_opacity = std::log2(s.opacities[row]);
+    BlendGaussian<S>& g = chunk.gaussians[i];
+    g = blend_gaussian(s.means2d + 2 * row, s.factors + 3 * row, s.opacities[row]);
     chunk.color_rows[i] = s.colors + row * s.channels;
     for (int c = 0; c < D; ++c) chunk.inline_colors[i][c] = chunk.color_rows[i][c];
-    chunk.masks[i] = touched_blocks(frame, r);
+    chunk.masks[i] = touched_blocks(frame, g);
   }
   for (int i = count; i < std::min(kChunk, count + 16); ++i) chunk.masks[i] = 0;
 }
@@ -150,15 +129,6 @@ struct LaneOffsets {
     for (int i = 0; i < kLanes; ++i) x[i] = static_cast<S>(i % kBlockSide), y[i] = static_cast<S>(i / kBlockSide);
   }
 };
-
-// log2 of alpha before clamping, at a block's pixels; `dx`, `dy`: Gaussian centre minus the block's first pixel centre.
-template <class S>
-Packet<S> log2_alpha(const Record<S>& g, S dx, S dy, const LaneOffsets<S>& lane) {
-  using P = Packet<S>;
-  const P u = P(g.u * dx + g.w * dy) - P(g.u) * lane.x - P(g.w) * lane.y;
-  const P v = P(g.v * dy) - P(g.v) * lane.y;
-  return P(g.log2_opacity) - u * u - v * v;
-}
 
 // Infinite in lanes outside the image: no log2 alpha passes it.
 template <class S>

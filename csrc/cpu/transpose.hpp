@@ -2,7 +2,7 @@
 // of 16 Gaussians", so that sums over pixels need no horizontal adds.
 #pragma once
 
-#include "math/packet.hpp"
+#include "cpu/simd.hpp"
 
 namespace dyngs {
 

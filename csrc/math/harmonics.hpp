@@ -1,7 +1,7 @@
 // Real spherical harmonics up to degree 4 in the sign convention of 3DGS, and their derivatives.
 #pragma once
 
-#include "math/packet.hpp"
+#include "math/vec.hpp"
 
 namespace dyngs {
 
@@ -9,9 +9,8 @@ inline constexpr int kMaxShTerms = 25;
 
 // basis[k] for k < (degree + 1)^2 at the unit direction (x, y, z).
 template <class R>
-void sh_basis(int degree, R x, R y, R z, R* basis) {
-  using S = typename ScalarOf<R>::type;
-  const auto c = [](double value) { return R(S(value)); };
+DYNGS_HD void sh_basis(int degree, R x, R y, R z, R* basis) {
+  const auto c = [](double value) { return real<R>(value); };
   basis[0] = c(0.28209479177387814);
   if (degree < 1) return;
   basis[1] = c(-0.4886025119029199) * y;
@@ -47,9 +46,8 @@ void sh_basis(int degree, R x, R y, R z, R* basis) {
 
 // Sum over k of g[k] times the gradient of basis[k] with respect to (x, y, z), the polynomials taken as they stand.
 template <class R>
-void sh_basis_vjp(int degree, R x, R y, R z, const R* g, R& gx, R& gy, R& gz) {
-  using S = typename ScalarOf<R>::type;
-  const auto c = [](double value) { return R(S(value)); };
+DYNGS_HD void sh_basis_vjp(int degree, R x, R y, R z, const R* g, R& gx, R& gy, R& gz) {
+  const auto c = [](double value) { return real<R>(value); };
   gx = gy = gz = c(0);
   if (degree < 1) return;
   gy += c(-0.4886025119029199) * g[1];

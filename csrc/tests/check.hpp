@@ -88,6 +88,33 @@ inline double dot(const Values& a, const Values& b) {
   return sum;
 }
 
+using Function = std::function<Values(const Values&)>;
+
+inline void expect_near(const std::string& what, double got, double wanted, double tolerance) {
+  if (std::abs(got - wanted) <= tolerance * std::max(1.0, std::abs(wanted))) return;  // false for NaN
+  std::printf("FAILED %s: got %.17g, expected %.17g\n", what.c_str(), got, wanted);
+  ++failures;
+}
+
+// `gradient` must be the gradient of <cotangent, f(x)>.
+inline void expect_vjp(const std::string& what, const Function& f, const Values& x, const Values& cotangent,
+                const Values& gradient) {
+  const auto scalar = [&](const Values& at) {
+    const Values y = f(at);
+    double sum = 0;
+    for (size_t i = 0; i < y.size(); ++i) sum += cotangent[i] * y[i];
+    return sum;
+  };
+  for (size_t i = 0; i < x.size(); ++i) {
+    const double h = 1e-4;
+    Values far = x, near = x, farther = x, nearer = x;
+    far[i] += h, near[i] -= h, farther[i] += 2 * h, nearer[i] -= 2 * h;
+    // fourth order: truncation 1e-16 / 30 times the fifth derivative, rounding 1e-16 / 1e-4 times the value (1e3 px)
+    const double slope = (8 * (scalar(far) - scalar(near)) - (scalar(farther) - scalar(nearer))) / (12 * h);
+    expect_near(what + ", input " + std::to_string(i), gradient[i], slope, 1e-7);
+  }
+}
+
 // Ends the program with the code that CTest knows for "skipped" where the processor lacks what it was compiled for.
 inline void skip_unless_supported() {
 #if defined(DYNGS_NEEDS_v4)

@@ -1,7 +1,8 @@
-// The formulas of csrc/math: every hand-derived vjp against central differences in double, the forward passes against
-// plain formulas in long double, and packets against scalars. Prints what failed; the exit code is 1 if anything did.
+// Rotations, projection and harmonics of csrc/math: every hand-derived vjp against central differences in double, the
+// forward passes against plain formulas in long double, and packets against scalars. Prints what failed; the exit code is
+// 1 if anything did. test_formulas.cpp has the rest of the folder.
+#include "cpu/simd.hpp"
 #include "math/harmonics.hpp"
-#include "math/packet.hpp"
 #include "math/projection.hpp"
 #include "tests/check.hpp"
 
@@ -9,32 +10,6 @@ namespace {
 
 using namespace dyngs;
 using namespace check;
-using Function = std::function<Values(const Values&)>;
-
-void expect_near(const std::string& what, double got, double wanted, double tolerance) {
-  if (std::abs(got - wanted) <= tolerance * std::max(1.0, std::abs(wanted))) return;  // false for NaN
-  std::printf("FAILED %s: got %.17g, expected %.17g\n", what.c_str(), got, wanted);
-  ++failures;
-}
-
-// `gradient` must be the gradient of <cotangent, f(x)>.
-void expect_vjp(const std::string& what, const Function& f, const Values& x, const Values& cotangent,
-                const Values& gradient) {
-  const auto scalar = [&](const Values& at) {
-    const Values y = f(at);
-    double sum = 0;
-    for (size_t i = 0; i < y.size(); ++i) sum += cotangent[i] * y[i];
-    return sum;
-  };
-  for (size_t i = 0; i < x.size(); ++i) {
-    const double h = 1e-4;
-    Values far = x, near = x, farther = x, nearer = x;
-    far[i] += h, near[i] -= h, farther[i] += 2 * h, nearer[i] -= 2 * h;
-    // fourth order: truncation 1e-16 / 30 times the fifth derivative, rounding 1e-16 / 1e-4 times the value (1e3 px)
-    const double slope = (8 * (scalar(far) - scalar(near)) - (scalar(farther) - scalar(nearer))) / (12 * h);
-    expect_near(what + ", input " + std::to_string(i), gradient[i], slope, 1e-7);
-  }
-}
 
 Quat<double> quat(const Values& v, int at = 0) { return {v[at], v[at + 1], v[at + 2], v[at + 3]}; }
 Values values(const Quat<double>& q) { return {q.w, q.x, q.y, q.z}; }
@@ -102,7 +77,7 @@ struct Setup {
 Setup unpack(const Values& v) {
   Setup s;
   s.camera = {{}, {0, 0, 0}, 310, 295, 160, 125, 320, 240};
-  for (int i = 0; i < 9; ++i) s.camera.rotation[i / 3][i % 3] = v[10 + i];
+  for (int i = 0; i < 9; ++i) s.camera.rotation.m[i / 3][i % 3] = v[10 + i];
   s.center = {v[0], v[1], v[2]}, s.unit = quat(v, 3), s.scale = {v[7], v[8], v[9]};
   return s;
 }
@@ -129,14 +104,14 @@ void test_project_vjp(double eps, bool outside) {
   const auto f = [&](const Values& v) {
     ProjectionState<double> state;
     const Splat<double> s = splat_of(v, eps, state);
-    return Values{s.x, s.y, s.depth, s.u, s.w, s.v, s.compensation};
+    return Values{s.x, s.y, s.depth, s.conic.u, s.conic.w, s.conic.v, s.conic.compensation};
   };
   const Values g = uniforms(7, -1, 1);
   const Setup s = unpack(x);
   ProjectionState<double> state;
   const Splat<double> splat = splat_of(x, eps, state);
   expect_near("the clamp is as wanted", state.free_x, !outside, 0);
-  const SplatGrad<double> cotangent{g[0], g[1], g[2], g[3], g[4], g[5], g[6]};
+  const SplatGrad<double> cotangent{g[0], g[1], g[2], {g[3], g[4], g[5], g[6]}};
   const ProjectionGrad<double> d = project_vjp(s.camera, s.unit, s.scale, eps, state, splat, cotangent);
   Values gradient{d.cam.x, d.cam.y, d.cam.z};
   for (double e : values(d.unit)) gradient.push_back(e);
@@ -149,8 +124,9 @@ void test_project_vjp(double eps, bool outside) {
 void test_project_forward() {
   const double eps = 0.3;
   const Values x = random_setup();
-  ProjectionState<double> st;
-  const Splat<double> s = splat_of(x, eps, st);
+  ProjectionState<double> state;
+  const Conic<double> s = splat_of(x, eps, state).conic;
+  const CovarianceState<double>& st = state.shape;
   long double xx = 0, xy = 0, yy = 0;
   for (int k = 0; k < 3; ++k) {
     xx += static_cast<long double>(st.m[0][k]) * st.m[0][k], yy += static_cast<long double>(st.m[1][k]) * st.m[1][k];
@@ -168,12 +144,12 @@ void test_project_forward() {
 // A needle of 1e8:1 in float: the width across it is eps to a few ulps, though det C = 1e11 * eps nearly cancels.
 void test_needle() {
   for (int trial = 0; trial < 20; ++trial) {
-    const Pinhole<float> camera{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, {0, 0, 0}, 300, 300, 160, 120, 320, 240};
+    const Pinhole<float> camera{{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}}, {0, 0, 0}, 300, 300, 160, 120, 320, 240};
     const double angle = uniform(0.1, 3.0);
     const auto w = static_cast<float>(std::cos(angle / 2)), z = static_cast<float>(std::sin(angle / 2));
     ProjectionState<float> state;
-    const Splat<float> s =
-        project(camera, Vec3<float>{0, 0, 1}, Quat<float>{w, 0, 0, z}, Vec3<float>{1e3f, 1e-5f, 1e-5f}, 0.3f, state);
+    const Vec3<float> center{0, 0, 1}, scale{1e3f, 1e-5f, 1e-5f};
+    const Conic<float> s = project(camera, center, Quat<float>{w, 0, 0, z}, scale, 0.3f, state).conic;
     const double narrow = std::hypot(s.u, std::hypot(s.w, s.v));  // 1 / the small standard deviation
     expect_near("needle", narrow * std::sqrt(0.3 + 9e-6), 1, 1e-6);  // 9e-6: 300 px times 1e-5, squared
   }
@@ -201,7 +177,7 @@ void test_packets(double tolerance) {
   Packet<S> lanes[10];
   std::vector<Values> rows;
   const Values first = random_setup();
-  for (int i = 0; i < 9; ++i) camera.rotation[i / 3][i % 3] = static_cast<S>(first[10 + i]);
+  for (int i = 0; i < 9; ++i) camera.rotation.m[i / 3][i % 3] = static_cast<S>(first[10 + i]);
   for (int lane = 0; lane < kLanes; ++lane) {
     rows.push_back(random_setup());
     std::copy(first.begin() + 10, first.end(), rows.back().begin() + 10);
@@ -215,10 +191,10 @@ void test_packets(double tolerance) {
     ProjectionState<double> scalar_state;
     const Splat<double> scalar = splat_of(rows[lane], eps, scalar_state);
     expect_near("packet x", splat.x[lane], scalar.x, tolerance);
-    expect_near("packet u", splat.u[lane], scalar.u, tolerance);
-    expect_near("packet w", splat.w[lane], scalar.w, tolerance);
-    expect_near("packet v", splat.v[lane], scalar.v, tolerance);
-    expect_near("packet compensation", splat.compensation[lane], scalar.compensation, tolerance);
+    expect_near("packet u", splat.conic.u[lane], scalar.conic.u, tolerance);
+    expect_near("packet w", splat.conic.w[lane], scalar.conic.w, tolerance);
+    expect_near("packet v", splat.conic.v[lane], scalar.conic.v, tolerance);
+    expect_near("packet compensation", splat.conic.compensation[lane], scalar.conic.compensation, tolerance);
   }
 }
 
@@ -226,12 +202,12 @@ void test_exp2() {
   for (int i = 0; i < 2000; ++i) {
     Packet<float> x;
     for (int lane = 0; lane < kLanes; ++lane) x[lane] = static_cast<float>(uniform(-126, 0));
-    const Packet<float> y = exp2_of(x);
+    const Packet<float> y = exp2(x);
     for (int lane = 0; lane < kLanes; ++lane)
       expect_near("exp2", y[lane] / std::exp2(static_cast<double>(x[lane])), 1, 2.5e-7);
   }
-  expect_near("exp2 of zero", exp2_of(Packet<float>(0.0f))[0], 1, 2.5e-7);
-  const float tiny = exp2_of(Packet<float>(-std::numeric_limits<float>::infinity()))[0];
+  expect_near("exp2 of zero", exp2(Packet<float>(0.0f))[0], 1, 2.5e-7);
+  const float tiny = exp2(Packet<float>(-std::numeric_limits<float>::infinity()))[0];
   expect_near("exp2 far below is small, not NaN", tiny >= 0 && tiny < 2e-38f, 1, 0);
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -84,12 +85,24 @@ def test_strided_arrays_are_refused_rather_than_filled_elsewhere() -> None:
         )
 
 
-def test_formulas_in_cpp(tmp_path: Path) -> None:
-    """csrc/tests/test_math.cpp, built without Python, as by the CMake option DYNGS_TESTS."""
+def test_formulas_need_no_library_but_the_mathematical_one() -> None:
+    allowed = {"cmath", "cstdint", "limits", "type_traits", "utility"}
+    headers = sorted((ROOT / "csrc/math").glob("*.hpp"))
+    assert headers
+    for header in headers:
+        text = header.read_text(encoding="utf-8")
+        assert set(re.findall(r"#include <(\S+)>", text)) <= allowed, header.name
+        assert all(f.startswith("math/") for f in re.findall(r'#include "(\S+)"', text)), header.name
+        assert not re.findall(r"\bnew\b *[\w(\[]|malloc|vector_size|#pragma omp", text), header.name
+
+
+@pytest.mark.parametrize("name", ["test_math", "test_formulas"])
+def test_formulas_in_cpp(tmp_path: Path, name: str) -> None:
+    """csrc/tests/*.cpp without kernels, built without Python, as by the CMake option DYNGS_TESTS."""
     compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
         pytest.skip("no C++ compiler here")
-    program, source = tmp_path / "test_math", ROOT / "csrc/tests/test_math.cpp"
+    program, source = tmp_path / name, ROOT / f"csrc/tests/{name}.cpp"
     # GNU dialect and contraction as in CMakeLists.txt
     flags = ["-std=gnu++20", "-O1", "-ffp-contract=fast", "-w", f"-I{ROOT / 'csrc'}"]
     subprocess.run([compiler, *flags, str(source), "-o", str(program)], check=True, timeout=100)
