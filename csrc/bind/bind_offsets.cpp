@@ -9,7 +9,7 @@
 #include <tuple>
 
 #include "bind/arrays.hpp"
-#include "cpu/offsets.hpp"
+#include "core/api.hpp"
 
 namespace nb = nanobind;
 

@@ -9,7 +9,7 @@
 #include <vector>
 
 #include "bind/arrays.hpp"
-#include "cpu/perceptron.hpp"
+#include "core/api.hpp"
 
 namespace nb = nanobind;
 

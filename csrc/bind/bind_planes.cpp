@@ -11,7 +11,7 @@
 #include <vector>
 
 #include "bind/arrays.hpp"
-#include "cpu/planes.hpp"
+#include "core/api.hpp"
 
 namespace nb = nanobind;
 
@@ -29,19 +29,24 @@ bool same_shape(const Planes<const S>& a, const Planes<S>& b) {
 }
 
 template <class S>
-HexPlane<S> hexplane_input(const Levels<const S>& levels, double time) {
+std::vector<PlaneLevel<S>> levels_input(const Levels<const S>& levels) {
   if (levels.empty()) throw nb::value_error("hexplane: no levels");
   const size_t channels = std::get<0>(levels[0]).shape(3);
-  HexPlane<S> planes{{}, static_cast<int64_t>(channels), time};
+  std::vector<PlaneLevel<S>> out;
   for (const auto& [space, over_time] : levels) {
     const size_t size = space.shape(1);
     if (size == 0 || over_time.shape(1) == 0 || space.shape(2) != size || over_time.shape(2) != size ||
         space.shape(3) != channels || over_time.shape(3) != channels)
       throw nb::value_error("hexplane: planes of sizes that do not fit each other");
-    planes.levels.push_back({space.data(), over_time.data(), static_cast<int64_t>(size),
-                             static_cast<int64_t>(over_time.shape(1))});
+    out.push_back({space.data(), over_time.data(), static_cast<int64_t>(size),
+                   static_cast<int64_t>(over_time.shape(1))});
   }
-  return planes;
+  return out;
+}
+
+template <class S>
+HexPlane<S> hexplane_input(const Levels<const S>& levels, const std::vector<PlaneLevel<S>>& inputs, double time) {
+  return {inputs, static_cast<int64_t>(std::get<0>(levels[0]).shape(3)), time};
 }
 
 template <class S>
@@ -60,22 +65,24 @@ std::vector<PlaneGrads<S>> grads_output(const Levels<const S>& levels, const Lev
 template <class S>
 void hexplane_forward_arrays(const Array<const S, nb::shape<-1, 3>>& coords, const Levels<const S>& levels, double time,
                              const Array<S, nb::ndim<2>>& features, const Array<int32_t, nb::ndim<1>>& order,
-                             int num_threads) {
-  const HexPlane<S> planes = hexplane_input<S>(levels, time);
+                             int threads) {
+  const auto inputs = levels_input<S>(levels);
+  const HexPlane<S> planes = hexplane_input<S>(levels, inputs, time);
   const PlanePoints<S> points{coords.data(), static_cast<int64_t>(coords.shape(0))};
   if (features.shape(0) != coords.shape(0) || order.shape(0) != coords.shape(0) ||
       features.shape(1) != levels.size() * planes.channels)
     throw nb::value_error("hexplane_forward: arrays of different sizes");
   nb::gil_scoped_release release;
-  hexplane_forward(planes, points, features.data(), order.data(), num_threads);
+  hexplane_forward(planes, points, features.data(), order.data(), threads);
 }
 
 template <class S>
 void hexplane_backward_arrays(const Array<const S, nb::shape<-1, 3>>& coords, const Levels<const S>& levels,
                               double time, const Array<const int32_t, nb::ndim<1>>& order,
                               const Array<const S, nb::ndim<2>>& g_features, const Levels<S>& g_levels,
-                              const std::optional<Array<S, nb::shape<-1, 3>>>& g_coords, int num_threads) {
-  const HexPlane<S> planes = hexplane_input<S>(levels, time);
+                              const std::optional<Array<S, nb::shape<-1, 3>>>& g_coords, int threads) {
+  const auto inputs = levels_input<S>(levels);
+  const HexPlane<S> planes = hexplane_input<S>(levels, inputs, time);
   const auto grads = grads_output<S>(levels, g_levels);
   const PlanePoints<S> points{coords.data(), static_cast<int64_t>(coords.shape(0))};
   if (g_features.shape(0) != coords.shape(0) || order.shape(0) != coords.shape(0) ||
@@ -85,18 +92,19 @@ void hexplane_backward_arrays(const Array<const S, nb::shape<-1, 3>>& coords, co
   if (std::any_of(order.data(), order.data() + points.count, missing))
     throw nb::index_error("hexplane_backward: no such point");
   nb::gil_scoped_release release;
-  hexplane_backward(planes, points, order.data(), g_features.data(), grads, g_coords ? g_coords->data() : nullptr,
-                    num_threads);
+  hexplane_backward<S>(planes, points, order.data(), g_features.data(), grads, g_coords ? g_coords->data() : nullptr,
+                    threads);
 }
 
 template <class S>
 double plane_penalty_arrays(const Levels<const S>& levels, const std::optional<Levels<S>>& g_levels,
-                            const std::tuple<double, double, double>& weights, int num_threads) {
-  const HexPlane<S> planes = hexplane_input<S>(levels, 0.0);
+                            const std::tuple<double, double, double>& weights, int threads) {
+  const auto inputs = levels_input<S>(levels);
+  const HexPlane<S> planes = hexplane_input<S>(levels, inputs, 0.0);
   const auto grads = g_levels ? grads_output<S>(levels, *g_levels) : std::vector<PlaneGrads<S>>{};
   const auto [space, time, one] = weights;
   nb::gil_scoped_release release;
-  return plane_penalty(planes, PenaltyWeights{space, time, one}, grads, num_threads);
+  return plane_penalty<S>(planes, PenaltyWeights{space, time, one}, grads, threads);
 }
 
 template <class S>

@@ -12,8 +12,7 @@
 #include <tuple>
 
 #include "bind/arrays.hpp"
-#include "cpu/finite.hpp"
-#include "cpu/kernels.hpp"
+#include "core/api.hpp"
 #include "cpu/memory.hpp"
 
 namespace nb = nanobind;

@@ -9,7 +9,7 @@
 #include <tuple>
 
 #include "bind/arrays.hpp"
-#include "cpu/shading.hpp"
+#include "core/api.hpp"
 
 namespace nb = nanobind;
 

@@ -8,7 +8,7 @@
 #include <tuple>
 
 #include "bind/arrays.hpp"
-#include "cpu/skinning.hpp"
+#include "core/api.hpp"
 
 namespace nb = nanobind;
 
@@ -56,19 +56,19 @@ Skinned<T> skinned_arrays(const Rows<T>& offset, const Rows<T>& blended, const R
 
 template <class S>
 void skinning_forward_arrays(const NodeArrays<S>& node_arrays, const PointArrays<S>& point_arrays,
-                             const Rows<S>& offset, const Rows<S>& blended, const Rows<S>& weights, int num_threads) {
+                             const Rows<S>& offset, const Rows<S>& blended, const Rows<S>& weights, int threads) {
   const SkinNodes<S> nodes = nodes_input<S>(node_arrays);
   const SkinPoints<S> points = points_input<S>(point_arrays, nodes.count);
   const Skinned<S> out = skinned_arrays<S>(offset, blended, weights, points.count, nodes.width, points.nodes);
   nb::gil_scoped_release release;
-  skinning_forward(nodes, points, out, num_threads);
+  skinning_forward(nodes, points, out, threads);
 }
 
 template <class S>
 void skinning_backward_arrays(const NodeArrays<S>& node_arrays, const PointArrays<S>& point_arrays,
                               const std::tuple<Rows<const S>, Rows<const S>, Rows<const S>>& g_arrays,
                               const std::optional<Rows<S>>& g_points, const Rows<S>& g_motion, const Rows<S>& g_values,
-                              int num_threads) {
+                              int threads) {
   const SkinNodes<S> nodes = nodes_input<S>(node_arrays);
   const SkinPoints<S> points = points_input<S>(point_arrays, nodes.count);
   const auto& [g_offset, g_blended, weights] = g_arrays;
@@ -78,7 +78,7 @@ void skinning_backward_arrays(const NodeArrays<S>& node_arrays, const PointArray
   require_shape(g_motion, nodes.count, 7), require_shape(g_values, nodes.count, nodes.width);
   nb::gil_scoped_release release;
   skinning_backward(nodes, points, g,
-                    SkinGrads<S>{g_points ? g_points->data() : nullptr, g_motion.data(), g_values.data()}, num_threads);
+                    SkinGrads<S>{g_points ? g_points->data() : nullptr, g_motion.data(), g_values.data()}, threads);
 }
 
 template <class S>

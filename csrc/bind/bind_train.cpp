@@ -11,8 +11,7 @@
 #endif
 
 #include "bind/arrays.hpp"
-#include "cpu/adam.hpp"
-#include "cpu/loss.hpp"
+#include "core/api.hpp"
 
 namespace nb = nanobind;
 
@@ -21,7 +20,7 @@ namespace {
 
 double l1_ssim_arrays(Array<const float, nb::shape<-1, -1, 3>> rendered, Array<const float, nb::shape<-1, -1, 3>> target,
                std::optional<Array<const float, nb::ndim<2>>> mask,
-               std::optional<Array<float, nb::shape<-1, -1, 3>>> gradient, float ssim_weight, int num_threads) {
+               std::optional<Array<float, nb::shape<-1, -1, 3>>> gradient, float ssim_weight, int threads) {
   const size_t height = rendered.shape(0), width = rendered.shape(1);
   const auto differs = [=](const auto& array) { return array.shape(0) != height || array.shape(1) != width; };
   if (differs(target) || (mask && differs(*mask)) || (gradient && differs(*gradient)))
@@ -30,7 +29,7 @@ double l1_ssim_arrays(Array<const float, nb::shape<-1, -1, 3>> rendered, Array<c
                         static_cast<int64_t>(width), ssim_weight};
   float* to = gradient ? gradient->data() : nullptr;
   nb::gil_scoped_release release;
-  return l1_ssim_loss(input, to, num_threads);
+  return l1_ssim_loss(input, to, threads);
 }
 
 using AdamOptions = std::tuple<double, double, double, int64_t>;  // beta1, beta2, eps, step
@@ -38,7 +37,7 @@ using AdamOptions = std::tuple<double, double, double, int64_t>;  // beta1, beta
 int64_t adam_step_arrays(Array<float, nb::ndim<2>> param, Array<const float, nb::ndim<2>> grad,
                   Array<float, nb::ndim<2>> exp_avg, Array<float, nb::ndim<2>> exp_avg_sq,
                   Array<const float, nb::ndim<1>> column_rates, std::optional<Array<const bool, nb::ndim<1>>> rows,
-                  const AdamOptions& options, int num_threads) {
+                  const AdamOptions& options, int threads) {
   const size_t num_rows = param.shape(0), row_size = param.shape(1);
   const auto differs = [=](const auto& array) { return array.shape(0) != num_rows || array.shape(1) != row_size; };
   if (differs(grad) || differs(exp_avg) || differs(exp_avg_sq) || column_rates.shape(0) != row_size ||
@@ -49,16 +48,16 @@ int64_t adam_step_arrays(Array<float, nb::ndim<2>> param, Array<const float, nb:
   const auto [beta1, beta2, eps, step] = options;
   const AdamRates rates{column_rates.data(), rows ? rows->data() : nullptr, beta1, beta2, eps, step};
   nb::gil_scoped_release release;
-  return adam_step(state, rates, num_threads);
+  return adam_step(state, rates, threads);
 }
 
-void seen_rows_arrays(Array<const float, nb::ndim<2>> grads, Array<bool, nb::ndim<1>> seen, int num_threads) {
+void seen_rows_arrays(Array<const float, nb::ndim<2>> grads, Array<bool, nb::ndim<1>> seen, int threads) {
   if (grads.shape(0) != seen.shape(0)) throw nb::value_error("seen_rows: arrays of different sizes");
   const float* from = grads.data();
   bool* to = seen.data();
   const int64_t num_rows = grads.shape(0), row_size = grads.shape(1);
   nb::gil_scoped_release release;
-  seen_rows(from, num_rows, row_size, to, num_threads);
+  seen_rows(from, num_rows, row_size, to, threads);
 }
 
 // Returns whether the allocator took the settings. No mapped blocks at all, because M_MMAP_THRESHOLD has a documented limit

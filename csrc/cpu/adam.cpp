@@ -3,7 +3,7 @@
 // The work is cut into blocks of rows. Where few rows of a block are to be updated and rows are long, that is done run by
 // run, which saves the memory traffic of the rows between; otherwise element by element under a mask, which keeps whole
 // vectors busy.
-#include "cpu/adam.hpp"
+#include "core/api.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -174,12 +174,12 @@ int64_t update_block(const Plan& plan, Block block) {
 
 }  // namespace
 
-int64_t adam_step(const AdamState& state, const AdamRates& rates, int num_threads) {
+int64_t adam_step(const AdamState& state, const AdamRates& rates, int threads) {
   if (state.num_rows == 0 || state.row_size == 0) return 0;
   const Plan plan = make_plan(state, rates);
   const int64_t num_blocks = (state.num_rows + plan.rows_per_block - 1) / plan.rows_per_block;
   int64_t skipped = 0;
-#pragma omp parallel for num_threads(num_threads) schedule(dynamic, 8) reduction(+ : skipped)
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 8) reduction(+ : skipped)
   for (int64_t b = 0; b < num_blocks; ++b) {
     const int64_t first = b * plan.rows_per_block;
     skipped += update_block(plan, {first, std::min(plan.rows_per_block, state.num_rows - first)});
@@ -187,8 +187,8 @@ int64_t adam_step(const AdamState& state, const AdamRates& rates, int num_thread
   return skipped;
 }
 
-void seen_rows(const float* grads, int64_t num_rows, int64_t row_size, bool* seen, int num_threads) {
-#pragma omp parallel for num_threads(num_threads) schedule(static)
+void seen_rows(const float* grads, int64_t num_rows, int64_t row_size, bool* seen, int threads) {
+#pragma omp parallel for num_threads(threads) schedule(static)
   for (int64_t row = 0; row < num_rows; ++row) {
     const float* grad = grads + row * row_size;
     seen[row] = row_size > 0 && (grad[0] != 0 || !all_zero(grad, row_size));  // where seen, mostly at the first number

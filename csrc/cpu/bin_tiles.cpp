@@ -13,7 +13,7 @@
 #include <string>
 #include <utility>
 
-#include "cpu/kernels.hpp"
+#include "core/api.hpp"
 #include "cpu/memory.hpp"
 #include "cpu/parallel.hpp"
 #include "cpu/spans.hpp"

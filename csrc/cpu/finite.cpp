@@ -1,4 +1,4 @@
-#include "cpu/finite.hpp"
+#include "core/api.hpp"
 
 #include <atomic>
 #include <bit>

@@ -1,7 +1,7 @@
 // View-dependent colour: max(0, sum_k sh_k Y_k(dir) + 0.5) with dir = (mean - centre) / |mean - centre|, and its backward pass.
 #include "math/harmonics.hpp"
 
-#include "cpu/kernels.hpp"
+#include "core/api.hpp"
 #include "cpu/parallel.hpp"
 #include "cpu/simd.hpp"
 

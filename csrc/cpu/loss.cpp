@@ -7,7 +7,7 @@
 // 1e5, and nothing overflows. Which it is depends on the tile's pixels alone.
 //
 // Channels are interleaved: a row is 3 * width numbers, and the horizontal taps lie 3 numbers apart.
-#include "cpu/loss.hpp"
+#include "core/api.hpp"
 
 #include <algorithm>
 #include <atomic>
@@ -332,7 +332,7 @@ double sum_of_mask(const LossInput& input) {
 
 }  // namespace
 
-double l1_ssim_loss(const LossInput& input, float* gradient, int num_threads) {
+double l1_ssim_loss(const LossInput& input, float* gradient, int threads) {
   const Kernel<float> kernel = gaussian_kernel<float>();
   const Kernel<double> fine_kernel = gaussian_kernel<double>();
   const Pieces strips(input.height, kTileRows), columns(input.width, kTilePixels);
@@ -342,11 +342,11 @@ double l1_ssim_loss(const LossInput& input, float* gradient, int num_threads) {
   const std::unique_ptr<Sums[]> sums(new Sums[num_tiles]);
   // Allocated here, as no exception may leave the threads; the float64 rows, hardly ever needed, stay untouched.
   const int64_t floats = Workspace<float>::size(widest), doubles = Workspace<double>::size(widest);
-  const std::unique_ptr<float[]> float_rows(new float[num_threads * floats]);
-  const std::unique_ptr<double[]> double_rows(new double[num_threads * doubles]);
+  const std::unique_ptr<float[]> float_rows(new float[threads * floats]);
+  const std::unique_ptr<double[]> double_rows(new double[threads * doubles]);
   std::atomic<int64_t> next{0};
-#pragma omp parallel for num_threads(num_threads) schedule(static, 1)
-  for (int thread = 0; thread < num_threads; ++thread) {
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+  for (int thread = 0; thread < threads; ++thread) {
     Workspace<float> rows(float_rows.get() + thread * floats, widest);
     for (int64_t t = next++; t < num_tiles; t = next++) {
       const int64_t strip = t / columns.count, column = t % columns.count;

@@ -1,4 +1,4 @@
-#include "cpu/offsets.hpp"
+#include "core/api.hpp"
 
 #include "cpu/parallel.hpp"
 #include "math/quaternion.hpp"

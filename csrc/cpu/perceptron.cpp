@@ -8,7 +8,7 @@
 //
 // Sums have a fixed order: within a block the kernel's, from block to block in order of the rows within one of kParts
 // ranges of blocks, then over these ranges in order.
-#include "cpu/perceptron.hpp"
+#include "core/api.hpp"
 
 #include <algorithm>
 #include <array>

@@ -6,7 +6,7 @@
 #include <cmath>
 
 #include "cpu/parallel.hpp"
-#include "cpu/planes.hpp"
+#include "core/api.hpp"
 #include "cpu/simd.hpp"
 #include "math/planes.hpp"
 
@@ -152,7 +152,7 @@ double mean_factor(double weight, int64_t count) { return count > 0 ? weight / s
 
 template <class S>
 std::vector<Plane<S>> all_planes(const HexPlane<S>& hexplane, const PenaltyWeights& weights,
-                                 const std::vector<PlaneGrads<S>>& grads) {
+                                 std::span<const PlaneGrads<S>> grads) {
   std::vector<Plane<S>> planes;
   const int64_t channels = hexplane.channels;
   for (size_t l = 0; l < hexplane.levels.size(); ++l) {
@@ -175,7 +175,7 @@ std::vector<Plane<S>> all_planes(const HexPlane<S>& hexplane, const PenaltyWeigh
 
 template <class S>
 double plane_penalty(const HexPlane<S>& hexplane, const PenaltyWeights& weights,
-                     const std::vector<PlaneGrads<S>>& grads, int num_threads) {
+                     std::span<const PlaneGrads<S>> grads, int threads) {
   struct Band {
     size_t plane;
     int64_t begin, end;
@@ -188,8 +188,8 @@ double plane_penalty(const HexPlane<S>& hexplane, const PenaltyWeights& weights,
   std::vector<double> sums(bands.size());
   int64_t most = 0;
   for (const auto& plane : planes) most = std::max(most, room_for(plane));
-  const auto room = for_each_worker<std::vector<S>>(num_threads, most);
-  parallel_workers(static_cast<int64_t>(bands.size()), 1, num_threads, [&](int worker, int64_t b, int64_t) {
+  const auto room = for_each_worker<std::vector<S>>(threads, most);
+  parallel_workers(static_cast<int64_t>(bands.size()), 1, threads, [&](int worker, int64_t b, int64_t) {
     sums[b] = band_penalty(planes[bands[b].plane], bands[b].begin, bands[b].end, room[worker]->data());
   });
   double total = 0;
@@ -198,8 +198,8 @@ double plane_penalty(const HexPlane<S>& hexplane, const PenaltyWeights& weights,
 }
 
 template double plane_penalty<float>(const HexPlane<float>&, const PenaltyWeights&,
-                                     const std::vector<PlaneGrads<float>>&, int);
+                                     std::span<const PlaneGrads<float>>, int);
 template double plane_penalty<double>(const HexPlane<double>&, const PenaltyWeights&,
-                                      const std::vector<PlaneGrads<double>>&, int);
+                                      std::span<const PlaneGrads<double>>, int);
 
 }  // namespace dyngs

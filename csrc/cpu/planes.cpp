@@ -1,7 +1,7 @@
 // Planes larger than the cache are read and written at random places if points come in random order, so points are
 // visited cell by cell of a coarse grid. The backward pass gives each task the gradients of one level and one packet of
 // channels, which it alone writes, point by point in that order: no atomics, the same sums on any number of threads.
-#include "cpu/planes.hpp"
+#include "core/api.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -60,9 +60,9 @@ Chunk<S> load_chunk(const PlanePoints<S>& points, const int32_t* order, int64_t 
 }
 
 template <class S>
-std::vector<Chunk<S>> load_chunks(const PlanePoints<S>& points, const int32_t* order, int num_threads) {
+std::vector<Chunk<S>> load_chunks(const PlanePoints<S>& points, const int32_t* order, int threads) {
   std::vector<Chunk<S>> chunks((points.count + kLanes - 1) / kLanes);
-  parallel_for(points.count, kGrain, num_threads, [&](int64_t first, int64_t end) {
+  parallel_for(points.count, kGrain, threads, [&](int64_t first, int64_t end) {
     for (int64_t begin = first; begin < end; begin += kLanes) chunks[begin / kLanes] = load_chunk(points, order, begin);
   });
   return chunks;
@@ -105,6 +105,7 @@ std::vector<S> lines_at_time(const PlaneLevel<S>& level, int64_t channels, doubl
 template <class S>
 std::vector<std::vector<S>> all_lines(const HexPlane<S>& planes) {
   std::vector<std::vector<S>> lines;
+  lines.reserve(planes.levels.size());
   for (const auto& level : planes.levels) lines.push_back(lines_at_time(level, planes.channels, planes.time));
   return lines;
 }
@@ -341,23 +342,24 @@ void run_task(const Task<S>& given, const std::vector<Chunk<S>>& chunks, int64_t
 }
 
 template <class S>
-void clear(S* to, int64_t count, int num_threads) {
-  parallel_for(count, 1 << 16, num_threads,
+void clear(S* to, int64_t count, int threads) {
+  parallel_for(count, 1 << 16, threads,
                [&](int64_t begin, int64_t end) { std::memset(to + begin, 0, (end - begin) * sizeof(S)); });
 }
 
 template <class S>
 std::vector<LevelView<S>> level_views(const HexPlane<S>& planes, const std::vector<std::vector<S>>& lines) {
   std::vector<LevelView<S>> views;
+  views.reserve(lines.size());
   for (size_t l = 0; l < lines.size(); ++l) views.emplace_back(planes.levels[l], lines[l], planes.channels);
   return views;
 }
 
 // Sums the parts (parts, 3, count) of the tasks in order, and back into the order of the points.
 template <class S>
-void sum_coords(const std::vector<S>& parts, const int32_t* order, int64_t count, S* g_coords, int num_threads) {
+void sum_coords(const std::vector<S>& parts, const int32_t* order, int64_t count, S* g_coords, int threads) {
   const int64_t num_parts = count ? static_cast<int64_t>(parts.size()) / (kAxes * count) : 0;
-  parallel_for(count, kGrain, num_threads, [&](int64_t begin, int64_t end) {
+  parallel_for(count, kGrain, threads, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i)
       for (int a = 0; a < kAxes; ++a) {
         S sum = 0;
@@ -371,12 +373,12 @@ void sum_coords(const std::vector<S>& parts, const int32_t* order, int64_t count
 
 template <class S>
 void hexplane_forward(const HexPlane<S>& planes, const PlanePoints<S>& points, S* features, int32_t* order,
-                      int num_threads) {
+                      int threads) {
   sort_points(points, order);
   const auto lines = all_lines(planes);
   const auto views = level_views(planes, lines);
   const int64_t row_size = planes.channels * static_cast<int64_t>(views.size());
-  parallel_for(points.count, kGrain, num_threads, [&](int64_t first, int64_t end) {
+  parallel_for(points.count, kGrain, threads, [&](int64_t first, int64_t end) {
     for (int64_t begin = first; begin < end; begin += kLanes) {
       const Chunk<S> chunk = load_chunk(points, order, begin);
       for (size_t l = 0; l < views.size(); ++l)
@@ -387,19 +389,19 @@ void hexplane_forward(const HexPlane<S>& planes, const PlanePoints<S>& points, S
 
 template <class S>
 void hexplane_backward(const HexPlane<S>& planes, const PlanePoints<S>& points, const int32_t* order,
-                       const S* g_features, const std::vector<PlaneGrads<S>>& grads, S* g_coords, int num_threads) {
-  const auto chunks = load_chunks(points, order, num_threads);
+                       const S* g_features, std::span<const PlaneGrads<S>> grads, S* g_coords, int threads) {
+  const auto chunks = load_chunks(points, order, threads);
   const auto lines = all_lines(planes);
   const auto views = level_views(planes, lines);
   const int64_t channels = planes.channels, num_levels = views.size();
   const int64_t num_blocks = (channels + kLanes - 1) / kLanes, coords_size = kAxes * points.count;
   std::vector<S> parts(g_coords ? num_levels * num_blocks * coords_size : 0);
   std::vector<Task<S>> tasks;
-  const bool split = num_threads > num_levels * num_blocks;
+  const bool split = threads > num_levels * num_blocks;
   for (int64_t l = 0; l < num_levels; ++l) {
     const PlaneLevel<S>& level = planes.levels[l];
-    clear(grads[l].space, kAxes * level.size * level.size * channels, num_threads);
-    clear(grads[l].time, kAxes * level.times * level.size * channels, num_threads);
+    clear(grads[l].space, kAxes * level.size * level.size * channels, threads);
+    clear(grads[l].time, kAxes * level.times * level.size * channels, threads);
     for (int64_t c = 0; c < channels; c += kLanes)
       for (int share = 0; share < (split ? kAxes : 1); ++share) {
         LevelView<S> view = views[l];
@@ -415,22 +417,22 @@ void hexplane_backward(const HexPlane<S>& planes, const PlanePoints<S>& points, 
   }
   int64_t longest = 0;
   for (const auto& level : planes.levels) longest = std::max(longest, kAxes * level.size * kLanes);
-  const auto g_lines = for_each_worker<std::vector<S>>(num_threads, longest);
-  parallel_workers(static_cast<int64_t>(tasks.size()), 1, num_threads, [&](int worker, int64_t t, int64_t) {
+  const auto g_lines = for_each_worker<std::vector<S>>(threads, longest);
+  parallel_workers(static_cast<int64_t>(tasks.size()), 1, threads, [&](int worker, int64_t t, int64_t) {
     const Task<S>& task = tasks[t];
     const bool full = task.width == kLanes;
     const auto run = task.g_coords ? (full ? run_task<true, true, S> : run_task<false, true, S>)
                                    : (full ? run_task<true, false, S> : run_task<false, false, S>);
     run(task, chunks, points.count, channels * num_levels, g_lines[worker]->data());
   });
-  if (g_coords) sum_coords(parts, order, points.count, g_coords, num_threads);
+  if (g_coords) sum_coords(parts, order, points.count, g_coords, threads);
 }
 
 template void hexplane_forward<float>(const HexPlane<float>&, const PlanePoints<float>&, float*, int32_t*, int);
 template void hexplane_forward<double>(const HexPlane<double>&, const PlanePoints<double>&, double*, int32_t*, int);
 template void hexplane_backward<float>(const HexPlane<float>&, const PlanePoints<float>&, const int32_t*, const float*,
-                                       const std::vector<PlaneGrads<float>>&, float*, int);
+                                       std::span<const PlaneGrads<float>>, float*, int);
 template void hexplane_backward<double>(const HexPlane<double>&, const PlanePoints<double>&, const int32_t*,
-                                        const double*, const std::vector<PlaneGrads<double>>&, double*, int);
+                                        const double*, std::span<const PlaneGrads<double>>, double*, int);
 
 }  // namespace dyngs

@@ -1,7 +1,7 @@
 // Projection of N Gaussians into V views, 16 Gaussians at a time, and its backward pass.
 #include <cmath>
 
-#include "cpu/kernels.hpp"
+#include "core/api.hpp"
 #include "cpu/parallel.hpp"
 #include "cpu/simd.hpp"
 #include "math/projection.hpp"

@@ -1,4 +1,4 @@
-#include "cpu/shading.hpp"
+#include "core/api.hpp"
 
 #include <algorithm>
 #include <cmath>

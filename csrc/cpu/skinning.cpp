@@ -1,7 +1,7 @@
 // Whatever a node carries lies in one row of a table, in fours (x, y, z and one spare), so that a point and a node meet
 // in a few short vector operations. The backward pass splits the points into a number of contiguous parts that depends
 // on the sizes only; each adds up, in order, gradients of its own by all nodes, and these are then summed in order.
-#include "cpu/skinning.hpp"
+#include "core/api.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -192,10 +192,10 @@ bool follow_within(const int64_t* followed, int64_t size, int64_t num_nodes) {
 }
 
 template <class S>
-void skinning_forward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, const Skinned<S>& out, int num_threads) {
+void skinning_forward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, const Skinned<S>& out, int threads) {
   const Table<S> table = node_table(nodes, true);
   const int64_t per_point = points.nodes;
-  parallel_for(points.count, kGrain, num_threads, [&](int64_t begin, int64_t end) {
+  parallel_for(points.count, kGrain, threads, [&](int64_t begin, int64_t end) {
     for (int64_t m = begin; m < end; ++m)
       exponents(table, points.coords + 3 * m, points.followed + m * per_point, per_point, out.weights + m * per_point);
     exponentiate(out.weights + begin * per_point, (end - begin) * per_point);
@@ -210,18 +210,18 @@ void skinning_forward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, co
 
 template <class S>
 void skinning_backward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, const Skinned<const S>& g,
-                       const SkinGrads<S>& grads, int num_threads) {
+                       const SkinGrads<S>& grads, int threads) {
   const Table<S> table = node_table(nodes, false);
   const int64_t stride = kByValues + fours(nodes.width), size = nodes.count * stride;
   const int64_t parts = num_parts(points.count, points.nodes, nodes.count);
   const auto sums = std::make_unique_for_overwrite<Four<S>[]>(parts * size);
-  parallel_for(parts, 1, num_threads, [&](int64_t part, int64_t) {
+  parallel_for(parts, 1, threads, [&](int64_t part, int64_t) {
     Four<S>* own = sums.get() + part * size;
     std::fill(own, own + size, Four<S>(S(0)));
     gather_part(table, points, g, nodes.width, points.count * part / parts, points.count * (part + 1) / parts, own,
                 grads.points);
   });
-  parallel_for(nodes.count, kNodeGrain, num_threads, [&](int64_t begin, int64_t end) {
+  parallel_for(nodes.count, kNodeGrain, threads, [&](int64_t begin, int64_t end) {
     for (int64_t part = 1; part < parts; ++part)
       for (int64_t i = begin * stride; i < end * stride; ++i) sums[i] += sums[part * size + i];
     for (int64_t s = begin; s < end; ++s) write_node(nodes, s, sums.get() + s * stride, grads);

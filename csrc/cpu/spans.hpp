@@ -3,7 +3,7 @@
 
 #include <algorithm>
 
-#include "cpu/kernels.hpp"
+#include "core/api.hpp"
 #include "cpu/simd.hpp"
 #include "math/ellipse.hpp"
 

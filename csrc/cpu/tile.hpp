@@ -6,7 +6,7 @@
 #include <cmath>
 #include <limits>
 
-#include "cpu/kernels.hpp"
+#include "core/api.hpp"
 #include "cpu/simd.hpp"
 #include "math/blend.hpp"
 #include "math/ellipse.hpp"

@@ -4,11 +4,7 @@
 #include <memory>
 #include <numeric>
 
-#include "cpu/offsets.hpp"
-#include "cpu/perceptron.hpp"
-#include "cpu/planes.hpp"
-#include "cpu/shading.hpp"
-#include "cpu/skinning.hpp"
+#include "core/api.hpp"
 #include "tests/check.hpp"
 
 namespace {
@@ -144,21 +140,22 @@ Features<S> features_of(const Grids& g, const Values& cotangent, int threads) {
   std::vector<S> arrays[4];
   for (int l = 0; l < 2; ++l) arrays[2 * l] = as<S>(g.space[l]), arrays[2 * l + 1] = as<S>(g.times[l]);
   const auto coords = as<S>(g.coords), g_features = as<S>(cotangent);
-  HexPlane<S> planes{{}, g.channels, g.time};
+  std::vector<PlaneLevel<S>> levels;
   Features<S> out;
   std::vector<PlaneGrads<S>> grads, penalty_grads;
   for (int l = 0; l < 2; ++l) {
-    planes.levels.push_back({arrays[2 * l].data(), arrays[2 * l + 1].data(), kSizes[l], kTimes[l]});
+    levels.push_back({arrays[2 * l].data(), arrays[2 * l + 1].data(), kSizes[l], kTimes[l]});
     out.g_space[l].resize(g.space[l].size()), out.g_time[l].resize(g.times[l].size());
     out.p_space[l].resize(g.space[l].size()), out.p_time[l].resize(g.times[l].size());
     grads.push_back({out.g_space[l].data(), out.g_time[l].data()});
     penalty_grads.push_back({out.p_space[l].data(), out.p_time[l].data()});
   }
   out.features.resize(g.points * 2 * g.channels), out.order.resize(g.points), out.g_coords.resize(3 * g.points);
+  const HexPlane<S> planes{levels, g.channels, g.time};
   const PlanePoints<S> points{coords.data(), g.points};
   hexplane_forward(planes, points, out.features.data(), out.order.data(), threads);
-  hexplane_backward(planes, points, out.order.data(), g_features.data(), grads, out.g_coords.data(), threads);
-  out.penalty = plane_penalty(planes, kPenalty, penalty_grads, threads);
+  hexplane_backward<S>(planes, points, out.order.data(), g_features.data(), grads, out.g_coords.data(), threads);
+  out.penalty = plane_penalty<S>(planes, kPenalty, penalty_grads, threads);
   return out;
 }
 

@@ -17,7 +17,9 @@ using namespace dyngs;
 using namespace check;
 
 Vec3<double> vec(const Values& v, size_t at) { return {v[at], v[at + 1], v[at + 2]}; }
-void append(Values& to, const Vec3<double>& v) { to.insert(to.end(), {v.x, v.y, v.z}); }
+void append(Values& to, const Vec3<double>& v) {
+  for (double e : {v.x, v.y, v.z}) to.push_back(e);
+}
 
 void test_vectors() {
   const Values x = uniforms(3, 0.2, 1), g = uniforms(3, -1, 1);
@@ -139,7 +141,7 @@ void test_blend_vjp() {
   Values gradient;
   for (int k = 0; k < kDepth; ++k) {
     const BlendSplatGrad<double> s = gradients_of(v, k, out.p[k]);
-    gradient.insert(gradient.end(), {s.mean.x, s.mean.y, s.u, s.w, s.v, s.opacity, out.shades[k]});
+    for (double e : {s.mean.x, s.mean.y, s.u, s.w, s.v, s.opacity, out.shades[k]}) gradient.push_back(e);
     double slope_x = 0, slope_y = 0;
     for (int pixel = 0; pixel < 2; ++pixel) {
       const double* at = v.data() + k * kPerGaussian;

@@ -5,7 +5,7 @@
 #include <cmath>
 #include <numeric>
 
-#include "cpu/kernels.hpp"
+#include "core/api.hpp"
 #include "tests/check.hpp"
 
 namespace {

@@ -4,9 +4,7 @@
 #include <limits>
 #include <memory>
 
-#include "cpu/adam.hpp"
-#include "cpu/finite.hpp"
-#include "cpu/loss.hpp"
+#include "core/api.hpp"
 #include "tests/check.hpp"
 
 namespace {
