@@ -30,8 +30,7 @@ const T* checked(const std::optional<Array<const T>>& array, int64_t count) {
 }
 
 template <class S>
-void add(const std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, Array<S>>& gaussians,
-         const Maybe<int64_t>& rows,
+void add(const std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, Array<S>>& gaussians, const Maybe<int64_t>& rows,
          const std::tuple<Array<const S>, Maybe<S>, Maybe<S>, Maybe<S>, Maybe<S>>& offsets, int threads) {
   const auto& [means, quats, log_scales, logit_opacities, sh] = gaussians;
   const auto& [by_means, by_quats, by_log_scales, by_logit_opacities, by_colors] = offsets;
@@ -40,12 +39,20 @@ void add(const std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, Array<S>>& gau
   const auto wrong = [n](int64_t row) { return row < 0 || row >= n; };
   if (rows ? std::any_of(rows->data(), rows->data() + rows->size(), wrong) : count > n)
     throw nb::index_error("offsets: no such Gaussian");
-  const RowOffsets<S> from{count, checked(rows, count), checked(by_means, 3 * count), checked(by_quats, 4 * count),
-                           checked(by_log_scales, 3 * count), checked(by_logit_opacities, count),
+  const RowOffsets<S> from{count,
+                           checked(rows, count),
+                           checked(by_means, 3 * count),
+                           checked(by_quats, 4 * count),
+                           checked(by_log_scales, 3 * count),
+                           checked(by_logit_opacities, count),
                            checked(by_colors, 3 * count)};
   const int64_t stride = n ? static_cast<int64_t>(sh.size()) / n : 0;
-  const MovedGaussians<S> to{checked(means, 3 * n), checked(quats, 4 * n), checked(log_scales, 3 * n),
-                             logit_opacities.data(), sh.data(), stride};
+  const MovedGaussians<S> to{checked(means, 3 * n),
+                             checked(quats, 4 * n),
+                             checked(log_scales, 3 * n),
+                             logit_opacities.data(),
+                             sh.data(),
+                             stride};
   if (by_colors && n && stride < 3) throw nb::value_error("offsets: arrays of different sizes");
   nb::gil_scoped_release release;
   add_offsets(from, to, threads);

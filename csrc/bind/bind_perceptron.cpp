@@ -37,7 +37,8 @@ template <class T>
 T* checked(const Array<T>& array, int64_t count, const char* name) {
   if (static_cast<int64_t>(array.size()) != count)
     throw nb::value_error((std::string("perceptron: ") + name + " has " + std::to_string(array.size()) +
-                           " elements, expected " + std::to_string(count)).c_str());
+                           " elements, expected " + std::to_string(count))
+                              .c_str());
   return array.data();
 }
 template <class T>
@@ -88,10 +89,13 @@ void bind(nb::module_& module) {
 }  // namespace
 
 void bind_perceptron(nb::module_& module) {
-  module.def("perceptron_kept_per_row", [](const std::vector<int64_t>& widths, int64_t skip) {
-    check_widths(widths, skip);
-    return Perceptron<float>{widths, skip, nullptr, 1}.kept_per_row();
-  }, nb::arg("widths"), nb::arg("skip"), "Scalars per row that the forward pass can keep for the backward pass.");
+  module.def(
+      "perceptron_kept_per_row",
+      [](const std::vector<int64_t>& widths, int64_t skip) {
+        check_widths(widths, skip);
+        return Perceptron<float>{widths, skip, nullptr, 1}.kept_per_row();
+      },
+      nb::arg("widths"), nb::arg("skip"), "Scalars per row that the forward pass can keep for the backward pass.");
   bind<float>(module), bind<double>(module);
 }
 

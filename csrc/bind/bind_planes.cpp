@@ -38,8 +38,8 @@ std::vector<PlaneLevel<S>> levels_input(const Levels<const S>& levels) {
     if (size == 0 || over_time.shape(1) == 0 || space.shape(2) != size || over_time.shape(2) != size ||
         space.shape(3) != channels || over_time.shape(3) != channels)
       throw nb::value_error("hexplane: planes of sizes that do not fit each other");
-    out.push_back({space.data(), over_time.data(), static_cast<int64_t>(size),
-                   static_cast<int64_t>(over_time.shape(1))});
+    out.push_back(
+        {space.data(), over_time.data(), static_cast<int64_t>(size), static_cast<int64_t>(over_time.shape(1))});
   }
   return out;
 }
@@ -93,7 +93,7 @@ void hexplane_backward_arrays(const Array<const S, nb::shape<-1, 3>>& coords, co
     throw nb::index_error("hexplane_backward: no such point");
   nb::gil_scoped_release release;
   hexplane_backward<S>(planes, points, order.data(), g_features.data(), grads, g_coords ? g_coords->data() : nullptr,
-                    threads);
+                       threads);
 }
 
 template <class S>

@@ -32,8 +32,9 @@ T* data_or_null(const MaybeArray<T>& array) {
 template <class T>
 void expect(const Array<T>& array, int64_t count, const char* name) {
   if (static_cast<int64_t>(array.size()) != count)
-    throw nb::value_error((std::string(name) + " has " + std::to_string(array.size()) + " elements, expected " +
-                           std::to_string(count)).c_str());
+    throw nb::value_error(
+        (std::string(name) + " has " + std::to_string(array.size()) + " elements, expected " + std::to_string(count))
+            .c_str());
 }
 template <class T>
 void expect(const MaybeArray<T>& array, int64_t count, const char* name) {
@@ -43,15 +44,16 @@ void expect(const MaybeArray<T>& array, int64_t count, const char* name) {
 template <class A>
 void expect_rank(const A& array, size_t rank, const char* name) {
   if (array.ndim() != rank)
-    throw nb::value_error((std::string(name) + " has " + std::to_string(array.ndim()) + " axes, expected " +
-                           std::to_string(rank)).c_str());
+    throw nb::value_error(
+        (std::string(name) + " has " + std::to_string(array.ndim()) + " axes, expected " + std::to_string(rank))
+            .c_str());
 }
 
 // A picture's side, or a number of threads.
 int within(int64_t value, int64_t most, const char* name) {
   if (value < 1 || value > most)
-    throw nb::value_error((std::string(name) + " is " + std::to_string(value) + ", expected 1 to " +
-                           std::to_string(most)).c_str());
+    throw nb::value_error(
+        (std::string(name) + " is " + std::to_string(value) + ", expected 1 to " + std::to_string(most)).c_str());
   return static_cast<int>(value);
 }
 constexpr int64_t kMaxThreads = 1 << 16;
@@ -64,8 +66,15 @@ struct ProjectSettings {
 
   template <class S>
   ProjectOptions<S> cast() const {
-    return {width, height, static_cast<S>(eps2d), static_cast<S>(near), static_cast<S>(far),
-            static_cast<S>(alpha_min), static_cast<S>(radius_clip), antialiased, threads};
+    return {width,
+            height,
+            static_cast<S>(eps2d),
+            static_cast<S>(near),
+            static_cast<S>(far),
+            static_cast<S>(alpha_min),
+            static_cast<S>(radius_clip),
+            antialiased,
+            threads};
   }
 };
 
@@ -107,27 +116,25 @@ void bind_projection(nb::module_& module, const char* arrays_name) {
         nb::gil_scoped_release release;
         project_forward(views, settings.cast<S>(), out);
       },
-      nb::arg(), nb::arg(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(),
-      nb::arg().noconvert(), nb::arg().noconvert());
-  module.def(
-      "project_backward",
-      [](const Arrays& in, const ProjectSettings& settings, Array<const int32_t> radii,
-         std::tuple<Array<const S>, Array<const S>, Array<const S>, Array<const S>> grads,
-         std::tuple<Array<S>, Array<S>, Array<S>, MaybeArray<S>> out) {
-        const GaussianViews<S> views = in.views();
-        const int64_t n = views.num_gaussians, rows = views.num_views * n;
-        const auto& [g_means2d, g_depths, g_factors, g_compensations] = grads;
-        const auto& [means, quats, scales, viewmats] = out;
-        expect(radii, 2 * rows, "radii"), expect(g_means2d, 2 * rows, "means2d gradient");
-        expect(g_depths, rows, "depths gradient"), expect(g_factors, 3 * rows, "factors gradient");
-        expect(g_compensations, rows, "compensations gradient"), expect(means, 3 * n, "means gradient");
-        expect(quats, 4 * n, "quats gradient"), expect(scales, 3 * n, "scales gradient");
-        expect(viewmats, 16 * views.num_views, "viewmats gradient");
-        const ProjectedGrads<S> from{g_means2d.data(), g_depths.data(), g_factors.data(), g_compensations.data()};
-        const GaussianGrads<S> to{means.data(), quats.data(), scales.data(), data_or_null(viewmats)};
-        nb::gil_scoped_release release;
-        project_backward(views, settings.cast<S>(), radii.data(), from, to);
-      });
+      nb::arg(), nb::arg(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(),
+      nb::arg().noconvert());
+  module.def("project_backward", [](const Arrays& in, const ProjectSettings& settings, Array<const int32_t> radii,
+                                    std::tuple<Array<const S>, Array<const S>, Array<const S>, Array<const S>> grads,
+                                    std::tuple<Array<S>, Array<S>, Array<S>, MaybeArray<S>> out) {
+    const GaussianViews<S> views = in.views();
+    const int64_t n = views.num_gaussians, rows = views.num_views * n;
+    const auto& [g_means2d, g_depths, g_factors, g_compensations] = grads;
+    const auto& [means, quats, scales, viewmats] = out;
+    expect(radii, 2 * rows, "radii"), expect(g_means2d, 2 * rows, "means2d gradient");
+    expect(g_depths, rows, "depths gradient"), expect(g_factors, 3 * rows, "factors gradient");
+    expect(g_compensations, rows, "compensations gradient"), expect(means, 3 * n, "means gradient");
+    expect(quats, 4 * n, "quats gradient"), expect(scales, 3 * n, "scales gradient");
+    expect(viewmats, 16 * views.num_views, "viewmats gradient");
+    const ProjectedGrads<S> from{g_means2d.data(), g_depths.data(), g_factors.data(), g_compensations.data()};
+    const GaussianGrads<S> to{means.data(), quats.data(), scales.data(), data_or_null(viewmats)};
+    nb::gil_scoped_release release;
+    project_backward(views, settings.cast<S>(), radii.data(), from, to);
+  });
 }
 
 template <class S>
@@ -145,30 +152,28 @@ Harmonics<S> harmonics_input(const Array<const S>& means, const Array<const S>& 
 
 template <class S>
 void bind_harmonics(nb::module_& module) {
-  module.def("harmonics_forward",
-             [](Array<const S> means, Array<const S> centers, Array<const S> sh, Array<const int32_t> radii,
-                Array<S> colors, int degree, int threads) {
-               const Harmonics<S> in = harmonics_input(means, centers, sh, radii, degree, threads);
-               expect(colors, 3 * in.num_views * in.num_gaussians, "colors");
-               nb::gil_scoped_release release;
-               harmonics_forward(in, colors.data());
-             });
-  module.def("harmonics_backward",
-             [](Array<const S> means, Array<const S> centers, Array<const S> sh, Array<const int32_t> radii,
-                std::tuple<Array<const S>, Array<const S>> colors_and_grads,
-                std::tuple<Array<S>, Array<S>, MaybeArray<S>> out, int degree, int threads) {
-               const Harmonics<S> in = harmonics_input(means, centers, sh, radii, degree, threads);
-               const auto& [colors, grads] = colors_and_grads;
-               const auto& [g_means, g_sh, g_centers] = out;
-               expect(colors, 3 * in.num_views * in.num_gaussians, "colors");
-               expect(grads, 3 * in.num_views * in.num_gaussians, "colors gradient");
-               expect(g_means, 3 * in.num_gaussians, "means gradient");
-               expect(g_sh, 3 * in.num_gaussians * in.num_terms, "sh gradient");
-               expect(g_centers, 3 * in.num_views, "centers gradient");
-               nb::gil_scoped_release release;
-               harmonics_backward(in, colors.data(), grads.data(), g_means.data(), g_sh.data(),
-                                  data_or_null(g_centers));
-             });
+  module.def("harmonics_forward", [](Array<const S> means, Array<const S> centers, Array<const S> sh,
+                                     Array<const int32_t> radii, Array<S> colors, int degree, int threads) {
+    const Harmonics<S> in = harmonics_input(means, centers, sh, radii, degree, threads);
+    expect(colors, 3 * in.num_views * in.num_gaussians, "colors");
+    nb::gil_scoped_release release;
+    harmonics_forward(in, colors.data());
+  });
+  module.def(
+      "harmonics_backward", [](Array<const S> means, Array<const S> centers, Array<const S> sh,
+                               Array<const int32_t> radii, std::tuple<Array<const S>, Array<const S>> colors_and_grads,
+                               std::tuple<Array<S>, Array<S>, MaybeArray<S>> out, int degree, int threads) {
+        const Harmonics<S> in = harmonics_input(means, centers, sh, radii, degree, threads);
+        const auto& [colors, grads] = colors_and_grads;
+        const auto& [g_means, g_sh, g_centers] = out;
+        expect(colors, 3 * in.num_views * in.num_gaussians, "colors");
+        expect(grads, 3 * in.num_views * in.num_gaussians, "colors gradient");
+        expect(g_means, 3 * in.num_gaussians, "means gradient");
+        expect(g_sh, 3 * in.num_gaussians * in.num_terms, "sh gradient");
+        expect(g_centers, 3 * in.num_views, "centers gradient");
+        nb::gil_scoped_release release;
+        harmonics_backward(in, colors.data(), grads.data(), g_means.data(), g_sh.data(), data_or_null(g_centers));
+      });
 }
 
 template <class S>
@@ -180,9 +185,21 @@ struct SplatArrays {
     expect_rank(opacities, 2, "opacities");
     const int64_t v = opacities.shape(0), n = opacities.shape(1);
     expect(means2d, 2 * v * n, "means2d"), expect(factors, 3 * v * n, "factors"), expect(radii, 2 * v * n, "radii");
-    return {n, v, settings.width, settings.height, 0, means2d.data(), factors.data(), opacities.data(), nullptr,
-            nullptr, radii.data(), static_cast<S>(settings.alpha_min), static_cast<S>(settings.alpha_max),
-            static_cast<S>(settings.transmittance_min), settings.threads};
+    return {n,
+            v,
+            settings.width,
+            settings.height,
+            0,
+            means2d.data(),
+            factors.data(),
+            opacities.data(),
+            nullptr,
+            nullptr,
+            radii.data(),
+            static_cast<S>(settings.alpha_min),
+            static_cast<S>(settings.alpha_max),
+            static_cast<S>(settings.transmittance_min),
+            settings.threads};
   }
 
   Splats<S> with_colors(const BlendSettings& settings, const Array<const S>& colors) const {
@@ -205,8 +222,7 @@ nb::ndarray<nb::numpy, T, nb::ndim<1>> release_vector(std::vector<T>&& vector) {
   return {owner->data(), {owner->size()}, free};
 }
 
-using EntryArrays =
-    std::tuple<Array<const int64_t>, Array<const int32_t>, Array<const int32_t>, Array<const int32_t>>;
+using EntryArrays = std::tuple<Array<const int64_t>, Array<const int32_t>, Array<const int32_t>, Array<const int32_t>>;
 
 // Whether all of `count` indices are in [0, bound).
 bool all_within(const int32_t* indices, int64_t count, int64_t bound) {
@@ -233,7 +249,8 @@ Entries checked_entries(const EntryArrays& arrays, const Splats<S>& s) {
   expect(tile_offsets, tiles + 1, "tile_offsets"), expect(slot_ranges, 2 * splats, "slot_ranges");
   expect(slots, count, "slots");
   const Entries entries{tile_offsets.data(), slot_ranges.data(), gaussians.data(), slots.data(), count};
-  if (!in_order(entries, tiles, splats)) throw nb::value_error("tile_offsets or slot_ranges name entries that are not there");
+  if (!in_order(entries, tiles, splats))
+    throw nb::value_error("tile_offsets or slot_ranges name entries that are not there");
   if (!all_within(entries.gaussians, count, splats)) throw nb::value_error("gaussians name splats that are not there");
   if (!all_within(entries.slots, count, count)) throw nb::value_error("slots name places that are not there");
   return entries;
@@ -245,44 +262,42 @@ void bind_binning(nb::module_& module, const char* arrays_name) {
   nb::class_<Arrays>(module, arrays_name)
       .def(nb::init<Array<const S>, Array<const S>, Array<const S>, Array<const int32_t>>(), nb::arg().noconvert(),
            nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert());
-  module.def("bin_tiles",
-             [](const Arrays& in, Array<const S> depths, const BlendSettings& settings, int64_t max_entries) {
-               Splats<S> s = in.splats(settings);
-               expect(depths, s.num_views * s.num_gaussians, "depths");
-               s.depths = depths.data();
-               Binning binning;
-               {
-                 nb::gil_scoped_release release;
-                 binning = bin_tiles(s, max_entries);
-               }
-               return std::make_tuple(release_vector(std::move(binning.tile_offsets)),
-                                      release_vector(std::move(binning.slot_ranges)),
-                                      release_vector(std::move(binning.gaussians)),
-                                      release_vector(std::move(binning.slots)));
-             });
+  module.def(
+      "bin_tiles", [](const Arrays& in, Array<const S> depths, const BlendSettings& settings, int64_t max_entries) {
+        Splats<S> s = in.splats(settings);
+        expect(depths, s.num_views * s.num_gaussians, "depths");
+        s.depths = depths.data();
+        Binning binning;
+        {
+          nb::gil_scoped_release release;
+          binning = bin_tiles(s, max_entries);
+        }
+        return std::make_tuple(release_vector(std::move(binning.tile_offsets)),
+                               release_vector(std::move(binning.slot_ranges)),
+                               release_vector(std::move(binning.gaussians)), release_vector(std::move(binning.slots)));
+      });
 }
 
 template <class S>
 void bind_blending(nb::module_& module) {
   using Arrays = SplatArrays<S>;
-  module.def("rasterize_forward",
-             [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background, const EntryArrays& entries,
-                const BlendSettings& settings,
-                std::tuple<Array<S>, Array<S>, Array<int32_t>, MaybeArray<S>> out, int tallied) {
-               const Splats<S> s = in.with_colors(settings, colors);
-               const int64_t pixels = s.num_views * s.width * s.height;
-               const auto& [color, transmittance, stop, tally] = out;
-               expect(background, s.num_views * s.channels, "background"), expect(color, pixels * s.channels, "color");
-               expect(transmittance, pixels, "transmittance"), expect(stop, pixels, "stop");
-               expect(tally, s.num_views * s.num_gaussians, "tally");
-               if (tallied < 0 || tallied > 4 || tally.has_value() != (tallied > 0))
-                 throw nb::value_error("rasterize: a tally needs its array");
-               const Image<S> image{color.data(), transmittance.data(), stop.data(), data_or_null(background),
-                                    data_or_null(tally), static_cast<Tally>(tallied)};
-               const Entries checked = checked_entries(entries, s);
-               nb::gil_scoped_release release;
-               rasterize_forward(s, checked, image);
-             });
+  module.def("rasterize_forward", [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background,
+                                     const EntryArrays& entries, const BlendSettings& settings,
+                                     std::tuple<Array<S>, Array<S>, Array<int32_t>, MaybeArray<S>> out, int tallied) {
+    const Splats<S> s = in.with_colors(settings, colors);
+    const int64_t pixels = s.num_views * s.width * s.height;
+    const auto& [color, transmittance, stop, tally] = out;
+    expect(background, s.num_views * s.channels, "background"), expect(color, pixels * s.channels, "color");
+    expect(transmittance, pixels, "transmittance"), expect(stop, pixels, "stop");
+    expect(tally, s.num_views * s.num_gaussians, "tally");
+    if (tallied < 0 || tallied > 4 || tally.has_value() != (tallied > 0))
+      throw nb::value_error("rasterize: a tally needs its array");
+    const Image<S> image{color.data(),        transmittance.data(),       stop.data(), data_or_null(background),
+                         data_or_null(tally), static_cast<Tally>(tallied)};
+    const Entries checked = checked_entries(entries, s);
+    nb::gil_scoped_release release;
+    rasterize_forward(s, checked, image);
+  });
   module.def("rasterize_backward",
              [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background, const EntryArrays& entries,
                 const BlendSettings& settings,
@@ -300,8 +315,8 @@ void bind_blending(nb::module_& module) {
                expect(g_colors, rows * s.channels, "colors gradient"), expect(probe, 4 * rows, "probe gradient");
                const ImageGrads<S> from{g_color.data(), g_transmittance.data(), transmittance.data(), stop.data(),
                                         data_or_null(background)};
-               const SplatGrads<S> to{means2d.data(), factors.data(), opacities.data(), g_colors.data(),
-                                      data_or_null(probe), absolute};
+               const SplatGrads<S> to{means2d.data(),  factors.data(),      opacities.data(),
+                                      g_colors.data(), data_or_null(probe), absolute};
                const Entries checked = checked_entries(entries, s);
                nb::gil_scoped_release release;
                rasterize_backward(s, checked, from, to);
@@ -314,22 +329,34 @@ void bind_rasterizer(nb::module_& module) {
   nb::class_<ProjectSettings>(module, "ProjectSettings")
       .def("__init__", [](ProjectSettings* self, int64_t width, int64_t height, double eps2d, double near, double far,
                           double alpha_min, double radius_clip, bool antialiased, int64_t threads) {
-        new (self) ProjectSettings{within(width, kMaxSide, "width"), within(height, kMaxSide, "height"), eps2d, near, far,
-                                   alpha_min, radius_clip, antialiased, within(threads, kMaxThreads, "threads")};
+        new (self) ProjectSettings{within(width, kMaxSide, "width"),
+                                   within(height, kMaxSide, "height"),
+                                   eps2d,
+                                   near,
+                                   far,
+                                   alpha_min,
+                                   radius_clip,
+                                   antialiased,
+                                   within(threads, kMaxThreads, "threads")};
       });
   nb::class_<BlendSettings>(module, "BlendSettings")
       .def("__init__", [](BlendSettings* self, int64_t width, int64_t height, double alpha_min, double alpha_max,
                           double transmittance_min, int64_t threads) {
-        new (self) BlendSettings{within(width, kMaxSide, "width"), within(height, kMaxSide, "height"), alpha_min,
-                                 alpha_max, transmittance_min, within(threads, kMaxThreads, "threads")};
+        new (self) BlendSettings{within(width, kMaxSide, "width"),
+                                 within(height, kMaxSide, "height"),
+                                 alpha_min,
+                                 alpha_max,
+                                 transmittance_min,
+                                 within(threads, kMaxThreads, "threads")};
       });
   bind_projection<float>(module, "GaussianArraysF32"), bind_projection<double>(module, "GaussianArraysF64");
   bind_harmonics<float>(module), bind_harmonics<double>(module);
   bind_binning<float>(module, "SplatArraysF32"), bind_binning<double>(module, "SplatArraysF64");
   bind_blending<float>(module), bind_blending<double>(module);
   module.attr("MAX_SIDE") = kMaxSide;
-  module.def("available_memory", [](const std::string& root) { return available_memory(root); }, nb::arg("root") = "",
-             "Bytes that this process can still take; `root` stands before /proc and /sys.");
+  module.def(
+      "available_memory", [](const std::string& root) { return available_memory(root); }, nb::arg("root") = "",
+      "Bytes that this process can still take; `root` stands before /proc and /sys.");
   module.def("count_nonfinite", [](Array<const float> x, int threads) {
     nb::gil_scoped_release release;
     return count_nonfinite(x.data(), static_cast<int64_t>(x.size()), threads);

@@ -32,7 +32,7 @@ SkinNodes<S> nodes_input(const NodeArrays<S>& arrays) {
   const auto& [positions, radii, motion, values] = arrays;
   const size_t count = radii.shape(0), width = values.shape(1);
   require_shape(positions, count, 3), require_shape(motion, count, 7), require_shape(values, count, width);
-  return {positions.data(), radii.data(), motion.data(), values.data(), static_cast<int64_t>(count),
+  return {positions.data(),           radii.data(), motion.data(), values.data(), static_cast<int64_t>(count),
           static_cast<int64_t>(width)};
 }
 

@@ -18,15 +18,20 @@ namespace nb = nanobind;
 namespace dyngs {
 namespace {
 
-double l1_ssim_arrays(Array<const float, nb::shape<-1, -1, 3>> rendered, Array<const float, nb::shape<-1, -1, 3>> target,
-               std::optional<Array<const float, nb::ndim<2>>> mask,
-               std::optional<Array<float, nb::shape<-1, -1, 3>>> gradient, float ssim_weight, int threads) {
+double l1_ssim_arrays(Array<const float, nb::shape<-1, -1, 3>> rendered,
+                      Array<const float, nb::shape<-1, -1, 3>> target,
+                      std::optional<Array<const float, nb::ndim<2>>> mask,
+                      std::optional<Array<float, nb::shape<-1, -1, 3>>> gradient, float ssim_weight, int threads) {
   const size_t height = rendered.shape(0), width = rendered.shape(1);
   const auto differs = [=](const auto& array) { return array.shape(0) != height || array.shape(1) != width; };
   if (differs(target) || (mask && differs(*mask)) || (gradient && differs(*gradient)))
     throw nb::value_error("l1_ssim: arrays of different sizes");
-  const LossInput input{rendered.data(), target.data(), mask ? mask->data() : nullptr, static_cast<int64_t>(height),
-                        static_cast<int64_t>(width), ssim_weight};
+  const LossInput input{rendered.data(),
+                        target.data(),
+                        mask ? mask->data() : nullptr,
+                        static_cast<int64_t>(height),
+                        static_cast<int64_t>(width),
+                        ssim_weight};
   float* to = gradient ? gradient->data() : nullptr;
   nb::gil_scoped_release release;
   return l1_ssim_loss(input, to, threads);
@@ -35,15 +40,19 @@ double l1_ssim_arrays(Array<const float, nb::shape<-1, -1, 3>> rendered, Array<c
 using AdamOptions = std::tuple<double, double, double, int64_t>;  // beta1, beta2, eps, step
 
 int64_t adam_step_arrays(Array<float, nb::ndim<2>> param, Array<const float, nb::ndim<2>> grad,
-                  Array<float, nb::ndim<2>> exp_avg, Array<float, nb::ndim<2>> exp_avg_sq,
-                  Array<const float, nb::ndim<1>> column_rates, std::optional<Array<const bool, nb::ndim<1>>> rows,
-                  const AdamOptions& options, int threads) {
+                         Array<float, nb::ndim<2>> exp_avg, Array<float, nb::ndim<2>> exp_avg_sq,
+                         Array<const float, nb::ndim<1>> column_rates,
+                         std::optional<Array<const bool, nb::ndim<1>>> rows, const AdamOptions& options, int threads) {
   const size_t num_rows = param.shape(0), row_size = param.shape(1);
   const auto differs = [=](const auto& array) { return array.shape(0) != num_rows || array.shape(1) != row_size; };
   if (differs(grad) || differs(exp_avg) || differs(exp_avg_sq) || column_rates.shape(0) != row_size ||
       (rows && rows->shape(0) != num_rows))
     throw nb::value_error("adam_step: arrays of different sizes");
-  const AdamState state{param.data(),      grad.data(), exp_avg.data(), exp_avg_sq.data(), static_cast<int64_t>(num_rows),
+  const AdamState state{param.data(),
+                        grad.data(),
+                        exp_avg.data(),
+                        exp_avg_sq.data(),
+                        static_cast<int64_t>(num_rows),
                         static_cast<int64_t>(row_size)};
   const auto [beta1, beta2, eps, step] = options;
   const AdamRates rates{column_rates.data(), rows ? rows->data() : nullptr, beta1, beta2, eps, step};
@@ -76,7 +85,8 @@ bool keep_freed_memory() {
 void bind_train(nb::module_& module) {
   module.def("l1_ssim", l1_ssim_arrays, nb::arg("rendered").noconvert(), nb::arg("target").noconvert(),
              nb::arg("mask").noconvert().none(), nb::arg("gradient").noconvert().none(), nb::arg("ssim_weight"),
-             nb::arg("num_threads"), "Loss of two (H, W, 3) pictures; writes its gradient by `rendered` into `gradient`.");
+             nb::arg("num_threads"),
+             "Loss of two (H, W, 3) pictures; writes its gradient by `rendered` into `gradient`.");
   module.def("adam_step", adam_step_arrays, nb::arg("param").noconvert(), nb::arg("grad").noconvert(),
              nb::arg("exp_avg").noconvert(), nb::arg("exp_avg_sq").noconvert(), nb::arg("column_rates").noconvert(),
              nb::arg("rows").noconvert().none(), nb::arg("options"), nb::arg("num_threads"),

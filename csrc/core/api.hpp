@@ -213,7 +213,8 @@ struct PlanePoints {
 
 // Writes features (M, L * C), and into `order` (M) a permutation that puts neighbours next to each other.
 template <class S>
-void hexplane_forward(const HexPlane<S>& planes, const PlanePoints<S>& points, S* features, int32_t* order, int threads);
+void hexplane_forward(const HexPlane<S>& planes, const PlanePoints<S>& points, S* features, int32_t* order,
+                      int threads);
 
 // Gradients of sum(features * g_features), by the planes and, unless null, the points (M, 3). `order` comes from the
 // forward pass.
@@ -314,14 +315,14 @@ void skinning_backward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, c
 template <class S>
 struct RowOffsets {
   int64_t count;
-  const int64_t* rows;  // (M) which Gaussians; null: the first ones
+  const int64_t* rows;                                             // (M) which Gaussians; null: the first ones
   const S *means, *quats, *log_scales, *logit_opacities, *colors;  // (M, 3), (M, 4), (M, 3), (M,), (M, 3)
 };
 
 template <class S>
 struct MovedGaussians {
   S *means, *quats, *log_scales, *logit_opacities, *sh;  // (N, ...)
-  int64_t sh_stride;  // scalars per Gaussian
+  int64_t sh_stride;                                     // scalars per Gaussian
 };
 
 // Adds the offsets in place. Rotations are multiplied by identity + offset, not normalised. No row may occur twice.
@@ -341,7 +342,7 @@ struct Shading {
   const S* places;                      // (N, 3) means at rest, or null: the means
   const S* turn;                        // (3, 3) rotation from rest to the world, or null
   bool normals, timed;
-  S time;                               // in [-1, 1]
+  S time;  // in [-1, 1]
   int threads;
 
   int64_t width() const { return 9 + 4 * normals + timed; }

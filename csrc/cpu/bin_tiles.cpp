@@ -25,9 +25,9 @@ constexpr int kRadixBits = 11, kBuckets = 1 << kRadixBits;
 // Below these sizes starting threads costs more than they save.
 constexpr int64_t kParallelSort = 1 << 18, kParallelSpans = 1 << 11;
 
-constexpr int64_t kBytesPerEntry = 20;      // of lists and spans, at most
-constexpr int64_t kFewEntries = 1 << 22;    // for so few nobody asks how much memory is left
-constexpr int64_t kCountedRows = 1 << 22;   // rows of spans that are still counted once there are too many entries
+constexpr int64_t kBytesPerEntry = 20;     // of lists and spans, at most
+constexpr int64_t kFewEntries = 1 << 22;   // for so few nobody asks how much memory is left
+constexpr int64_t kCountedRows = 1 << 22;  // rows of spans that are still counted once there are too many entries
 
 // How many entries there may be.
 class Budget {
@@ -120,8 +120,8 @@ struct Part {
   std::vector<Span> spans;
   std::vector<int64_t> per_tile;  // counts, then the places where this part writes next
   int64_t entries = 0;
-  bool within_budget = true;      // of all parts; else nothing is kept any more
-  int64_t counted_rows = 0;       // since then
+  bool within_budget = true;  // of all parts; else nothing is kept any more
+  int64_t counted_rows = 0;   // since then
 };
 
 template <class S>

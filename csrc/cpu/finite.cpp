@@ -9,9 +9,7 @@ namespace dyngs {
 namespace {
 
 inline bool is_nonfinite(float x) { return (std::bit_cast<uint32_t>(x) & 0x7f800000u) == 0x7f800000u; }
-inline bool is_nonfinite(double x) {
-  return (std::bit_cast<uint64_t>(x) & 0x7ff0000000000000u) == 0x7ff0000000000000u;
-}
+inline bool is_nonfinite(double x) { return (std::bit_cast<uint64_t>(x) & 0x7ff0000000000000u) == 0x7ff0000000000000u; }
 
 }  // namespace
 

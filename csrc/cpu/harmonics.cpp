@@ -129,8 +129,8 @@ void harmonics_backward(const Harmonics<S>& in, const S* colors, const S* grad_c
     }
 }
 
-#define DYNGS_INSTANTIATE(S)                                        \
-  template void harmonics_forward<S>(const Harmonics<S>&, S*);      \
+#define DYNGS_INSTANTIATE(S)                                   \
+  template void harmonics_forward<S>(const Harmonics<S>&, S*); \
   template void harmonics_backward<S>(const Harmonics<S>&, const S*, const S*, S*, S*, S*);
 DYNGS_INSTANTIATE(float)
 DYNGS_INSTANTIATE(double)

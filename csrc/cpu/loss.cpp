@@ -27,10 +27,10 @@ constexpr int kRadius = 5;
 constexpr int kTaps = 2 * kRadius + 1;
 constexpr double kLargestInFloat = 16;  // of G(d^2) + G(s^2): pictures up to 2
 
-constexpr int kBatch = 4;                        // rows filtered together: each row read serves up to four sums
-constexpr int kWindow = kBatch + 2 * kRadius;    // rows that a batch reads
-constexpr int kRing = 16;                        // rows kept of each map; a power of two, at least kWindow
-constexpr int kHalo = 2 * kRadius;               // a gradient depends on pixels this far away
+constexpr int kBatch = 4;                      // rows filtered together: each row read serves up to four sums
+constexpr int kWindow = kBatch + 2 * kRadius;  // rows that a batch reads
+constexpr int kRing = 16;                      // rows kept of each map; a power of two, at least kWindow
+constexpr int kHalo = 2 * kRadius;             // a gradient depends on pixels this far away
 constexpr int kTileRows = 96;
 constexpr int kTilePixels = 256;
 

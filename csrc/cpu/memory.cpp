@@ -64,8 +64,8 @@ int64_t left_in_control_groups(const std::string& root) {
     std::string path = line.substr(second + 1);
     if (path == "/") path.clear();
     if (controllers.empty()) {
-      left = std::min(left, left_in_groups(root + "/sys/fs/cgroup", path,
-                                           {"memory.max", "memory.current", "inactive_file "}));
+      left = std::min(
+          left, left_in_groups(root + "/sys/fs/cgroup", path, {"memory.max", "memory.current", "inactive_file "}));
     } else if (controllers == "memory") {
       left = std::min(left, left_in_groups(root + "/sys/fs/cgroup/memory", path,
                                            {"memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file "}));

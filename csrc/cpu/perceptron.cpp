@@ -173,13 +173,13 @@ class Buffer {
 template <class S>
 struct Layer {
   int64_t hidden, in, out;
-  const S* forward;        // W^T: (in, out)
-  const S* bias;           // padded
-  const S* to_hidden;      // W[:, :hidden], backward only
-  const S* to_input;       // W[:, hidden:], backward only and of the skip layer only
-  int64_t kept_offset;     // its input within a block's kept scalars, per row; that of the first layer is not kept
-  int64_t weight_offset;   // its weight gradient within a part's sums: (out, stride_of(in))
-  int64_t bias_offset;     // (padded(out),)
+  const S* forward;       // W^T: (in, out)
+  const S* bias;          // padded
+  const S* to_hidden;     // W[:, :hidden], backward only
+  const S* to_input;      // W[:, hidden:], backward only and of the skip layer only
+  int64_t kept_offset;    // its input within a block's kept scalars, per row; that of the first layer is not kept
+  int64_t weight_offset;  // its weight gradient within a part's sums: (out, stride_of(in))
+  int64_t bias_offset;    // (padded(out),)
 };
 
 // A network ready to run: its weights packed.
@@ -202,7 +202,8 @@ class Plan {
         layer.to_input = to = packed_.take(layer.out * padded(layer.in - layer.hidden));
         pack(from + layer.hidden, layer.out, layer.in - layer.hidden, layer.in, 1, to);
       }
-      layer.kept_offset = kept_, layer.weight_offset = sums_, layer.bias_offset = sums_ + layer.out * stride_of(layer.in);
+      layer.kept_offset = kept_, layer.weight_offset = sums_,
+      layer.bias_offset = sums_ + layer.out * stride_of(layer.in);
       kept_ += l == 0 ? 0 : stride_of(layer.in), sums_ = layer.bias_offset + padded(layer.out);
       widest_ = std::max({widest_, layer.in, layer.out});
       from += layer.out * (layer.in + 1);
@@ -212,8 +213,8 @@ class Plan {
   }
 
   int64_t input() const { return input_; }
-  int64_t kept() const { return kept_; }    // scalars per row
-  int64_t sums() const { return sums_; }    // scalars of one part's parameter gradients
+  int64_t kept() const { return kept_; }                 // scalars per row
+  int64_t sums() const { return sums_; }                 // scalars of one part's parameter gradients
   int64_t stride() const { return stride_of(widest_); }  // of any layer's input or output
   const S* zeros() const { return zeros_.data(); }
 
@@ -257,7 +258,9 @@ void unpad_rows(const S* from, int64_t rows, int64_t width, S* to) {
 // The inputs of the other layers land in `inputs`: all of them as kept for the backward pass, or else only the last two.
 template <class S>
 void run_block(const Plan<S>& plan, int64_t rows, const S* x, S* inputs, bool keep, S* last) {
-  const auto place = [&](size_t l) { return inputs + rows * (keep ? plan.layers[l].kept_offset : l % 2 * plan.stride()); };
+  const auto place = [&](size_t l) {
+    return inputs + rows * (keep ? plan.layers[l].kept_offset : l % 2 * plan.stride());
+  };
   const S* from = x;
   for (size_t l = 0; l < plan.layers.size(); ++l) {
     const Layer<S>& layer = plan.layers[l];
@@ -265,8 +268,8 @@ void run_block(const Plan<S>& plan, int64_t rows, const S* x, S* inputs, bool ke
     if (is_last && last == nullptr) return;
     const int64_t next_in = is_last ? layer.out : plan.layers[l + 1].in, stride = stride_of(next_in);
     S* to = is_last ? last : place(l + 1);
-    multiply<false>(Product<S>{rows, layer.in, layer.out, from, stride_of(layer.in), layer.forward, 0, layer.bias, 0, to,
-                               stride, is_last ? After::kNothing : After::kRelu});
+    multiply<false>(Product<S>{rows, layer.in, layer.out, from, stride_of(layer.in), layer.forward, 0, layer.bias, 0,
+                               to, stride, is_last ? After::kNothing : After::kRelu});
     if (next_in > layer.out)
       copy_rows(x, rows, plan.input(), stride_of(plan.input()), to + layer.out, stride, stride - layer.out);
     from = to;
@@ -288,7 +291,8 @@ template <class S>
 struct Rows {
   Buffer<S> x, last, inputs;  // padded; the last two layers' inputs, unless all are kept
   Rows(const Plan<S>& plan, bool kept)
-      : x(kBlock * stride_of(plan.input())), last(kBlock * stride_of(plan.layers.back().out)),
+      : x(kBlock * stride_of(plan.input())),
+        last(kBlock * stride_of(plan.layers.back().out)),
         inputs(kept ? 0 : 2 * kBlock * plan.stride()) {}
 };
 
@@ -297,8 +301,11 @@ template <class S>
 struct Scratch {
   Buffer<S> x, kept, grad, next_grad, grad_x;
   Scratch(const Plan<S>& plan, bool with_kept)
-      : x(kBlock * stride_of(plan.input())), kept(with_kept ? kBlock * plan.kept() : 0), grad(kBlock * plan.stride()),
-        next_grad(kBlock * plan.stride()), grad_x(kBlock * stride_of(plan.input())) {}
+      : x(kBlock * stride_of(plan.input())),
+        kept(with_kept ? kBlock * plan.kept() : 0),
+        grad(kBlock * plan.stride()),
+        next_grad(kBlock * plan.stride()),
+        grad_x(kBlock * stride_of(plan.input())) {}
 };
 
 // Adds a block's parameter gradients to `sums`, and leaves its gradient by scratch.x in scratch.grad_x if asked for.
@@ -423,9 +430,9 @@ void perceptron_backward(const Perceptron<S>& net, int64_t rows, const S* x, con
   sum_parts(plan, sums.get(), parts, net.threads, grad_params);
 }
 
-#define DYNGS_INSTANTIATE(S)                                                                               \
-  template struct Perceptron<S>;                                                                           \
-  template void perceptron_forward<S>(const Perceptron<S>&, int64_t, const S*, S*, S*);                    \
+#define DYNGS_INSTANTIATE(S)                                                            \
+  template struct Perceptron<S>;                                                        \
+  template void perceptron_forward<S>(const Perceptron<S>&, int64_t, const S*, S*, S*); \
   template void perceptron_backward<S>(const Perceptron<S>&, int64_t, const S*, const S*, const S*, S*, S*);
 DYNGS_INSTANTIATE(float)
 DYNGS_INSTANTIATE(double)

@@ -5,8 +5,8 @@
 #include <algorithm>
 #include <cmath>
 
-#include "cpu/parallel.hpp"
 #include "core/api.hpp"
+#include "cpu/parallel.hpp"
 #include "cpu/simd.hpp"
 #include "math/planes.hpp"
 
@@ -116,7 +116,9 @@ struct RowDifferences {
 
 // Numbers that band_penalty needs room for.
 template <class S>
-int64_t room_for(const Plane<S>& plane) { return 4 * plane.row_size() + 2 * plane.channels; }
+int64_t room_for(const Plane<S>& plane) {
+  return 4 * plane.row_size() + 2 * plane.channels;
+}
 
 // The penalty of rows [begin, end), and its gradient.
 template <class S>
@@ -174,8 +176,8 @@ std::vector<Plane<S>> all_planes(const HexPlane<S>& hexplane, const PenaltyWeigh
 }  // namespace
 
 template <class S>
-double plane_penalty(const HexPlane<S>& hexplane, const PenaltyWeights& weights,
-                     std::span<const PlaneGrads<S>> grads, int threads) {
+double plane_penalty(const HexPlane<S>& hexplane, const PenaltyWeights& weights, std::span<const PlaneGrads<S>> grads,
+                     int threads) {
   struct Band {
     size_t plane;
     int64_t begin, end;
@@ -197,8 +199,8 @@ double plane_penalty(const HexPlane<S>& hexplane, const PenaltyWeights& weights,
   return total;
 }
 
-template double plane_penalty<float>(const HexPlane<float>&, const PenaltyWeights&,
-                                     std::span<const PlaneGrads<float>>, int);
+template double plane_penalty<float>(const HexPlane<float>&, const PenaltyWeights&, std::span<const PlaneGrads<float>>,
+                                     int);
 template double plane_penalty<double>(const HexPlane<double>&, const PenaltyWeights&,
                                       std::span<const PlaneGrads<double>>, int);
 

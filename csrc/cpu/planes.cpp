@@ -139,8 +139,12 @@ struct LevelView {
   int64_t size, channels, step, row;  // the last two are strides in elements
 
   LevelView(const PlaneLevel<S>& level, const std::vector<S>& lines, int64_t channels)
-      : space(level.space), lines(lines.data()), size(level.size), channels(channels),
-        step(level.size > 1 ? channels : 0), row(level.size > 1 ? level.size * channels : 0) {}
+      : space(level.space),
+        lines(lines.data()),
+        size(level.size),
+        channels(channels),
+        step(level.size > 1 ? channels : 0),
+        row(level.size > 1 ? level.size * channels : 0) {}
 };
 
 // Where the six planes are read for the points of a chunk: offsets of the first samples, weights of the next ones.
@@ -409,10 +413,15 @@ void hexplane_backward(const HexPlane<S>& planes, const PlanePoints<S>& points, 
         view.lines += c;
         const bool has_coords = g_coords && share == 0;
         S* part = has_coords ? parts.data() + (l * num_blocks + c / kLanes) * coords_size : nullptr;
-        tasks.push_back({view, g_features + l * channels + c, grads[l].space + c, grads[l].time + c, part,
+        tasks.push_back({view,
+                         g_features + l * channels + c,
+                         grads[l].space + c,
+                         grads[l].time + c,
+                         part,
                          static_cast<int>(std::min<int64_t>(kLanes, channels - c)),
                          {!split || share == 0, !split || share == 1, !split || share == 2},
-                         time_rows(planes.time, level.times), level.times});
+                         time_rows(planes.time, level.times),
+                         level.times});
       }
   }
   int64_t longest = 0;

@@ -51,9 +51,9 @@ Loaded<S> load_gaussians(const GaussianViews<S>& in, int64_t first, int count) {
   Loaded<S> g;
   g.mean = {column(in.means, 3, 0), column(in.means, 3, 1), column(in.means, 3, 2)};
   g.scale = {column(in.scales, 3, 0), column(in.scales, 3, 1), column(in.scales, 3, 2)};
-  g.unit = normalize(Quat<Packet<S>>{column(in.quats, 4, 0), column(in.quats, 4, 1), column(in.quats, 4, 2),
-                                     column(in.quats, 4, 3)},
-                     g.inv_norm);
+  g.unit = normalize(
+      Quat<Packet<S>>{column(in.quats, 4, 0), column(in.quats, 4, 1), column(in.quats, 4, 2), column(in.quats, 4, 3)},
+      g.inv_norm);
   g.opacity = column(in.opacities, 1, 0);
   return g;
 }
@@ -113,7 +113,9 @@ void backward_view(const Pinhole<S>& cam, const Loaded<S>& g, const ProjectOptio
   p.z = select(visible, p.z, P(S(1)));
   ProjectionState<P> state;
   const Splat<P> splat = project(cam, p, g.unit, g.scale, options.eps2d, state);
-  const SplatGrad<P> gs{load(grads.means2d, 2, 0), load(grads.means2d, 2, 1), load(grads.depths, 1, 0),
+  const SplatGrad<P> gs{load(grads.means2d, 2, 0),
+                        load(grads.means2d, 2, 1),
+                        load(grads.depths, 1, 0),
                         {load(grads.factors, 3, 0), load(grads.factors, 3, 1), load(grads.factors, 3, 2),
                          load(grads.compensations, 1, 0)}};
   ProjectionGrad<P> d = project_vjp(cam, g.unit, g.scale, options.eps2d, state, splat, gs);
@@ -180,9 +182,9 @@ void project_backward(const GaussianViews<S>& in, const ProjectOptions<S>& optio
   }
 }
 
-#define DYNGS_INSTANTIATE(S)                                                                                        \
-  template void project_forward<S>(const GaussianViews<S>&, const ProjectOptions<S>&, const Projected<S>&);         \
-  template void project_backward<S>(const GaussianViews<S>&, const ProjectOptions<S>&, const int32_t*,              \
+#define DYNGS_INSTANTIATE(S)                                                                                \
+  template void project_forward<S>(const GaussianViews<S>&, const ProjectOptions<S>&, const Projected<S>&); \
+  template void project_backward<S>(const GaussianViews<S>&, const ProjectOptions<S>&, const int32_t*,      \
                                     const ProjectedGrads<S>&, const GaussianGrads<S>&);
 DYNGS_INSTANTIATE(float)
 DYNGS_INSTANTIATE(double)

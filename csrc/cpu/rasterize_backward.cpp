@@ -60,10 +60,10 @@ template <class S>
 struct BlockPixels {
   BlendBehind<Packet<S>> behind;
   Packet<S> threshold;
-  Packet<S> grad[kMaxChannels];               // dL/dC per channel, lane: pixel
-  S grad_rows[kMaxChannels][kLanes];          // the same, to broadcast one pixel
+  Packet<S> grad[kMaxChannels];       // dL/dC per channel, lane: pixel
+  S grad_rows[kMaxChannels][kLanes];  // the same, to broadcast one pixel
   int32_t stop[kLanes];
-  int32_t last = 0;                           // largest stop
+  int32_t last = 0;  // largest stop
 };
 
 template <class S>
@@ -261,7 +261,8 @@ void all_tiles_backward(const Splats<S>& s, const Layout& layout, const Entries&
 }
 
 template <class S>
-void write_gaussian(const Splats<S>& s, int64_t row, const double* sum, const Layout& layout, const SplatGrads<S>& out) {
+void write_gaussian(const Splats<S>& s, int64_t row, const double* sum, const Layout& layout,
+                    const SplatGrads<S>& out) {
   const S mean_x = s.means2d[2 * row], mean_y = s.means2d[2 * row + 1];
   const Vec2<S> near = nearest_in_picture(s, mean_x, mean_y);
   const S* factor = s.factors + 3 * row;

@@ -22,7 +22,8 @@ void write_row(const Shading<S>& in, const Mat3<S>& turn, int64_t row, S* out) {
   const int64_t i = in.picked[row];
   const Vec3<S> mean = load_vec3(in.means + 3 * i), place = in.places ? load_vec3(in.places + 3 * i) : mean;
   const S* box = in.box;
-  out = put(out, contracted<S>({(place.x - box[0]) / box[3], (place.y - box[1]) / box[4], (place.z - box[2]) / box[5]}));
+  out =
+      put(out, contracted<S>({(place.x - box[0]) / box[3], (place.y - box[1]) / box[4], (place.z - box[2]) / box[5]}));
   S inv_norm;  // for a gradient, which is not needed
   Vec3<S> direction = normalize(mean - load_vec3(in.eye), inv_norm);
   if (in.turn) direction = transposed_times(turn, direction);

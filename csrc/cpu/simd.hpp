@@ -107,10 +107,10 @@ struct Mask {
 template <class S>
 using PacketMask = Mask<S, kLanes>;
 
-#define DYNGS_COMPARE(op)                                                       \
-  template <class S, int kCount>                                                \
-  inline Mask<S, kCount> operator op(Simd<S, kCount> a, Simd<S, kCount> b) {    \
-    return {a.v op b.v};                                                        \
+#define DYNGS_COMPARE(op)                                                    \
+  template <class S, int kCount>                                             \
+  inline Mask<S, kCount> operator op(Simd<S, kCount> a, Simd<S, kCount> b) { \
+    return {a.v op b.v};                                                     \
   }
 DYNGS_COMPARE(<)
 DYNGS_COMPARE(<=)
@@ -138,9 +138,9 @@ struct Mask<float, kLanes> {
   friend Mask operator|(Mask a, Mask b) { return {static_cast<__mmask16>(a.bits | b.bits)}; }
   friend Mask operator!(Mask a) { return {static_cast<__mmask16>(~a.bits)}; }
 };
-#define DYNGS_COMPARE(op, code)                                                  \
-  inline PacketMask<float> operator op(Packet<float> a, Packet<float> b) {       \
-    return {_mm512_cmp_ps_mask((__m512)a.v, (__m512)b.v, code)};                 \
+#define DYNGS_COMPARE(op, code)                                            \
+  inline PacketMask<float> operator op(Packet<float> a, Packet<float> b) { \
+    return {_mm512_cmp_ps_mask((__m512)a.v, (__m512)b.v, code)};           \
   }
 DYNGS_COMPARE(<, _CMP_LT_OQ)
 DYNGS_COMPARE(<=, _CMP_LE_OQ)

@@ -228,9 +228,9 @@ void skinning_backward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, c
   });
 }
 
-#define DYNGS_INSTANTIATE(S)                                                                                     \
-  template void skinning_forward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<S>&, int);             \
-  template void skinning_backward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<const S>&,            \
+#define DYNGS_INSTANTIATE(S)                                                                          \
+  template void skinning_forward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<S>&, int);  \
+  template void skinning_backward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<const S>&, \
                                   const SkinGrads<S>&, int);
 DYNGS_INSTANTIATE(float)
 DYNGS_INSTANTIATE(double)

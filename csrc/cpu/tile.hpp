@@ -16,7 +16,7 @@ namespace dyngs {
 inline constexpr int kBlockSide = 4, kBlocks = 16;
 inline constexpr int kChunk = 256;  // Gaussians copied at a time: their records stay in the L1 cache
 
-inline constexpr int kDynamic = 0;        // number of channels known only at run time
+inline constexpr int kDynamic = 0;         // number of channels known only at run time
 inline constexpr int kInlineChannels = 4;  // colours of up to this many channels are copied beside the records
 
 template <class S>
@@ -60,10 +60,10 @@ struct Chunk {
 
 template <class S>
 struct TileFrame {
-  int x0, y0;                     // top left pixel
+  int x0, y0;  // top left pixel
   int view;
-  Packet<S> block_x, block_y;     // first pixel centre of each block
-  uint16_t inside;                // blocks that hold at least one pixel of the image
+  Packet<S> block_x, block_y;  // first pixel centre of each block
+  uint16_t inside;             // blocks that hold at least one pixel of the image
   S log2_alpha_min;
 };
 
@@ -106,8 +106,8 @@ void prefetch(const Splats<S>& s, int64_t row) {
 
 // Copies entries [begin, begin + count) of a tile.
 template <int D, class S>
-[[gnu::noinline]] void load_chunk(const Splats<S>& s, const Entries& entries, const TileFrame<S>& frame, int64_t begin, int count,
-                Chunk<S>& chunk) {
+[[gnu::noinline]] void load_chunk(const Splats<S>& s, const Entries& entries, const TileFrame<S>& frame, int64_t begin,
+                                  int count, Chunk<S>& chunk) {
   chunk.count = count;
   for (int i = 0; i < count; ++i) {
     if (i + kPrefetch < count) prefetch(s, entries.gaussians[begin + i + kPrefetch]);

@@ -20,8 +20,10 @@ inline void transpose16(Packet<float> (&rows)[kLanes]) {
   for (int i = 0; i < 16; i += 4) {  // 4x4 blocks within the four 128-bit parts
     const __m512 r0 = (__m512)rows[i].v, r1 = (__m512)rows[i + 1].v;
     const __m512 r2 = (__m512)rows[i + 2].v, r3 = (__m512)rows[i + 3].v;
-    const __m512d lo01 = _mm512_castps_pd(_mm512_unpacklo_ps(r0, r1)), hi01 = _mm512_castps_pd(_mm512_unpackhi_ps(r0, r1));
-    const __m512d lo23 = _mm512_castps_pd(_mm512_unpacklo_ps(r2, r3)), hi23 = _mm512_castps_pd(_mm512_unpackhi_ps(r2, r3));
+    const __m512d lo01 = _mm512_castps_pd(_mm512_unpacklo_ps(r0, r1)),
+                  hi01 = _mm512_castps_pd(_mm512_unpackhi_ps(r0, r1));
+    const __m512d lo23 = _mm512_castps_pd(_mm512_unpacklo_ps(r2, r3)),
+                  hi23 = _mm512_castps_pd(_mm512_unpackhi_ps(r2, r3));
     a[i] = _mm512_castpd_ps(_mm512_unpacklo_pd(lo01, lo23));
     a[i + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(lo01, lo23));
     a[i + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(hi01, hi23));

@@ -57,7 +57,8 @@ void expect_close(const std::string& what, const std::vector<A>& got, const std:
     largest = std::max(largest, std::abs(static_cast<double>(wanted[i])));
   }
   if (got.size() == wanted.size() && largest > 0 && error <= tolerance * largest) return;
-  std::printf("FAILED %s: largest error %.3g, largest value %.3g, tolerance %.1g\n", what.c_str(), error, largest, tolerance);
+  std::printf("FAILED %s: largest error %.3g, largest value %.3g, tolerance %.1g\n", what.c_str(), error, largest,
+              tolerance);
   ++failures;
 }
 
@@ -68,8 +69,8 @@ void expect_same_bits(const std::string& what, const std::vector<T>& a, const st
 
 // `gradient` is that of `scalar` at x: `count` entries of it, spread over the array, against central differences with
 // steps of `h`, to `tolerance` of the largest gradient.
-inline void expect_gradient(const std::string& what, const std::function<double(const Values&)>& scalar, const Values& x,
-                            const Values& gradient, double h, double tolerance, int64_t count = 12) {
+inline void expect_gradient(const std::string& what, const std::function<double(const Values&)>& scalar,
+                            const Values& x, const Values& gradient, double h, double tolerance, int64_t count = 12) {
   const int64_t n = static_cast<int64_t>(x.size());
   Values got, slopes;
   for (int64_t k = 0; k < std::min(n, count); ++k) {
@@ -98,7 +99,7 @@ inline void expect_near(const std::string& what, double got, double wanted, doub
 
 // `gradient` must be the gradient of <cotangent, f(x)>.
 inline void expect_vjp(const std::string& what, const Function& f, const Values& x, const Values& cotangent,
-                const Values& gradient) {
+                       const Values& gradient) {
   const auto scalar = [&](const Values& at) {
     const Values y = f(at);
     double sum = 0;

@@ -43,7 +43,8 @@ __global__ void rotations(Numbers<S> n) {
 
 template <class S>
 __global__ void projection(Numbers<S> n) {
-  const Pinhole<S> camera{rotation_matrix(n.quat()), n.vec(), n.next(), n.next(), n.next(), n.next(), n.next(), n.next()};
+  const Pinhole<S> camera{
+      rotation_matrix(n.quat()), n.vec(), n.next(), n.next(), n.next(), n.next(), n.next(), n.next()};
   const Quat<S> unit = n.quat();
   const Vec3<S> scale = n.vec();
   const S eps = n.next();

@@ -72,7 +72,8 @@ Values plain_point(const Skin& s, int64_t m, const Values& weights) {
     double a[3], t[3], turned[3];
     for (int c = 0; c < 3; ++c) a[c] = s.coords[3 * m + c] - s.positions[3 * node + c];
     for (int c = 0; c < 3; ++c) t[c] = 2 * (u[(c + 1) % 3] * a[(c + 2) % 3] - u[(c + 2) % 3] * a[(c + 1) % 3]);
-    for (int c = 0; c < 3; ++c) turned[c] = w * t[c] + u[(c + 1) % 3] * t[(c + 2) % 3] - u[(c + 2) % 3] * t[(c + 1) % 3];
+    for (int c = 0; c < 3; ++c)
+      turned[c] = w * t[c] + u[(c + 1) % 3] * t[(c + 2) % 3] - u[(c + 2) % 3] * t[(c + 1) % 3];
     for (int c = 0; c < 3; ++c) out[c] += weights[b] * (turned[c] + s.motion[7 * node + c]);
     for (int64_t k = 0; k < s.width; ++k) out[3 + k] += weights[b] * s.values[node * s.width + k];
   }
@@ -80,8 +81,16 @@ Values plain_point(const Skin& s, int64_t m, const Values& weights) {
 }
 
 void test_skinning(int64_t width) {
-  Skin s{9, 1300, 3, width, uniforms(27, -1, 1), uniforms(9, 0.3, 1), uniforms(63, -1, 1), uniforms(9 * width, -1, 1),
-         uniforms(3900, -1, 1), random_indices(3900, 9)};
+  Skin s{9,
+         1300,
+         3,
+         width,
+         uniforms(27, -1, 1),
+         uniforms(9, 0.3, 1),
+         uniforms(63, -1, 1),
+         uniforms(9 * width, -1, 1),
+         uniforms(3900, -1, 1),
+         random_indices(3900, 9)};
   const Values g_offset = uniforms(3 * s.points, -1, 1), g_blended = uniforms(width * s.points, -1, 1);
   const auto d = skin<double>(s, g_offset, g_blended, 1);
   std::vector<Values> weights;
@@ -89,10 +98,12 @@ void test_skinning(int64_t width) {
   for (int64_t m = 0; m < s.points; ++m) {
     weights.push_back(plain_weights(s, m));
     const Values out = plain_point(s, m, weights.back());
-    offset.insert(offset.end(), out.begin(), out.begin() + 3), blended.insert(blended.end(), out.begin() + 3, out.end());
+    offset.insert(offset.end(), out.begin(), out.begin() + 3),
+        blended.insert(blended.end(), out.begin() + 3, out.end());
   }
-  expect_close("skinning, offset", d.offset, offset, 1e-12), expect_close("skinning, values", d.blended, blended, 1e-12);
-  const auto by = [&](Values Skin::*member) {
+  expect_close("skinning, offset", d.offset, offset, 1e-12),
+      expect_close("skinning, values", d.blended, blended, 1e-12);
+  const auto by = [&](Values Skin::* member) {
     return [&, member](const Values& x) {
       Skin moved = s;
       moved.*member = x;
@@ -204,7 +215,8 @@ double roughness(const Values& planes, int64_t rows, int64_t size, int64_t chann
 double plain_penalty(const Grids& g) {
   double sum = 0;
   for (int l = 0; l < 2; ++l) {
-    for (bool down : {false, true}) sum += kPenalty.space * 0.5 * roughness(g.space[l], kSizes[l], kSizes[l], g.channels, down);
+    for (bool down : {false, true})
+      sum += kPenalty.space * 0.5 * roughness(g.space[l], kSizes[l], kSizes[l], g.channels, down);
     sum += kPenalty.time * roughness(g.times[l], kTimes[l], kSizes[l], g.channels, true);
     double away = 0;
     for (double x : g.times[l]) away += std::abs(1 - x);
@@ -254,7 +266,8 @@ void test_planes(int64_t channels, int64_t points) {
 
 // Perceptron --------------------------------------------------------------------------------------------------------
 
-Values plain_network(const std::vector<int64_t>& widths, int64_t skip, const Values& params, const Values& x, int64_t rows) {
+Values plain_network(const std::vector<int64_t>& widths, int64_t skip, const Values& params, const Values& x,
+                     int64_t rows) {
   Values out;
   const int64_t layers = static_cast<int64_t>(widths.size()) - 1;
   for (int64_t r = 0; r < rows; ++r) {
@@ -311,7 +324,8 @@ void test_perceptron(const std::vector<int64_t>& widths, int64_t skip) {
   const auto f = run_network<float>(widths, skip, params, x, g_y, 1, true);
   const auto four = run_network<float>(widths, skip, params, x, g_y, 4, true);
   const auto again = run_network<float>(widths, skip, params, x, g_y, 4, false);
-  expect_close("float network", f.y, d.y, 1e-5), expect_close("float network by parameters", f.g_params, d.g_params, 1e-3);
+  expect_close("float network", f.y, d.y, 1e-5),
+      expect_close("float network by parameters", f.g_params, d.g_params, 1e-3);
   for (const auto& other : {four, again}) {
     expect_same_bits("network on 4 threads", f.y, other.y);
     expect_same_bits("network on 4 threads, by inputs", f.g_x, other.g_x);
@@ -327,12 +341,15 @@ std::vector<S> moved_rows(int threads) {
   const int64_t n = 6000, count = n / 2;
   Indices rows(count);
   for (int64_t i = 0; i < count; ++i) rows[i] = n - 1 - 2 * i;
-  auto means = as<S>(uniforms(3 * n, -1, 1)), quats = as<S>(uniforms(4 * n, -1, 1)), scales = means, sh = as<S>(uniforms(12 * n, -1, 1));
+  auto means = as<S>(uniforms(3 * n, -1, 1)), quats = as<S>(uniforms(4 * n, -1, 1)), scales = means,
+       sh = as<S>(uniforms(12 * n, -1, 1));
   auto opacities = as<S>(uniforms(n, -1, 1));
   const auto by_means = as<S>(uniforms(3 * count, -1, 1)), by_quats = as<S>(uniforms(4 * count, -1, 1));
-  const RowOffsets<S> offsets{count, rows.data(), by_means.data(), by_quats.data(), by_means.data(), by_quats.data(), by_means.data()};
+  const RowOffsets<S> offsets{count,           rows.data(),     by_means.data(), by_quats.data(),
+                              by_means.data(), by_quats.data(), by_means.data()};
   const S unmoved = means[0];
-  add_offsets(offsets, MovedGaussians<S>{means.data(), quats.data(), scales.data(), opacities.data(), sh.data(), 12}, threads);
+  add_offsets(offsets, MovedGaussians<S>{means.data(), quats.data(), scales.data(), opacities.data(), sh.data(), 12},
+              threads);
   expect(means[0] == unmoved, "rows not asked for stay");
   for (const auto& more : {quats, scales, opacities, sh}) means.insert(means.end(), more.begin(), more.end());
   return means;
@@ -343,12 +360,13 @@ std::vector<S> shaded(int threads) {
   generator().seed(12);
   const int64_t n = 3000;
   const Indices picked = random_indices(n, n);
-  const auto means = as<S>(uniforms(3 * n, -3, 3)), quats = as<S>(uniforms(4 * n, -1, 1)), scales = as<S>(uniforms(3 * n, -1, 1));
+  const auto means = as<S>(uniforms(3 * n, -3, 3)), quats = as<S>(uniforms(4 * n, -1, 1)),
+             scales = as<S>(uniforms(3 * n, -1, 1));
   const auto base = as<S>(uniforms(3 * n, 0, 1)), places = as<S>(uniforms(3 * n, -3, 3));
   const S eye[] = {S(0.25), S(-4), S(0.5)}, box[] = {S(0), S(0), S(0), S(1), S(2), S(1)};
   const S turn[] = {S(0), S(1), S(0), S(-1), S(0), S(0), S(0), S(0), S(1)};
-  const Shading<S> in{n, picked.data(), means.data(), quats.data(), scales.data(), base.data(), eye, box, places.data(), turn,
-                      true, true, S(0.5), threads};
+  const Shading<S> in{n,   picked.data(), means.data(), quats.data(), scales.data(), base.data(), eye,
+                      box, places.data(), turn,         true,         true,          S(0.5),      threads};
   std::vector<S> out(n * in.width());
   shading_inputs(in, out.data());
   return out;

@@ -81,9 +81,9 @@ Values plain_light(const Values& v) {
 
 // By the steps of math/blend.hpp, for cotangents g of the two pixels: the light, and what the backward steps say.
 struct Blended {
-  Values light, shades;             // (2), (kDepth) gradients by the shades
-  double p[kDepth][2];              // gradients by log alpha
-  double slope[kDepth][2];          // d light / d alpha, from front to back
+  Values light, shades;     // (2), (kDepth) gradients by the shades
+  double p[kDepth][2];      // gradients by log alpha
+  double slope[kDepth][2];  // d light / d alpha, from front to back
 };
 
 Blended blend(const Values& v, const Values& g) {
@@ -310,11 +310,13 @@ void test_shading() {
 void test_ssim() {
   const double mx = uniform(0.2, 0.8), my = uniform(0.2, 0.8), vx = uniform(0.01, 0.1), vy = uniform(0.01, 0.1);
   const double xy = uniform(-0.01, 0.01), md = mx - my, ms = mx + my;
-  const Values maps{0, md * md + vx + vy - 2 * xy, ms * ms + vx + vy + 2 * xy};  // a shift of both means, G(d^2), G(s^2)
+  const Values maps{0, md * md + vx + vy - 2 * xy,
+                    ms * ms + vx + vy + 2 * xy};  // a shift of both means, G(d^2), G(s^2)
   const auto ssim = [&](const Values& v) {
     return Values{1 - ssim_terms(md + v[0], ms + v[0], v[1], v[2]).dissimilarity};
   };
-  const double wanted = (2 * mx * my + kSsimC1) * (2 * xy + kSsimC2) / ((mx * mx + my * my + kSsimC1) * (vx + vy + kSsimC2));
+  const double wanted =
+      (2 * mx * my + kSsimC1) * (2 * xy + kSsimC2) / ((mx * mx + my * my + kSsimC1) * (vx + vy + kSsimC2));
   expect_near("ssim", ssim(maps)[0], wanted, 1e-13);
   const SsimTerms<double> t = ssim_terms(md, ms, maps[1], maps[2]);
   expect_vjp("ssim_terms", ssim, maps, {1}, {t.grad_mean, t.grad_diff_square, t.grad_sum_square});
@@ -326,7 +328,8 @@ void test_adam() {
   const AdamCoefficients<double> c{0.1, 0.999, 0.001, 1 / std::sqrt(1 - 0.999 * 0.999), 1e-8};
   const AdamElement<double> next = adam_update(AdamElement<double>{0.3, 0.2, 0.05}, -0.7, 0.01, c);
   const double m = 0.9 * 0.2 - 0.1 * 0.7, v = 0.999 * 0.05 + 0.001 * 0.49;
-  expect_near("Adam, first moment", next.exp_avg, m, 1e-15), expect_near("Adam, second moment", next.exp_avg_sq, v, 1e-15);
+  expect_near("Adam, first moment", next.exp_avg, m, 1e-15),
+      expect_near("Adam, second moment", next.exp_avg_sq, v, 1e-15);
   expect_near("Adam", next.param, 0.3 - 0.01 * m / (std::sqrt(v / (1 - 0.999 * 0.999)) + 1e-8), 1e-15);
 }
 

@@ -150,7 +150,7 @@ void test_needle() {
     ProjectionState<float> state;
     const Vec3<float> center{0, 0, 1}, scale{1e3f, 1e-5f, 1e-5f};
     const Conic<float> s = project(camera, center, Quat<float>{w, 0, 0, z}, scale, 0.3f, state).conic;
-    const double narrow = std::hypot(s.u, std::hypot(s.w, s.v));  // 1 / the small standard deviation
+    const double narrow = std::hypot(s.u, std::hypot(s.w, s.v));     // 1 / the small standard deviation
     expect_near("needle", narrow * std::sqrt(0.3 + 9e-6), 1, 1e-6);  // 9e-6: 300 px times 1e-5, squared
   }
 }

@@ -58,25 +58,39 @@ struct Inputs {
   std::vector<S> means, quats, scales, opacities, viewmats, intrinsics, centers, sh, background;
 
   Inputs(const Scene& s, int threads_)
-      : scene(s), threads(threads_), means(as<S>(s.means)), quats(as<S>(s.quats)), scales(as<S>(s.scales)),
-        opacities(as<S>(s.opacities)), viewmats(as<S>(s.viewmats)), intrinsics(as<S>(s.intrinsics)),
-        centers(as<S>(s.centers)), sh(as<S>(s.sh)), background(as<S>(s.background)) {}
+      : scene(s),
+        threads(threads_),
+        means(as<S>(s.means)),
+        quats(as<S>(s.quats)),
+        scales(as<S>(s.scales)),
+        opacities(as<S>(s.opacities)),
+        viewmats(as<S>(s.viewmats)),
+        intrinsics(as<S>(s.intrinsics)),
+        centers(as<S>(s.centers)),
+        sh(as<S>(s.sh)),
+        background(as<S>(s.background)) {}
 
   GaussianViews<S> views() const {
-    return {scene.n, scene.views, means.data(), quats.data(), scales.data(), opacities.data(), viewmats.data(),
-            intrinsics.data()};
+    return {scene.n,       scene.views,      means.data(),    quats.data(),
+            scales.data(), opacities.data(), viewmats.data(), intrinsics.data()};
   }
   ProjectOptions<S> options() const {
     return {scene.width, scene.height, S(0.3), S(0.2), S(100), static_cast<S>(scene.alpha_min), S(0), true, threads};
   }
   Harmonics<S> harmonics(const int32_t* radii) const {
-    return {scene.n, scene.views, static_cast<int>(scene.terms()), scene.degree, means.data(), centers.data(), sh.data(),
-            radii, threads};
+    return {scene.n,      scene.views,  static_cast<int>(scene.terms()),
+            scene.degree, means.data(), centers.data(),
+            sh.data(),    radii,        threads};
   }
   Splats<S> splats(const Drawn<S>& d) const {
-    return {scene.n, scene.views, scene.width, scene.height, scene.channels, d.means2d.data(), d.factors.data(),
-            d.opacities.data(), d.depths.data(), d.colors.data(), d.radii.data(), static_cast<S>(scene.alpha_min),
-            S(0.99), static_cast<S>(scene.transmittance_min), threads};
+    return {scene.n,          scene.views,
+            scene.width,      scene.height,
+            scene.channels,   d.means2d.data(),
+            d.factors.data(), d.opacities.data(),
+            d.depths.data(),  d.colors.data(),
+            d.radii.data(),   static_cast<S>(scene.alpha_min),
+            S(0.99),          static_cast<S>(scene.transmittance_min),
+            threads};
   }
 };
 
@@ -86,9 +100,9 @@ void project_all(const Inputs<S>& in, Drawn<S>& d) {
   const int64_t rows = s.views * s.n;
   d.means2d.resize(2 * rows), d.depths.resize(rows), d.factors.resize(3 * rows), d.compensations.resize(rows);
   d.radii.resize(2 * rows), d.opacities.resize(rows);
-  project_forward(in.views(), in.options(),
-                  Projected<S>{d.means2d.data(), d.depths.data(), d.factors.data(), d.compensations.data(),
-                               d.radii.data()});
+  project_forward(
+      in.views(), in.options(),
+      Projected<S>{d.means2d.data(), d.depths.data(), d.factors.data(), d.compensations.data(), d.radii.data()});
   for (int64_t i = 0; i < rows; ++i) d.opacities[i] = in.opacities[i % s.n] * d.compensations[i];
   d.colors = as<S>(s.features);
   if (s.channels == 3) harmonics_forward(in.harmonics(d.radii.data()), d.colors.data());
@@ -111,11 +125,11 @@ void backward(const Inputs<S>& in, const Entries& entries, const Cotangents& cot
   const auto g_depths = as<S>(cotangents.depths);
   std::vector<S> g_means2d(2 * rows), g_factors(3 * rows), g_seen(rows), g_compensations(rows);
   d.g_features.resize(rows * s.channels), d.probe.resize(4 * rows);
-  rasterize_backward(in.splats(d), entries,
-                     ImageGrads<S>{g_color.data(), g_transmittance.data(), d.transmittance.data(), d.stop.data(),
-                                   in.background.data()},
-                     SplatGrads<S>{g_means2d.data(), g_factors.data(), g_seen.data(), d.g_features.data(), d.probe.data(),
-                                   true});
+  rasterize_backward(
+      in.splats(d), entries,
+      ImageGrads<S>{g_color.data(), g_transmittance.data(), d.transmittance.data(), d.stop.data(),
+                    in.background.data()},
+      SplatGrads<S>{g_means2d.data(), g_factors.data(), g_seen.data(), d.g_features.data(), d.probe.data(), true});
   d.g_opacities.assign(s.n, S(0));
   for (int64_t i = 0; i < rows; ++i) {
     d.g_opacities[i % s.n] += g_seen[i] * d.compensations[i];
@@ -143,9 +157,9 @@ Drawn<S> draw(const Scene& s, int threads, const Cotangents* cotangents = nullpt
   const Entries entries{bins.tile_offsets.data(), bins.slot_ranges.data(), bins.gaussians.data(), bins.slots.data(),
                         static_cast<int64_t>(bins.gaussians.size())};
   d.color.resize(s.pixels() * s.channels), d.transmittance.resize(s.pixels()), d.stop.resize(s.pixels());
-  rasterize_forward(splats, entries,
-                    Image<S>{d.color.data(), d.transmittance.data(), d.stop.data(), in.background.data(), nullptr,
-                             Tally::kNone});
+  rasterize_forward(
+      splats, entries,
+      Image<S>{d.color.data(), d.transmittance.data(), d.stop.data(), in.background.data(), nullptr, Tally::kNone});
   if (cotangents == nullptr) return d;
   backward(in, entries, *cotangents, d);
   auto color = d.color, transmittance = d.transmittance;  // a tally draws again
@@ -187,7 +201,7 @@ Values plain_picture(const Scene& s, const Drawn<double>& d) {
 }
 
 void test_gradients(const Scene& s, const Cotangents& cotangents, const Drawn<double>& d) {
-  const auto by = [&](Values Scene::*member) {
+  const auto by = [&](Values Scene::* member) {
     return [&s, &cotangents, member](const Values& x) {
       Scene moved = s;
       moved.*member = x;
@@ -196,7 +210,7 @@ void test_gradients(const Scene& s, const Cotangents& cotangents, const Drawn<do
              dot(drawn.depths, cotangents.depths);
     };
   };
-  const auto test = [&](const char* name, Values Scene::*member, const Values& gradient) {
+  const auto test = [&](const char* name, Values Scene::* member, const Values& gradient) {
     expect_gradient(std::string(name) + " gradient, D=" + std::to_string(s.channels), by(member), s.*member, gradient,
                     1e-6, 1e-6, 6);
   };
@@ -274,7 +288,8 @@ void test_nothing_to_draw() {
   for (int64_t i = 0; i < s.n; ++i) s.means[3 * i + 2] = -5;  // behind the cameras
   const Cotangents cotangents = random_cotangents(s);
   const Drawn<float> d = draw<float>(s, 2, &cotangents);
-  expect(std::all_of(d.transmittance.begin(), d.transmittance.end(), [](float x) { return x == 1; }), "nothing is drawn");
+  expect(std::all_of(d.transmittance.begin(), d.transmittance.end(), [](float x) { return x == 1; }),
+         "nothing is drawn");
   expect(d.color[0] == static_cast<float>(s.background[0]), "an empty picture shows the background");
 }
 

@@ -26,7 +26,8 @@ double blurred(const Pictures& p, int64_t row, int64_t col, F&& f) {
     for (int j = -5; j <= 5; ++j) {
       const double tap = std::exp(-(i * i + j * j) / (2 * 1.5 * 1.5));
       total += tap;
-      if (row + i >= 0 && row + i < p.height && col + j >= 0 && col + j < p.width) sum += tap * f((row + i) * p.width + col + j);
+      if (row + i >= 0 && row + i < p.height && col + j >= 0 && col + j < p.width)
+        sum += tap * f((row + i) * p.width + col + j);
     }
   return sum / total;
 }
@@ -59,15 +60,21 @@ double plain_loss(const Pictures& p, int64_t row_begin, int64_t row_end, int64_t
 }
 
 void test_loss(int64_t height, int64_t width, double ssim_weight, bool masked) {
-  Pictures p{height, width, uniforms(3 * height * width, 0, 1), uniforms(3 * height * width, 0, 1),
-             masked ? uniforms(height * width, 0, 1) : Values(height * width, 1), ssim_weight};
+  Pictures p{height,
+             width,
+             uniforms(3 * height * width, 0, 1),
+             uniforms(3 * height * width, 0, 1),
+             masked ? uniforms(height * width, 0, 1) : Values(height * width, 1),
+             ssim_weight};
   const auto x = as<float>(p.rendered), y = as<float>(p.target), mask = as<float>(p.mask);
-  const LossInput input{x.data(), y.data(), masked ? mask.data() : nullptr, height, width, static_cast<float>(ssim_weight)};
+  const LossInput input{x.data(), y.data(), masked ? mask.data() : nullptr,
+                        height,   width,    static_cast<float>(ssim_weight)};
   std::vector<float> gradient(x.size()), again(x.size());
   const double loss = l1_ssim_loss(input, gradient.data(), 1);
   const std::string what = std::to_string(width) + "x" + std::to_string(height);
   const double four = l1_ssim_loss(input, again.data(), 4);
-  expect(loss == four && loss == l1_ssim_loss(input, nullptr, 2), "the loss is the same on any number of threads " + what);
+  expect(loss == four && loss == l1_ssim_loss(input, nullptr, 2),
+         "the loss is the same on any number of threads " + what);
   expect_same_bits("gradient of the loss on 4 threads " + what, gradient, again);
   double weights = 0;
   for (double m : p.mask) weights += m;
@@ -109,7 +116,8 @@ void test_adam(int64_t rows, int64_t size, double share) {
   Moments plain{start, Values(start.size()), Values(start.size())};
   const auto float_rates = as<float>(rates);
   std::vector<float> param[2], first[2], second[2];
-  for (int k = 0; k < 2; ++k) param[k] = as<float>(start), first[k].resize(start.size()), second[k].resize(start.size());
+  for (int k = 0; k < 2; ++k)
+    param[k] = as<float>(start), first[k].resize(start.size()), second[k].resize(start.size());
   for (int64_t step = 1; step <= 3; ++step) {
     auto grad = as<float>(uniforms(rows * size, -1, 1));
     const auto asked = std::make_unique<bool[]>(rows);
