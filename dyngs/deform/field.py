@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.ops.offsets import add_offsets_
+from dyngs.ops.quaternions import identity_quat, quat_product
 from dyngs.ops.registration import has_kernel
 from dyngs.parameters import Parameters
 from dyngs.state import State, moved_to, part_of, prefixed
@@ -209,17 +210,7 @@ def chosen(x: Tensor, rows: Tensor | None) -> Tensor:
 
 def turned_quats(quats: Tensor, offsets: Tensor) -> Tensor:
     """(M, 4) the rotations ``quats`` followed by identity + ``offsets``: a Hamilton product, not normalised."""
-    w1, x1, y1, z1 = (offsets + offsets.new_tensor([1.0, 0.0, 0.0, 0.0])).unbind(-1)
-    w2, x2, y2, z2 = quats.unbind(-1)
-    return torch.stack(
-        [
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-        ],
-        dim=-1,
-    )
+    return quat_product(offsets + identity_quat(offsets), quats)
 
 
 def _added(x: Tensor, offset: Tensor, rows: Tensor | None) -> Tensor:

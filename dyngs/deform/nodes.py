@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dyngs.deform.field import Offsets
-from dyngs.ops.quaternions import unit_quats
+from dyngs.ops.quaternions import identity_quat, rotate
 from dyngs.ops.skinning import blend_skinning
 
 if TYPE_CHECKING:
@@ -101,11 +101,7 @@ def follow(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:
 
 def turned(offsets: Tensor, vectors: Tensor) -> Tensor:
     """(..., 3) ``vectors`` turned by the rotations identity + ``offsets`` (..., 4), of any length."""
-    quats = offsets + offsets.new_tensor([1.0, 0.0, 0.0, 0.0])
-    unit = unit_quats(quats)
-    w, axis = unit[..., :1], unit[..., 1:]
-    twice = 2 * torch.linalg.cross(axis, vectors)
-    return vectors + w * twice + torch.linalg.cross(axis, twice)
+    return rotate(offsets + identity_quat(offsets), vectors)
 
 
 def _tree(points: Tensor) -> KDTree:

@@ -1,6 +1,11 @@
-"""Quaternions of any length made unit quaternions, as the kernels do it (``normalize`` in csrc/math/projection.hpp)."""
+"""Quaternions wxyz of any length: unit quaternions, products, rotations of vectors, rotation matrices.
+
+Unit quaternions are made as the kernels make them (``normalize`` in csrc/math/projection.hpp).
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -10,7 +15,7 @@ SHORTEST = 1e-12
 
 
 def unit_quats(quats: Tensor) -> Tensor:
-    """(..., 4) unit quaternions wxyz along ``quats`` of any length; zero becomes the identity, with a gradient of zero.
+    """Return the unit quaternions (..., 4) along ``quats`` of any length; the identity for zero, with zero gradient.
 
     Divided by the largest entry first, so that no square leaves the range of floats. NaN and infinity give NaN.
     """
@@ -19,6 +24,46 @@ def unit_quats(quats: Tensor) -> Tensor:
     scaled = quats / largest.clamp_min(SHORTEST)
     exact = quats.detach() / torch.where(zero, 1, largest)
     scaled = scaled + (exact - scaled).detach()  # another value where a quaternion is short, the gradient as it was
-    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-    scaled = torch.where(zero, identity, scaled)
+    scaled = torch.where(zero, identity_quat(quats), scaled)
     return scaled / scaled.norm(dim=-1, keepdim=True)
+
+
+def identity_quat(like: Tensor) -> Tensor:
+    """Return the quaternion (4,) of no rotation, in the dtype and on the device of ``like``."""
+    return like.new_tensor([1.0, 0.0, 0.0, 0.0])
+
+
+def quat_product(left: Tensor, right: Tensor) -> Tensor:
+    """Return the Hamilton products (..., 4): the rotation ``right`` followed by ``left``, not normalised."""
+    w1, x1, y1, z1 = left.unbind(-1)
+    w2, x2, y2, z2 = right.unbind(-1)
+    return torch.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ],
+        dim=-1,
+    )
+
+
+def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
+    """Return ``vectors`` (..., 3) rotated by ``quats`` (..., 4) of any length; zero rotates nothing."""
+    unit = unit_quats(quats)
+    w, axis = unit[..., :1], unit[..., 1:]
+    twice = 2 * torch.linalg.cross(axis, vectors)
+    return vectors + w * twice + torch.linalg.cross(axis, twice)
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Return the rotation matrices (..., 3, 3) of ``quats`` (..., 4) of any length; the identity for zero."""
+    return torch.stack(matrix_entries(unit_quats(quats).unbind(-1)), dim=-1).unflatten(-1, (3, 3))
+
+
+def matrix_entries(unit: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """Return the nine entries, row by row, of the rotation matrices of unit quaternions given as w, x, y, z."""
+    w, x, y, z = unit
+    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
+    xy, xz, yz, wx, wy, wz = 2 * x * y, 2 * x * z, 2 * y * z, 2 * w * x, 2 * w * y, 2 * w * z
+    return (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)

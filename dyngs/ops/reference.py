@@ -11,22 +11,8 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.ops.projection import Projection, ProjectionOptions
+from dyngs.ops.quaternions import rotation_matrices
 from dyngs.ops.rasterization import Blended, BlendOptions
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """(N, 3, 3) rotations of quaternions (N, 4) wxyz of any norm; zero gives the identity."""
-    largest = quats.detach().abs().amax(dim=-1, keepdim=True)
-    scaled = quats / torch.where(largest > 0, largest, 1.0)  # its squares neither overflow nor vanish
-    norm = scaled.norm(dim=-1, keepdim=True)
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype).expand_as(quats)
-    w, x, y, z = torch.where(norm > 0, scaled / torch.where(norm > 0, norm, 1.0), identity).unbind(-1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
 def covariances2d(means: Tensor, quats: Tensor, scales: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dyngs.ops.native import array, core, num_threads
-from dyngs.ops.quaternions import unit_quats
+from dyngs.ops.quaternions import rotation_matrices
 from dyngs.ops.registration import Gradient, register
 
 
@@ -159,11 +159,5 @@ def contracted(points: Tensor) -> Tensor:
 
 def shortest_axes(quats: Tensor, log_scales: Tensor) -> Tensor:
     """Return (M, 3) unit vectors along the shortest axis of each Gaussian: the normal of a flat one, up to its sign."""
-    w, x, y, z = unit_quats(quats).unbind(-1)
-    columns = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
-    axes = torch.stack([torch.stack(column, dim=1) for column in columns], dim=1)
-    return axes[torch.arange(len(axes)), log_scales.argmin(dim=1)]
+    shortest = log_scales.argmin(dim=1)
+    return rotation_matrices(quats).gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]

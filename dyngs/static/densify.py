@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dyngs.config import DefaultStrategy
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.ops.quaternions import unit_quats
+from dyngs.ops.quaternions import rotate
 from dyngs.tensor_checks import require_tensor
 
 SPLIT_SHRINK = 1.6
@@ -215,11 +215,3 @@ def _with_lowered_opacities(result: EditResult, logit_opacities: Tensor) -> Edit
     lowered = moved.clamp_max(math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
     changes = {**result.changes, "logit_opacities": lowered}
     return EditResult(result.edit, changes, result.zero_moments | {"logit_opacities"})
-
-
-def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
-    """(N, 3) ``vectors`` turned by ``quats`` (N, 4) wxyz of any length; a zero quaternion turns nothing."""
-    unit = unit_quats(quats)
-    w, axis = unit[:, :1], unit[:, 1:]
-    twice = 2 * torch.linalg.cross(axis, vectors)
-    return vectors + w * twice + torch.linalg.cross(axis, twice)

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from dyngs.config import McmcStrategy
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.static.densify import MAX_LOG_VARIANCE, DensifySchedule, rotate
+from dyngs.ops.quaternions import rotate
+from dyngs.static.densify import MAX_LOG_VARIANCE, DensifySchedule, EditResult, rotate
 
 MAX_COPIES = 50
 NOISE_STEEPNESS = 100.0

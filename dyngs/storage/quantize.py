@@ -9,6 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import torch
+
+from dyngs.ops.quaternions import quat_product
 
 LIMIT = 2**20
 """Whole numbers are smaller in size; larger values are stored as they are."""
@@ -140,15 +143,5 @@ def _unit(quats: np.ndarray) -> np.ndarray:
 
 
 def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(N, 4) Hamilton products wxyz."""
-    w1, x1, y1, z1 = left.T
-    w2, x2, y2, z2 = right.T
-    return np.stack(
-        [
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-        ],
-        axis=1,
-    )
+    """Return the (N, 4) Hamilton products wxyz."""
+    return quat_product(torch.from_numpy(left), torch.from_numpy(right)).numpy()

@@ -10,12 +10,10 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.deform.nodes import turned
-from dyngs.human.pose.covariance import rotations_of, transform_covariance
+from dyngs.human.pose.covariance import transform_covariance
 from dyngs.ops.projection import project
-from dyngs.ops.quaternions import unit_quats
-from dyngs.ops.reference import rotation_matrices
+from dyngs.ops.quaternions import quat_product, rotate, rotation_matrices, unit_quats
 from dyngs.ops.shading import shortest_axes
-from dyngs.static.densify import rotate
 
 SCALES = [1e-45, 1e-38, 1e-30, 1e-20, 1e-13, 1e-6, 1.0, 1e6, 1e13, 1e20, 1e37]
 ROUNDING = 8 * torch.finfo(torch.float32).eps
@@ -48,7 +46,6 @@ def test_every_user_takes_every_length(scale: float) -> None:
     matrices = rotation_matrices(quats.double()).float()
     vectors, log_scales = torch.randn(3, 3), torch.tensor([[0.0, -1.0, -2.0]]).repeat(3, 1)
     close = {"rtol": 0, "atol": 8 * ROUNDING}  # entries are sums of products of two entries each
-    torch.testing.assert_close(rotations_of(quats), matrices, **close)
     torch.testing.assert_close(rotation_matrices(quats), matrices, **close)
     torch.testing.assert_close(shortest_axes(quats, log_scales), matrices[:, :, 2], **close)
     moved = (matrices @ vectors[..., None])[..., 0]
@@ -90,3 +87,19 @@ def test_zero_is_the_identity_and_what_is_not_finite_stays_so() -> None:
     assert not quats.grad.any()
     for bad in (float("nan"), float("inf")):
         assert bool(unit_quats(torch.tensor([bad, 0.0, 0.0, 1.0])).isnan().any())
+
+
+def test_rotation_of_a_quarter_turn_and_of_nothing() -> None:
+    quats = torch.tensor([[2.0, 0, 0, 2.0], [0.0, 0, 0, 0]], dtype=torch.float64)
+    turn, nothing = rotation_matrices(quats)
+    torch.testing.assert_close(turn @ torch.tensor([1.0, 0, 0]).double(), torch.tensor([0.0, 1, 0]).double())
+    assert torch.equal(nothing, torch.eye(3, dtype=torch.float64))
+
+
+def test_products_rotate_by_the_right_one_first() -> None:
+    first, second = some_quats(1).double(), some_quats(2).double()
+    vectors = torch.randn(50, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    both = quat_product(second, first)
+    torch.testing.assert_close(rotation_matrices(both), rotation_matrices(second) @ rotation_matrices(first))
+    torch.testing.assert_close(rotate(both, vectors), rotate(second, rotate(first, vectors)))
+    torch.testing.assert_close(both.norm(dim=1), first.norm(dim=1) * second.norm(dim=1))

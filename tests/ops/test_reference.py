@@ -46,13 +46,6 @@ def test_gradcheck(antialiased: bool) -> None:
     assert torch.autograd.gradcheck(run, [getattr(scene, name) for name in names])
 
 
-def test_rotation_of_a_quarter_turn_and_of_nothing() -> None:
-    quats = torch.tensor([[2.0, 0, 0, 2.0], [0.0, 0, 0, 0]], dtype=torch.float64)
-    turn, nothing = reference.rotation_matrices(quats)
-    torch.testing.assert_close(turn @ torch.tensor([1.0, 0, 0]).double(), torch.tensor([0.0, 1, 0]).double())
-    assert torch.equal(nothing, torch.eye(3, dtype=torch.float64))
-
-
 def test_ball_on_the_optical_axis() -> None:
     """Variance (focal scale / z)^2 + eps, mean on the principal point, extent by the opacity."""
     sigma, z, opacity = 0.2, 4.0, 0.7

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.human.pose.covariance import rotations_of
 from dyngs.ops.native import kernel_threads
+from dyngs.ops.quaternions import rotation_matrices
 from dyngs.ops.shading import Sight, contracted, num_inputs, reference_inputs, shading_inputs, shading_op, shortest_axes
 
 
@@ -23,7 +23,7 @@ def sight(seed: int, *, normals: bool, timed: bool, on_body: bool, dtype: torch.
         return torch.randn(shape, generator=g, dtype=torch.float64).to(dtype)
 
     box = torch.stack([random(3), 0.1 + random(3).abs()])
-    rest = (random(11, 3), rotations_of(random(1, 4))[0]) if on_body else None
+    rest = (random(11, 3), rotation_matrices(random(1, 4))[0]) if on_body else None
     rows = torch.randperm(11, generator=g)[:7]
     return Sight(
         random(11, 3), random(11, 4), random(11, 3), rows, random(3), box, rest, 0.3 if timed else None, normals
@@ -106,7 +106,7 @@ def test_far_places_stay_bounded_and_in_order(seed: int, scale: float) -> None:
 def test_the_shortest_axis_is_the_normal() -> None:
     quats = torch.randn(30, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     log_scales = torch.randn(30, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    expected = rotations_of(quats).gather(2, log_scales.argmin(1)[:, None, None].expand(30, 3, 1))[..., 0]
+    expected = rotation_matrices(quats).gather(2, log_scales.argmin(1)[:, None, None].expand(30, 3, 1))[..., 0]
     torch.testing.assert_close(shortest_axes(quats, log_scales), expected)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dyngs.human.pose.nearest_rotation import quats_of
-from dyngs.ops.quaternions import unit_quats
+from dyngs.ops.quaternions import rotation_matrices
 
 _SWEEPS = 6
 """Limit on the sweeps of Jacobi's method, which converges quadratically: nearly rigid maps need 1 or 2."""
@@ -40,17 +40,8 @@ def transform_covariance(linear: Tensor, quats: Tensor, log_scales: Tensor) -> t
     """
     longest = log_scales.amax(-1, keepdim=True)
     lengths = (log_scales - longest).clamp_min(_THINNEST).exp()
-    axes, moved = _Axes.apply(linear @ (rotations_of(quats) * lengths[:, None, :]))  # pyright: ignore[reportGeneralTypeIssues]
+    axes, moved = _Axes.apply(linear @ (rotation_matrices(quats) * lengths[:, None, :]))  # pyright: ignore[reportGeneralTypeIssues]
     return quats_of(axes), moved + longest
-
-
-def rotations_of(quats: Tensor) -> Tensor:
-    """Return the rotations (N, 3, 3) of quaternions wxyz (N, 4) of any length; the identity for zero."""
-    w, x, y, z = unit_quats(quats).T
-    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
-    xy, xz, yz, wx, wy, wz = 2 * x * y, 2 * x * z, 2 * y * z, 2 * w * x, 2 * w * y, 2 * w * z
-    rows = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
 class _Axes(torch.autograd.Function):

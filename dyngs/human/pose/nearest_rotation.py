@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from dyngs.ops.quaternions import matrix_entries
+
 _ROOT_STEPS = 20
 """Limit on the steps of Laguerre's method: 2 to 4 suffice for nearly rigid blends, multiple roots need more."""
 
@@ -57,7 +59,8 @@ class _NearestRotation(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, matrices: Tensor) -> Tensor:
         a = _components(matrices.detach())
-        blocks = [_rotations(_dominant_quats(block.double())).to(a.dtype) for block in a.split(_BLOCK, dim=1)]
+        quats = (_dominant_quats(block.double()) for block in a.split(_BLOCK, dim=1))
+        blocks = [torch.stack(matrix_entries(unit.unbind())).to(a.dtype) for unit in quats]
         r = torch.cat(blocks, dim=1)
         ctx.save_for_backward(a, r)
         return r.T.reshape(matrices.shape)
@@ -175,12 +178,3 @@ def _largest(columns: Tensor) -> Tensor:
     for other, entry in zip(others, diagonal[1:], strict=True):
         chosen, largest = torch.where(entry > largest, other, chosen), torch.maximum(largest, entry)
     return chosen / chosen.square().sum(0).sqrt().clamp_min(1e-30)
-
-
-def _rotations(quats: Tensor) -> Tensor:
-    """Return the matrices (9, L), row by row, of unit quaternions (4, L)."""
-    w, x, y, z = quats.unbind()
-    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
-    xy, xz, yz, wx, wy, wz = 2 * x * y, 2 * x * z, 2 * y * z, 2 * w * x, 2 * w * y, 2 * w * z
-    rows = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
-    return torch.stack(rows)

@@ -105,7 +105,7 @@ def _reach(heights: tuple[float, ...]) -> float:
 def _turned(quats: Tensor, turns: Tensor) -> Tensor:
     """(N, 4) the rotations ``quats`` after the unit quaternions along 1 + ``turns`` (N, 4), each normalised by itself.
 
-    Hamilton product q r, wxyz.
+    Hamilton product q r, wxyz; not ``quat_product``, whose sums round otherwise: predictions would differ in last bits.
     """
     one = turns.new_tensor([1.0, 0.0, 0.0, 0.0])
     w, *xyz = unit_quats(one + turns).unbind(1)

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors, heaviest_joints, skinning_weights, texel_gaussians
-from dyngs.human.pose.covariance import rotations_of
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.load import default_template
+from dyngs.ops.quaternions import rotation_matrices
 
 RESOLUTION = 48
 
@@ -58,7 +58,7 @@ def test_first_gaussians_lie_flat_on_their_scaffolds() -> None:
     gaussians, anchors = texel_gaussians(texels, (0.0, 0.03), 1)
     assert len(gaussians) == len(anchors) == 2 * len(texels)
     torch.testing.assert_close(gaussians.means[len(texels) :], texels.points + 0.03 * texels.normals)
-    thin = rotations_of(gaussians.quats)[:, :, 2]
+    thin = rotation_matrices(gaussians.quats)[:, :, 2]
     torch.testing.assert_close(thin[: len(texels)], texels.normals, rtol=0, atol=1e-5)
     assert gaussians.log_scales.argmin(1).eq(2).all()
     assert gaussians.opacities[0] > 0.5 > gaussians.opacities[-1]

@@ -26,13 +26,13 @@ from dyngs.human.avatar.posing import (
     rest_offsets,
     rotate_sh,
 )
-from dyngs.human.pose.covariance import rotations_of
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate, posed_vertices
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.human.template.load import default_template
 from dyngs.ops.harmonics import evaluate_harmonics
+from dyngs.ops.quaternions import rotation_matrices
 
 RESOLUTION = 48
 LEFT_ELBOW, LEFT_WRIST = JOINT_NAMES.index("left_elbow"), JOINT_NAMES.index("left_wrist")
@@ -59,7 +59,7 @@ def in_pose(turns: dict[int, tuple[float, float, float]], gaussians: Gaussians |
 
 
 def covariances(gaussians: Gaussians) -> Tensor:
-    half = rotations_of(gaussians.quats) * gaussians.scales[:, None, :]
+    half = rotation_matrices(gaussians.quats) * gaussians.scales[:, None, :]
     return half @ half.mT
 
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.human.pose.covariance import rotations_of, transform_covariance
-from dyngs.ops.reference import rotation_matrices
+from dyngs.human.pose.covariance import transform_covariance
+from dyngs.ops.quaternions import rotation_matrices
 
 
 def normal(*shape: int, seed: int = 0) -> Tensor:
@@ -71,7 +71,7 @@ def test_gradients_are_those_of_the_covariance() -> None:
 
 @pytest.mark.parametrize("log_scales", [(-4.0, -4.0, -4.0), (-4.0, -4.0, -6.0), (0.0, -80.0, -80.0)])
 def test_gradients_stay_finite_for_discs_balls_and_needles(log_scales: tuple[float, ...]) -> None:
-    linear = rotations_of(torch.randn(5, 4, generator=torch.Generator().manual_seed(2)))
+    linear = rotation_matrices(torch.randn(5, 4, generator=torch.Generator().manual_seed(2)))
     given = [linear, torch.tensor([[1.0, 0, 0, 0]]).repeat(5, 1), torch.tensor([log_scales]).repeat(5, 1)]
     given = [x.requires_grad_() for x in given]
     quats, moved = transform_covariance(*given)
@@ -92,4 +92,4 @@ def test_no_gaussians_and_zero_quaternions() -> None:
     quats, log_scales = transform_covariance(torch.zeros(0, 3, 3), torch.zeros(0, 4), torch.zeros(0, 3))
     assert quats.shape == (0, 4)
     assert log_scales.shape == (0, 3)
-    torch.testing.assert_close(rotations_of(torch.zeros(1, 4)), torch.eye(3)[None])
+    torch.testing.assert_close(rotation_matrices(torch.zeros(1, 4)), torch.eye(3)[None])
