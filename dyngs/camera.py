@@ -36,15 +36,15 @@ class Cameras:
 
     @property
     def centers(self) -> Tensor:
-        """(V, 3) camera centres in the world."""
+        """Return (V, 3) camera centres in the world."""
         rotation, translation = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
         return -(rotation * translation[..., None]).sum(1)  # small products through BLAS are slow
 
     def select(self, index: int) -> Cameras:
-        """The camera at ``index`` as a batch of one."""
+        """Return the camera at ``index`` as a batch of one."""
         return Cameras(self.cam_from_world[index][None], self.intrinsics[index][None], self.width, self.height)
 
     def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
-        """The same cameras on another device or in another precision."""
+        """Return the same cameras on another device or in another precision."""
         pose, intrinsics = (x.to(device=device, dtype=dtype) for x in (self.cam_from_world, self.intrinsics))
         return Cameras(pose, intrinsics, self.width, self.height)

@@ -63,7 +63,7 @@ def rasterization(
     rolling_shutter: Any = None,
     viewmats_rs: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Pictures (C, H, W, D), their alphas (C, H, W, 1), and what was computed on the way.
+    """Return pictures (C, H, W, D), their alphas (C, H, W, 1), and a dict of intermediate results.
 
     Differentiable in means, quats, scales, opacities, colors, viewmats and backgrounds. ``meta["means2d"]`` may be
     asked to ``retain_grad()``; with ``absgrad`` it also gets an attribute ``absgrad`` in the backward pass.
@@ -142,7 +142,7 @@ class _Splats:
     gaussian_ids: Tensor | None
 
     def seen(self, x: Tensor) -> Tensor:
-        """``x`` (C, N, ...) as ``meta`` shows it: dense, or one row per visible pair."""
+        """Return ``x`` (C, N, ...) as ``meta`` shows it: dense, or one row per visible pair."""
         return x if self.camera_ids is None else x[self.camera_ids, self.gaussian_ids]
 
 
@@ -166,12 +166,12 @@ def _check_settings(
 
 
 def _check_shapes(tensors: dict[str, Tensor], sh_degree: int | None, *, with_colors: bool) -> None:
+    means, colors = tensors["means"], tensors["colors"]
     for name, x in tensors.items():
         if not isinstance(x, Tensor):
             raise DyngsError(f"rasterization: {name} must be a torch tensor, got {type(x).__name__}")
-        if x.device.type != "cpu":
-            raise DyngsError(f"rasterization: {name} is on {x.device}; dyngs draws on the CPU")
-    means, colors = tensors["means"], tensors["colors"]
+        if x.device != means.device:
+            raise DyngsError(f"rasterization: {name} is on {x.device}, but means on {means.device}; use one device")
     if means.ndim != 2:
         raise DyngsError(f"rasterization: means must be (N, 3), got {tuple(means.shape)}; scenes are not batched here")
     if means.dtype not in (torch.float32, torch.float64):
@@ -225,7 +225,7 @@ def _project(
 
 
 def _colors(means: Tensor, cameras: Cameras, colors: Tensor, projection: Projection, sh_degree: int | None) -> Tensor:
-    """(C, N, D) colour values."""
+    """Return (C, N, D) colour values."""
     c, n = projection.depths.shape
     if sh_degree is None:
         return colors.expand(c, n, colors.shape[-1])
@@ -241,7 +241,7 @@ def _colors(means: Tensor, cameras: Cameras, colors: Tensor, projection: Project
 def _with_depth(
     shades: Tensor, depths: Tensor, backgrounds: Tensor | None, render_mode: str
 ) -> tuple[Tensor, Tensor | None]:
-    """Channels to blend and their backgrounds; depth comes last, on a background of 0."""
+    """Return the channels to blend and their backgrounds; depth comes last, on a background of 0."""
     depth = depths[..., None]
     if render_mode in ("D", "ED"):
         return depth, None
@@ -261,7 +261,7 @@ def _blend(
     options: BlendOptions,
     channel_chunk: int,
 ) -> tuple[Tensor, Tensor]:
-    """Picture (C, H, W, D) and alpha (C, H, W, 1), in passes of ``channel_chunk`` channels."""
+    """Return picture (C, H, W, D) and alpha (C, H, W, 1), drawn in passes of ``channel_chunk`` channels."""
     chunk = min(channel_chunk, MAX_CHANNELS)
     probe = _absgrad_probe(splats) if options.absgrad else None
     pictures, transmittance = [], None
@@ -285,7 +285,7 @@ def _blend(
 
 
 def _absgrad_probe(splats: _Splats) -> Tensor:
-    """A probe whose gradient is handed to ``means2d.absgrad`` in the backward pass, as gsplat does."""
+    """Return a probe whose gradient is handed to ``means2d.absgrad`` in the backward pass, as gsplat does."""
     probe = splats.projection.means2d.new_zeros(*splats.projection.depths.shape, 4, requires_grad=True)
     means2d = splats.means2d
 

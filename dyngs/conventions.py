@@ -28,7 +28,7 @@ MAX_SH_DEGREE = 4
 
 
 class RasterizeMode(str, Enum):
-    """How the 2D low-pass filter is applied."""
+    """Handling of opacity by the 2D low-pass filter."""
 
     CLASSIC = "classic"
     """Add ``eps2d`` to the diagonal of the 2D covariance, opacity unchanged (3DGS)."""
@@ -37,5 +37,5 @@ class RasterizeMode(str, Enum):
 
 
 def num_sh_terms(degree: int) -> int:
-    """Number of SH terms K for ``degree``."""
+    """Return the number of SH terms K of ``degree``."""
     return (degree + 1) ** 2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 
 _MAX_REASON = 160
@@ -22,7 +22,7 @@ class DyngsError(Exception):
 
 
 @contextmanager
-def reading(path: str | os.PathLike[str], advice: str = "copy or export it again") -> Iterator[None]:
+def reading(path: str | os.PathLike[str], advice: str = "copy or export it again") -> Generator[None]:
     """A block in which whatever goes wrong is a DyngsError that names ``path``, with the first error as its cause.
 
     For the readers of files from others: their parsers raise more kinds of errors than anybody can list. A DyngsError

@@ -1,4 +1,4 @@
-"""The set of Gaussians, as optimised, and the one way in which its topology changes."""
+"""The set of Gaussians in the parametrisation that is optimised, and edits of its topology."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ class Gaussians:
 
     @staticmethod
     def stored(tensors: Mapping[str, Tensor]) -> Gaussians:
-        """Those of a file, by field name.
+        """Return the Gaussians stored in a file as tensors by field name.
 
         Raises:
-            KeyError: a tensor lacks.
-            ValueError: one is not finite float32, they do not fit together, or their harmonics are of no degree.
+            KeyError: a tensor is missing.
+            ValueError: one is not finite float32, they do not fit together, or no degree has that many harmonics.
         """
         found = Gaussians(**{f.name: tensors[f.name] for f in fields(Gaussians)})
         for name, x in found.tensors().items():
             require_tensor(name, x, x.shape)
         if found.sh.shape[1] not in [num_sh_terms(degree) for degree in range(MAX_SH_DEGREE + 1)]:
-            raise ValueError(f"'sh' has {found.sh.shape[1]} terms, which are those of no degree")
+            raise ValueError(f"'sh' has {found.sh.shape[1]} terms, which no degree has")
         return found
 
     def __len__(self) -> int:
@@ -59,29 +59,30 @@ class Gaussians:
 
     @property
     def scales(self) -> Tensor:
-        """(N, 3) standard deviations in world units."""
+        """Return (N, 3) standard deviations in world units."""
         return self.log_scales.exp()
 
     @property
     def opacities(self) -> Tensor:
-        """(N,) in [0, 1]."""
+        """Return (N,) opacities in [0, 1]."""
         return self.logit_opacities.sigmoid()
 
     @property
     def base_rgb(self) -> Tensor:
-        """(N, 3) view-independent colour, unclamped."""
+        """Return (N, 3) view-independent colours, not clamped to [0, 1]."""
         return self.sh[:, 0] * SH_C0 + 0.5
 
     @property
     def sh_degree(self) -> int:
+        """Return the degree of the harmonics."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     def tensors(self) -> dict[str, Tensor]:
-        """Field name to tensor, in declaration order."""
+        """Return the tensors by field name, in the order of declaration."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def select(self, index: Tensor) -> Gaussians:
-        """The Gaussians at ``index`` (long or bool)."""
+        """Return the Gaussians at ``index`` ((M,) long or (N,) bool)."""
         return Gaussians(**{name: x[index] for name, x in self.tensors().items()})
 
     def picked(self, rows: Tensor) -> Gaussians:
@@ -92,17 +93,22 @@ class Gaussians:
         """Return the Gaussians after ``edit``, without gradients."""
         return self.detach().select(edit.source)
 
+    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
+        """Return the same Gaussians on another device or in another precision; tensors that fit are shared."""
+        return Gaussians(**{name: x.to(device=device, dtype=dtype) for name, x in self.tensors().items()})
+
     def detach(self) -> Gaussians:
+        """Return the same Gaussians without gradients."""
         return Gaussians(**{name: x.detach() for name, x in self.tensors().items()})
 
     def replace(self, **changes: Tensor) -> Gaussians:
-        """A copy with some fields exchanged."""
+        """Return a copy with some fields replaced."""
         return replace(self, **changes)
 
 
 @dataclass(frozen=True)
 class TopologyEdit:
-    """How a densification step rearranges everything that is stored per Gaussian.
+    """Rearrangement by a densification step of everything that is stored per Gaussian.
 
     Row ``i`` of the new set descends from row ``source[i]`` of the old one: clone, split, prune and relocate are all
     ``x[source]``. Where ``is_new`` is set, optimizer moments start at zero.
@@ -116,11 +122,11 @@ class TopologyEdit:
     is_new: Tensor
 
     def apply(self, x: Tensor) -> Tensor:
-        """Rows of ``x`` (N_old, ...) rearranged to (N_new, ...)."""
+        """Return the rows of ``x`` (N_old, ...) rearranged to (N_new, ...)."""
         return x[self.source]
 
     def apply_moments(self, x: Tensor) -> Tensor:
-        """As ``apply``, with zeros where a row is new."""
+        """Return ``apply(x)`` with zeros where a row is new."""
         moved = x[self.source]
         moved[self.is_new] = 0
         return moved

@@ -1,4 +1,4 @@
-"""The one verb: Gaussians seen by cameras."""
+"""Rendering of Gaussians: pictures, and what each Gaussian contributes to them."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
 
 FOCAL_LENGTHS = (1e-6, 1e12)
-"""px. Beyond them gradients leave the range of float32; a picture of 8 px shows 180 degrees or nothing there."""
+"""Smallest and largest allowed, px; beyond them gradients leave the range of float32."""
 
 Shader = Callable[[Gaussians, Cameras, Tensor], Tensor]
-"""(V, N, 3) colours of N Gaussians for V cameras. Those with radii (V, N, 2) of zero are not drawn: theirs are of no
-matter, but finite. What is other than harmonics, or depends on more than the direction, comes into ``render`` so."""
+"""Function of Gaussians, cameras and radii (V, N, 2) that returns colours (V, N, 3): for colour models other than
+harmonics. Gaussians with radius 0 are not drawn; their colours are ignored, but must be finite."""
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How to draw.
+    """Settings of a render.
 
     Attributes:
         near, far: centres outside are culled, world units (3DGS: 0.2).
         eps2d: 2D low-pass variance, px^2 (3DGS: 0.3; Mip-Splatting: 0.1).
         mode: classic, or antialiased (opacity compensated for the low-pass).
-        sh_degree: highest degree used; None = all that is stored.
+        sh_degree: highest degree used; None = that of the Gaussians.
         alpha_min, alpha_max, transmittance_min: see ``BlendOptions``.
         depth: none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha).
         absgrad: fill the absolute part of the probe's gradient.
-        nonfinite: NaN or infinite input is an ``error``, or its Gaussians are left out (``skip``), or nobody looks
-            (``trust``; the trainer, whose optimizer never writes such values).
+        nonfinite: NaN or infinite input is an ``error``, or its Gaussians are left out (``skip``), or it is not looked
+            for (``trust``; the trainer does this, because its optimizer never writes such values).
 
     Raises:
         DyngsError: a number that is negative, NaN or beyond its range, or a choice that does not exist.
@@ -64,25 +64,27 @@ class RenderOptions:
         check_choice("nonfinite", self.nonfinite, ("error", "skip", "trust"))
         if self.sh_degree is not None:
             check_count("sh_degree", self.sh_degree, 0, MAX_SH_DEGREE)
-        _ = self.projection, self.blending  # these check the numbers
+        _ = self.projection, self.blending  # making them checks the numbers
 
     @property
     def projection(self) -> ProjectionOptions:
+        """The part that concerns the projection."""
         antialiased = self.mode == RasterizeMode.ANTIALIASED
         return ProjectionOptions(self.eps2d, self.near, self.far, self.alpha_min, antialiased=antialiased)
 
     @property
     def blending(self) -> BlendOptions:
+        """The part that concerns the blending."""
         return BlendOptions(self.alpha_min, self.alpha_max, self.transmittance_min, self.absgrad)
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """V pictures.
+    """V rendered pictures.
 
     Attributes:
         rgb: (V, H, W, 3), background composited; not clamped above 1.
-        transmittance: (V, H, W) in [0, 1], what remains of the background.
+        transmittance: (V, H, W) in [0, 1], the share of the background that is seen.
         depth: (V, H, W) view-space z in world units, or None; 0 where nothing is drawn.
         radii: (V, N, 2) int32 half extents in px, 0 = not drawn.
     """
@@ -94,8 +96,14 @@ class Rendering:
 
     @property
     def alpha(self) -> Tensor:
-        """(V, H, W) in [0, 1]."""
+        """Return (V, H, W) opacities of the pictures, in [0, 1]."""
         return 1 - self.transmittance
+
+    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Rendering:
+        """Return the same pictures on another device or in another precision; radii stay integers."""
+        rgb, transmittance = (x.to(device=device, dtype=dtype) for x in (self.rgb, self.transmittance))
+        depth = None if self.depth is None else self.depth.to(device=device, dtype=dtype)
+        return Rendering(rgb, transmittance, depth, self.radii.to(device=device))
 
 
 def render(
@@ -107,19 +115,22 @@ def render(
     probe: Tensor | None = None,
     shader: Shader | None = None,
 ) -> Rendering:
-    """Pictures of the Gaussians from every camera (Kerbl et al. 2023), differentiable in all of them.
+    """Return pictures of the Gaussians from every camera (Kerbl et al. 2023).
+
+    Differentiable in the Gaussians, the camera poses, the background, the probe and what the shader computes.
 
     Args:
         gaussians: N Gaussians, float32 (production), float64 (checks) or half (computed in float32).
-        cameras: V cameras.
-        options: how to draw.
+        cameras: V cameras, on the device of the Gaussians.
+        options: settings.
         background: (3,) or (V, 3) colour; None = black.
         probe: (V, N, 4) zeros whose gradient is the densification signal, see ``rasterize``.
         shader: gives the colours; None: the Gaussians' harmonics do.
 
     Raises:
         DyngsError: NaN or infinite input (names the argument and the count), focal lengths that are not positive, a
-            background or probe of another shape, or a render too large to bin.
+            background or probe of another shape, cameras on another device than the Gaussians, or a render too large
+            for memory.
     """
     gaussians, cameras = _checked(gaussians, cameras, background, options)
     if probe is not None and probe.shape != (len(cameras), len(gaussians), 4):
@@ -146,15 +157,17 @@ def render(
 
 
 def _needs_weights(options: RenderOptions) -> bool:
-    """Whether alpha is to be summed from the weights: where it may be small, 1 - transmittance has no digits left. From
-    1/255 on it has four, and one channel less to blend."""
+    """Return whether alpha is summed from the weights, one more channel to blend, instead of 1 - transmittance.
+
+    Below 1/255 the latter has fewer than four digits left.
+    """
     return options.depth == "expected" and options.alpha_min < 1 / 255
 
 
 def _with_depth(
     colors: Tensor, depths: Tensor, background: Tensor | None, *, weights: bool
 ) -> tuple[Tensor, Tensor | None]:
-    """Channels (V, N, D) with the depth added, and 1 if the sum of ``weights`` is wanted; their backgrounds are 0."""
+    """Return channels (V, N, D) with depth appended, and 1 if the sum of ``weights`` is wanted, on backgrounds of 0."""
     more = [depths[..., None]] + ([torch.ones_like(depths)[..., None]] if weights else [])
     if background is not None:
         background = torch.nn.functional.pad(background, (0, len(more)))
@@ -162,7 +175,7 @@ def _with_depth(
 
 
 def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()) -> Tensor:
-    """(V, N) sum over pixels of each Gaussian's blending weight: its share of every picture, for pruning scores.
+    """Return the (V, N) sums over pixels of each Gaussian's blending weight: its share of every picture.
 
     Raises:
         DyngsError: as ``render``.
@@ -180,7 +193,9 @@ def sensitivities(
     background: Tensor | None = None,
     shader: Shader | None = None,
 ) -> Tensor:
-    """(V, N) sum over pixels of (dI/dG)^2, I a pixel's channels added up, G the Gaussian there (Tu et al. 2026).
+    """Return the (V, N) sums over pixels of (dI/dG)^2 (Tu et al. 2026).
+
+    I is the sum of a pixel's channels, G the value of the 2D Gaussian there.
 
     Raises:
         DyngsError: as ``render``.
@@ -197,7 +212,7 @@ def sensitivities(
 def _colors(
     gaussians: Gaussians, cameras: Cameras, radii: Tensor, options: RenderOptions, shader: Shader | None
 ) -> Tensor:
-    """(V, N, 3)."""
+    """Return the colours (V, N, 3)."""
     if shader is not None:
         return shader(gaussians, cameras, radii)
     degree = gaussians.sh_degree if options.sh_degree is None else min(options.sh_degree, gaussians.sh_degree)
@@ -205,7 +220,7 @@ def _colors(
 
 
 def _finite_colors(colors: Tensor, policy: str) -> Tensor:
-    """``colors``, which may overflow though all that they come from is finite."""
+    """Return ``colors`` with overflow dealt with: they may overflow though all that they come from is finite."""
     if policy == "error":
         check_finite({"colors": colors}, "lower sh, or the weights of the network that colours")
         return colors
@@ -233,9 +248,12 @@ def _one_dtype(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Camer
 def _checked(
     gaussians: Gaussians, cameras: Cameras, background: Tensor | None, options: RenderOptions
 ) -> tuple[Gaussians, Cameras]:
-    """Both in one dtype, and what is not finite dealt with as ``options`` say."""
+    """Return both in one dtype, with NaN and infinity dealt with as ``options`` say."""
     if background is not None and tuple(background.shape) not in ((3,), (len(cameras), 3)):
         raise DyngsError(f"background must be (3,) or ({len(cameras)}, 3), got {tuple(background.shape)}")
+    if cameras.cam_from_world.device != gaussians.means.device:
+        devices = f"the cameras are on {cameras.cam_from_world.device}, the Gaussians on {gaussians.means.device}"
+        raise DyngsError(f"{devices}; move one of them with .to(device=...)")
     gaussians, cameras = _one_dtype(gaussians, cameras)
     if options.nonfinite != "trust":
         _check_views(cameras, background)
@@ -251,15 +269,15 @@ def _check_views(cameras: Cameras, background: Tensor | None) -> None:
 
 
 def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
-    """Nothing, if fx and fy of all (V, 3, 3) matrices lie within ``FOCAL_LENGTHS``.
+    """Raise an error unless fx and fy of all matrices (V, 3, 3) lie within ``FOCAL_LENGTHS``.
 
     Raises:
-        DyngsError: naming the first camera whose do not.
+        DyngsError: naming the first camera whose focal lengths do not.
     """
     focal, (shortest, longest) = intrinsics.detach().diagonal(dim1=1, dim2=2)[:, :2], FOCAL_LENGTHS
     bad = torch.nonzero(~((focal >= shortest) & (focal <= longest)).all(1))[:, 0]
     if len(bad):
-        fx, fy = focal[bad[0]].tolist()
+        fx, fy = (float(x) for x in focal[bad[0]])
         wanted = f"{name}: focal lengths must be positive, from {shortest:g} to {longest:g} px"
         raise DyngsError(f"{wanted}, but camera {int(bad[0])} has {fx:g} and {fy:g}")
 
@@ -273,7 +291,7 @@ def _deal_with_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:
     keep = finite_rows(list(watched.values()))
     if bool(keep.all()):
         return gaussians
-    cleaned = {}
+    cleaned: dict[str, Tensor] = {}
     for name, x in gaussians.tensors().items():
         mask = keep.view(-1, *[1] * (x.ndim - 1))
         cleaned[name] = torch.where(mask, x, torch.zeros_like(x))

@@ -1,6 +1,6 @@
-"""What tensors from a file must be like before anything is computed with them.
+"""Checks of tensors read from a file, before anything is computed with them.
 
-A checksum finds accidents, not a file that was made to be wrong: kernels and indexing rely on what is checked here.
+A checksum finds accidents, not a file made to do harm: kernels and indexing rely on what is checked here.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ REAL = torch.float32
 
 
 def require_tensor(name: str, x: Tensor, shape: Sequence[int | None], dtype: torch.dtype | None = REAL) -> Tensor:
-    """``x``, if it has this shape (None: any size) and type (None: any of real numbers), and is finite.
+    """Return ``x`` if it has this shape (None: any size) and dtype (None: any floating point), and is finite.
 
     Raises:
         ValueError: names it, and says what it is.
@@ -32,7 +32,7 @@ def require_tensor(name: str, x: Tensor, shape: Sequence[int | None], dtype: tor
 def require_indices(
     name: str, x: Tensor, shape: Sequence[int | None], count: int, dtype: torch.dtype = torch.int64
 ) -> Tensor:
-    """``x``, if it holds whole numbers from 0 to ``count`` - 1 in this shape. Raises ValueError."""
+    """Return ``x`` if it holds whole numbers from 0 to ``count`` - 1 in this shape; else raise ValueError."""
     require_tensor(name, x, shape, dtype)
     if bool(((x < 0) | (x >= count)).any()):
         raise ValueError(f"'{name}' names something beyond the {count} that there are")
@@ -40,14 +40,14 @@ def require_indices(
 
 
 def require_ascending(name: str, x: Tensor) -> Tensor:
-    """``x`` (N,), if each number is larger than the one before. Raises ValueError."""
+    """Return ``x`` (N,) if each number is larger than the one before; else raise ValueError."""
     if x.ndim != 1 or not bool((x[1:] > x[:-1]).all()):
         raise ValueError(f"'{name}' does not ascend")
     return x
 
 
 def require_moments(name: str, x: Tensor) -> Tensor:
-    """``x`` (N,), if it holds distinct times from 0 to 1, ascending. Raises ValueError."""
+    """Return ``x`` (N,) if it holds distinct times from 0 to 1, ascending; else raise ValueError."""
     require_ascending(name, require_tensor(name, x, (None,), None))
     if bool(((x < 0) | (x > 1)).any()):
         raise ValueError(f"'{name}' holds times outside [0, 1]")
@@ -55,7 +55,7 @@ def require_moments(name: str, x: Tensor) -> Tensor:
 
 
 def require_positive(name: str, x: Tensor) -> Tensor:
-    """``x``, if all of it is above 0. Raises ValueError."""
+    """Return ``x`` if all of it is above 0; else raise ValueError."""
     if not bool((x > 0).all()):
         raise ValueError(f"'{name}' must be above 0 everywhere")
     return x

@@ -75,6 +75,13 @@ def test_detach_cuts_the_graph() -> None:
     assert not gaussians.detach().means.requires_grad
 
 
+def test_to_moves_and_converts_every_tensor() -> None:
+    gaussians = five()
+    moved = gaussians.to(device="meta", dtype=torch.float32)
+    assert {(x.device.type, x.dtype) for x in moved.tensors().values()} == {("meta", torch.float32)}
+    assert all(a is b for a, b in zip(gaussians.to().tensors().values(), gaussians.tensors().values(), strict=True))
+
+
 def test_replace_leaves_the_rest() -> None:
     gaussians = five()
     other = gaussians.replace(means=gaussians.means + 1)

@@ -324,3 +324,19 @@ def test_background_and_probe_of_another_shape_are_refused(shape: tuple[int, ...
         render(scene.gaussians, scene.cameras, background=torch.zeros(shape))
     with pytest.raises(DyngsError, match=r"probe must be \(2, 20, 4\), got"):
         render(scene.gaussians, scene.cameras, probe=torch.zeros(shape))
+
+
+def test_a_rendering_in_another_precision() -> None:
+    scene = random_scene()
+    found = render(scene.gaussians, scene.cameras, RenderOptions(depth="expected")).to(dtype=torch.float32)
+    assert found.rgb.dtype == found.transmittance.dtype == torch.float32
+    assert found.depth is not None
+    assert found.depth.dtype == torch.float32
+    assert found.radii.dtype == torch.int32
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_cameras_on_another_device_are_refused(verb: Callable[..., object]) -> None:
+    scene = random_scene()
+    with pytest.raises(DyngsError, match=r"the cameras are on meta, the Gaussians on cpu; move one of them"):
+        verb(scene.gaussians, scene.cameras.to(device="meta"))

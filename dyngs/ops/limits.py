@@ -1,4 +1,4 @@
-"""How large a render may be: what the kernels can count, and what memory holds."""
+"""Limits of the size of a render: what the kernels can count, and what memory holds."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ MAX_SIDE: int = core.MAX_SIDE
 """px; float32 has no pixel centres beyond 2^23"""
 
 UNASKED = 1 << 26
-"""Bytes that are allocated without asking how many are left, which takes 0.1 ms."""
+"""Bytes up to which the free memory is not asked for, because asking takes 0.1 ms."""
 
 REMEDY = "lower the resolution, the scales or the number of views"
 
 
 def check_size(width: int, height: int) -> None:
-    """Nothing, if pictures of this size can be drawn.
+    """Raise an error unless pictures of this size can be drawn.
 
     Raises:
         DyngsError: a side below 1 or above ``MAX_SIDE``.
@@ -25,7 +25,7 @@ def check_size(width: int, height: int) -> None:
 
 
 def check_memory(size: int, what: str) -> None:
-    """Nothing, if ``size`` bytes for ``what`` fit what the machine, control groups and RLIMIT_AS leave this process.
+    """Raise an error unless ``size`` bytes for ``what`` fit what machine, control groups and RLIMIT_AS leave free.
 
     Raises:
         DyngsError: with both figures. (Where the system does not say, more than 16 GiB at once is refused.)

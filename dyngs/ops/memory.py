@@ -1,4 +1,4 @@
-"""How the process treats freed memory."""
+"""Reuse of freed memory by the process."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dyngs.ops.native import core
 
 
 def keep_freed_memory() -> bool:
-    """Whether freed blocks are from now on kept for reuse; call it once, before training.
+    """Keep freed blocks for reuse from now on; return whether that worked. Call it once, before training.
 
     Why: by default glibc takes a block of 32 MiB or more (in a fresh process 128 KiB or more) from the system at each
     allocation and gives it back at each release, and the kernel clears all its pages again at first touch. A training

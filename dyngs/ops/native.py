@@ -1,4 +1,4 @@
-"""The compiled core for this processor, and how tensors reach it.
+"""The compiled core for this processor, its number of threads, and tensors passed to it.
 
 The wheel holds one module per x86-64 level; the newest that the processor runs is imported. ``DYNGS_ISA=v2|v3|v4``
 picks an older one, for tests.
@@ -10,7 +10,7 @@ import os
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib import import_module
@@ -42,7 +42,7 @@ core, _ISA = _load_core()
 
 
 def active_isa() -> str:
-    """Instruction set of the loaded kernels: ``v2``, ``v3`` (AVX2) or ``v4`` (AVX-512)."""
+    """Return the instruction set of the loaded kernels: ``v2``, ``v3`` (AVX2) or ``v4`` (AVX-512)."""
     return _ISA
 
 
@@ -50,13 +50,13 @@ _kernel_threads: ContextVar[int | None] = ContextVar("kernel_threads", default=N
 
 
 def num_threads() -> int:
-    """Threads that the kernels use: those of ``kernel_threads``, else torch's setting; after a fork see ``Fork``."""
+    """Return the number of threads of the kernels: of ``kernel_threads``, else torch's; after a fork see ``Fork``."""
     wanted = _kernel_threads.get() or torch.get_num_threads()
     return _fork.allowed(wanted) if _fork.lost_threads else wanted
 
 
 class Fork:
-    """What becomes of the threads of OpenMP in a process made by ``os.fork``.
+    """Handling of the threads of OpenMP in a process made by ``os.fork``.
 
     The child has the parent's list of waiting threads, but not the threads: the next parallel loop, of the kernels as
     of torch, would wait for them without end. Where the parent had started any, the child therefore runs kernels and
@@ -71,11 +71,11 @@ class Fork:
         self._team = False
 
     def remember(self) -> None:
-        """Called in the parent just before it forks."""
+        """Note whether threads run; called in the parent just before it forks."""
         self._team = self.lost_threads or _native_threads() > self._before
 
     def begin_child(self) -> None:
-        """Called in the child just after the fork."""
+        """Set the number of threads; called in the child just after the fork."""
         self._before = _native_threads()
         self.lost_threads, self._told = self._team, False
         if self.lost_threads:
@@ -83,7 +83,7 @@ class Fork:
             torch.set_num_threads(1)
 
     def allowed(self, wanted: int) -> int:
-        """1; with a warning, once, where more were wanted or would have been before the fork."""
+        """Return 1, with one warning where more were wanted or would have been before the fork."""
         if not self._told and torch.utils.data.get_worker_info() is None:
             self._told = True
             reason = "this process was forked from one that had started threads, which it has not got"
@@ -93,8 +93,10 @@ class Fork:
 
 
 def _native_threads() -> int:
-    """Threads of this process that Python did not start; those of OpenMP stay once started. 0 without Linux's /proc:
-    elsewhere processes are not forked, or the OpenMP library starts anew."""
+    """Return the number of threads of this process that Python did not start; those of OpenMP stay once started.
+
+    0 without Linux's /proc: elsewhere processes are not forked, or the OpenMP library starts anew.
+    """
     try:
         return len(os.listdir("/proc/self/task")) - threading.active_count()
     except OSError:
@@ -107,8 +109,8 @@ if sys.platform != "win32":
 
 
 @contextmanager
-def kernel_threads(count: int) -> Iterator[None]:
-    """Within it the kernels run on ``count`` threads and torch's own operators on one.
+def kernel_threads(count: int) -> Generator[None]:
+    """Run kernels on ``count`` threads and torch's own operators on one inside this context.
 
     Why: around the kernels torch only does small element-wise work, where its threads cost more than they save, most of
     all on a machine that does other things too; and its sums then do not depend on the number of threads.
@@ -124,7 +126,7 @@ def kernel_threads(count: int) -> Iterator[None]:
 
 
 def array(x: Tensor) -> object:
-    """``x`` as the kernels take it: detached, C-contiguous, in a DLPack capsule (good for one call).
+    """Return ``x`` as the kernels take it: detached, C-contiguous, in a DLPack capsule (good for one call).
 
     A capsule costs 0.5 us where handing over the tensor itself costs 5 us, and a training step passes a hundred.
     """

@@ -1,4 +1,4 @@
-"""Checks of the numbers that callers set: every option is in its range, or one line says which is not."""
+"""Checks of the numbers that callers set: an error names the option that is out of its range."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LARGEST_COUNT = 2**31 - 1
 
 
 def check_number(name: str, value: object, low: float, high: float = LARGEST) -> None:
-    """Nothing, if ``value`` is a number from ``low`` to ``high``.
+    """Raise an error unless ``value`` is a number from ``low`` to ``high``.
 
     Raises:
         DyngsError: it is something else, or NaN.
@@ -25,10 +25,10 @@ def check_number(name: str, value: object, low: float, high: float = LARGEST) ->
 
 
 def check_near_and_far(near: object, far: object) -> None:
-    """Nothing, if they are the limits of a range of depths; ``far`` may be infinite.
+    """Raise an error unless they are the limits of a range of depths; ``far`` may be infinite.
 
     Raises:
-        DyngsError: they are not.
+        DyngsError: a negative number or NaN, or ``far`` not beyond ``near``.
     """
     check_number("near", near, 0)
     check_number("far", far, 0, math.inf)
@@ -37,7 +37,7 @@ def check_near_and_far(near: object, far: object) -> None:
 
 
 def check_count(name: str, value: object, low: int, high: int) -> None:
-    """Nothing, if ``value`` is a whole number from ``low`` to ``high``.
+    """Raise an error unless ``value`` is a whole number from ``low`` to ``high``.
 
     Raises:
         DyngsError: it is something else.
@@ -47,7 +47,7 @@ def check_count(name: str, value: object, low: int, high: int) -> None:
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:
-    """Nothing, if ``value`` is one of the ``choices``.
+    """Raise an error unless ``value`` is one of the ``choices``.
 
     Raises:
         DyngsError: it is not.

@@ -3,6 +3,9 @@
 Unit quaternions are made as the kernels make them (``normalize`` in csrc/math/projection.hpp).
 """
 
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# The stubs of torch leave parts of these functions untyped.
+
 from __future__ import annotations
 
 from collections.abc import Sequence

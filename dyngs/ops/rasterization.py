@@ -1,8 +1,11 @@
 """Tile binning and alpha blending of splats."""
 
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# The stubs of torch leave parts of these functions untyped.
+
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
@@ -121,7 +124,7 @@ def _arrays(means2d: Tensor, factors: Tensor, opacities: Tensor, radii: Tensor):
 
 
 @contextmanager
-def _refusals(kernel: str) -> Iterator[None]:
+def _refusals(kernel: str) -> Generator[None]:
     """Turn what the kernels say of lengths and indices into a ``DyngsError``."""
     try:
         yield

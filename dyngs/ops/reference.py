@@ -4,6 +4,9 @@ Everything is dense: every pixel looks at every Gaussian. Meant for float64 and 
 Gradients come from autograd. Sources: Zwicker et al. 2001, Kerbl et al. 2023, Yu et al. 2024 (compensation).
 """
 
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# The stubs of torch leave parts of these functions untyped.
+
 from __future__ import annotations
 
 import torch
@@ -16,7 +19,7 @@ from dyngs.ops.rasterization import Blended, BlendOptions
 
 
 def covariances2d(means: Tensor, quats: Tensor, scales: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """2D covariances (V, N, 2, 2) in px^2 without low-pass, and centres in the camera (V, N, 3)."""
+    """Return 2D covariances (V, N, 2, 2) in px^2 without low-pass, and centres in the camera (V, N, 3)."""
     rotation, translation = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
     centers = torch.einsum("vij,nj->vni", rotation, means) + translation[:, None]
     x, y, z = centers.unbind(-1)
@@ -41,7 +44,7 @@ def project(
 ) -> Projection:
     """As ``dyngs.ops.projection.project``."""
     bare, centers = covariances2d(means, quats, scales, cameras)
-    low_pass = options.eps2d * torch.eye(2, dtype=means.dtype)
+    low_pass = options.eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
     cov = bare + low_pass
     det = cov[..., 0, 0] * cov[..., 1, 1] - cov[..., 0, 1] ** 2
     bare_det = bare[..., 0, 0] * bare[..., 1, 1] - bare[..., 0, 1] ** 2
@@ -60,7 +63,7 @@ def project(
         shown = opacities * compensation if options.antialiased else opacities.expand_as(z)
         reach = 2 * (shown / options.alpha_min).log() if options.alpha_min > 0 else torch.full_like(z, float("inf"))
         extents = (reach.clamp_min(0)[..., None] * torch.stack([var_x, var_y], -1)).sqrt().ceil().clamp_max(1e9)
-        size = torch.tensor([cameras.width, cameras.height])
+        size = torch.tensor([cameras.width, cameras.height], device=means.device)
         visible = (z > options.near) & (z < options.far) & (reach > 0) & (extents > options.radius_clip).any(-1)
         visible &= ((means2d + extents > 0) & (means2d - extents < size)).all(-1)
     keep = visible[..., None]
@@ -74,13 +77,13 @@ def project(
 
 
 def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
-    """(..., K) real spherical harmonics of unit directions (..., 3), from the associated Legendre recursion.
+    """Return (..., K) real spherical harmonics of unit directions (..., 3), from the associated Legendre recursion.
 
     Independent of the polynomials in csrc/math/harmonics.hpp; signs as in 3DGS (Condon-Shortley phase included).
     """
     x, y, z = directions.unbind(-1)
     azimuth = torch.complex(x, y)
-    terms = []
+    terms: list[Tensor] = []
     for order in range(degree + 1):
         for m in range(-order, order + 1):
             norm = ((2 * order + 1) / (4 * torch.pi) * _factorial_ratio(order, abs(m))) ** 0.5
@@ -99,7 +102,7 @@ def _factorial_ratio(order: int, m: int) -> float:
 
 
 def _legendre_without_sine(order: int, m: int, z: Tensor) -> Tensor:
-    """Associated Legendre function P_order^m(z) / sin(theta)^m, with the Condon-Shortley phase (-1)^m."""
+    """Return the associated Legendre function P_order^m(z) / sin(theta)^m, with the Condon-Shortley phase (-1)^m."""
     current = torch.ones_like(z)
     for k in range(1, m + 1):
         current = current * -(2 * k - 1)
@@ -128,7 +131,7 @@ def rasterize(
     options: BlendOptions = BlendOptions(),
 ) -> Blended:
     """As ``dyngs.ops.rasterization.rasterize``, without probe: a loop over Gaussians, vectorised over pixels."""
-    raised = torch.zeros(*opacities.shape, size[1], size[0], dtype=colors.dtype)
+    raised = colors.new_zeros(*opacities.shape, size[1], size[0])
     return _rasterize(projection, opacities, colors, raised, background, options)
 
 
@@ -142,7 +145,7 @@ def squared_slopes(
     options: BlendOptions = BlendOptions(),
 ) -> Tensor:
     """As ``dyngs.ops.rasterization.tally`` of ``SQUARED_SLOPES``: (V, N), from autograd pixel for pixel."""
-    raised = torch.zeros(*opacities.shape, size[1], size[0], dtype=colors.dtype, requires_grad=True)
+    raised = colors.new_zeros(*opacities.shape, size[1], size[0], requires_grad=True)
     picture = _rasterize(projection, opacities.detach(), colors.detach(), raised, background, options).color
     (slopes,) = torch.autograd.grad(picture.sum(), raised)  # a pixel depends on its own values only
     return slopes.square().sum((2, 3))
@@ -158,13 +161,14 @@ def _rasterize(
 ) -> Blended:
     """As ``rasterize``, with ``raised`` (V, N, H, W) added to each 2D Gaussian's value in each pixel."""
     height, width = raised.shape[2:]
-    rows, columns = (torch.arange(n, dtype=colors.dtype) + 0.5 for n in (height, width))
+    rows, columns = (torch.arange(n, dtype=colors.dtype, device=colors.device) + 0.5 for n in (height, width))
     y, x = torch.meshgrid(rows, columns, indexing="ij")
-    pictures, remains = [], []
+    pictures: list[Tensor] = []
+    remains: list[Tensor] = []
     for v in range(len(opacities)):
-        transmittance = torch.ones(height, width, dtype=colors.dtype)
-        picture = torch.zeros(height, width, colors.shape[-1], dtype=colors.dtype)
-        full = torch.zeros(height, width, dtype=torch.bool)
+        transmittance = colors.new_ones(height, width)
+        picture = colors.new_zeros(height, width, colors.shape[-1])
+        full = colors.new_zeros(height, width, dtype=torch.bool)
         visible = torch.nonzero((projection.radii[v] > 0).all(-1))[:, 0]
         for i in visible[projection.depths[v, visible].argsort(stable=True)]:
             u_x, u_y, v_y = projection.factors[v, i]

@@ -8,6 +8,9 @@ implementations with ``implement`` and changes nothing here.
 ``torch.library.custom_op`` would do the same, but imports ``torch._dynamo`` when the first op is made: 2 s.
 """
 
+# pyright: reportUnknownMemberType=false
+# The stubs of torch leave parts of these functions untyped.
+
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
@@ -130,7 +133,7 @@ def _guarded(qualified: str, results: Any, sources: list[Tensor]) -> Any:
     if isinstance(results, (list, tuple)):
         guarded = [_guarded(qualified, x, sources) for x in cast(Iterable[object], results)]
         return guarded if isinstance(results, list) else tuple(guarded)
-    return _Undifferentiable.apply(qualified, results, *sources) if isinstance(results, Tensor) else results
+    return cast(Any, _Undifferentiable.apply(qualified, results, *sources)) if isinstance(results, Tensor) else results
 
 
 class _Undifferentiable(torch.autograd.Function):

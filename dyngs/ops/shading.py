@@ -3,6 +3,9 @@
 In plain torch this takes three times as long as the network itself: some thirty operations on narrow arrays.
 """
 
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# The stubs of torch leave parts of these functions untyped.
+
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -10,7 +10,7 @@ from torch import Tensor
 from dyngs.config import McmcStrategy
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.quaternions import rotate
-from dyngs.static.densify import MAX_LOG_VARIANCE, DensifySchedule, EditResult, rotate
+from dyngs.static.densify import MAX_LOG_VARIANCE, DensifySchedule
 
 MAX_COPIES = 50
 NOISE_STEEPNESS = 100.0
