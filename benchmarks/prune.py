@@ -4,8 +4,8 @@
 
 FOLDER keeps the pruned runs, which are used again. `stages` goes the whole way: pruned, fine-tuned, stored by
 `dyngs export --format dyngs`. `parts` compares pruning alone, masks alone and both, with and without fine-tuning (one
-step); `scores` compares the scores. Pruning does not back off here. Overrides (prune.share=0.8, prune.mask_times=6, ...)
-hold for all rows. Printed as a table in Markdown: Gaussians, PSNR of 20 training views and of the whole test split, how
+step); `scores` compares the scores. Pruning does not back off here. Overrides (prune.share=0.8, ...) hold for all
+rows. Printed as a table in Markdown: Gaussians, PSNR of 20 training views and of the whole test split, how
 many times as fast it draws as RUN, MB as float32 and as stored.
 """
 

@@ -13,6 +13,8 @@ from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen, key_ti
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.parameters import Parameters
 
+LR_DECAY = 0.01
+"""Last over first learning rate."""
 SPACE_RANGE = (0.1, 0.5)
 """Planes over space start uniformly in it, those with time at 1 (Wu et al.): the product does not depend on time."""
 
@@ -40,7 +42,7 @@ class Hexplane(NetworkField):
         rates = dict.fromkeys(tensors, options.lr_planes * setup.extent)
         weights = self.decoder.start_values(generator)
         rates |= dict.fromkeys(weights, options.lr_decoder * setup.extent)
-        self.parameters = Parameters(tensors | weights, rates, options.lr_decay)
+        self.parameters = Parameters(tensors | weights, rates, LR_DECAY)
 
     @property
     def levels(self) -> list[PlaneLevel]:

@@ -10,6 +10,8 @@ from dyngs.deform.decoder import Decoder, split_heads
 from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen
 from dyngs.parameters import Parameters
 
+LR_DECAY = 0.002
+"""Last over first learning rate."""
 SKIP_LAYER = 5
 """The input is fed once more into this layer (counted from 0), where there are that many hidden ones."""
 
@@ -27,7 +29,7 @@ class Mlp(NetworkField):
         skip = SKIP_LAYER if options.depth > SKIP_LAYER else None
         self.decoder = Decoder(inputs, [options.width] * options.depth, options, skip=skip)
         weights = self.decoder.start_values(generator)
-        self.parameters = Parameters(weights, dict.fromkeys(weights, options.lr), options.lr_decay)
+        self.parameters = Parameters(weights, dict.fromkeys(weights, options.lr), LR_DECAY)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """See ``DeformationField.offsets``; no gradient flows to ``means``, as in the paper."""

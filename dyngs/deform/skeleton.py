@@ -29,6 +29,10 @@ from dyngs.tensor_checks import require_indices, require_positive, require_tenso
 NOTHING = torch.zeros(0, 3)
 SPAN = 4
 """Control points that a pose depends on: the splines are cubic."""
+LR = {"quats": 6e-3, "log_scales": 1e-3, "logit_opacities": 1e-2, "colors": 2e-3}
+"""Learning rates of the nodes' changes but those of places."""
+LR_DECAY = 0.2
+"""Last over first learning rate."""
 PIECES_PER_TIME = 0.3
 """Pieces of the splines per training time. With more, poses follow single pictures; with fewer, they lag behind."""
 
@@ -48,12 +52,8 @@ class Skeleton(NetworkField):
         tensors = {name: torch.zeros(0, self.num_points, size) for name, size in sizes.items()}
         rates = {
             "means": options.lr_means * setup.extent,
-            "quats": options.lr_quats,
-            "log_scales": options.lr_scales,
-            "logit_opacities": options.lr_opacities,
-            "colors": options.lr_colors,
-        }
-        self.parameters = Parameters(tensors, {name: rates[name] for name in sizes}, options.lr_decay)
+        } | LR
+        self.parameters = Parameters(tensors, {name: rates[name] for name in sizes}, LR_DECAY)
 
     def restored(self, tensors: Mapping[str, Tensor]) -> Skeleton:
         buffers = part_of(tensors, "buffers")

@@ -17,6 +17,11 @@ from dyngs.gaussians import TopologyEdit
 from dyngs.parameters import Parameters
 from dyngs.state import Role
 
+LR_OTHERS = 1e-3
+"""Learning rate of all coefficients but those of positions."""
+LR_DECAY = 0.01
+"""Last over first learning rate."""
+
 
 class Trajectory(NetworkField):
     """Offsets as sums of basis functions with coefficients per Gaussian, all zero at the start."""
@@ -26,9 +31,9 @@ class Trajectory(NetworkField):
         self.num_terms = options.polynomial + 2 * options.fourier
         sizes = head_sizes(options)
         tensors = {name: torch.zeros(setup.num_moving, self.num_terms, size) for name, size in sizes.items()}
-        rates = dict.fromkeys(sizes, options.lr_quats)
+        rates = dict.fromkeys(sizes, LR_OTHERS)
         rates["means"] = options.lr_means * setup.extent
-        self.parameters = Parameters(tensors, rates, options.lr_decay, Role.PER_MOVING)
+        self.parameters = Parameters(tensors, rates, LR_DECAY, Role.PER_MOVING)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """See ``DeformationField.offsets``; ``means`` do not matter."""

@@ -17,6 +17,10 @@ from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.quaternions import rotate
 from dyngs.tensor_checks import require_tensor
 
+DENSE_FRACTION = 0.01
+"""Scale, in scene extents, up to which Gaussians are cloned; larger ones are split."""
+PRUNE_SCALE = 0.1
+"""Scale, in scene extents, from which Gaussians are removed after the first opacity reset."""
 SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
 MAX_LOG_VARIANCE = 60.0
@@ -143,7 +147,7 @@ class DefaultDensifier:
         self.grad_sum, self.seen = (require_tensor(x, state[x], (count,)).clone() for x in ("grad_sum", "seen"))
 
     def _densify(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
-        max_scale = self.options.prune_scale * self.extent if step > self.schedule.prune_scale_after else math.inf
+        max_scale = PRUNE_SCALE * self.extent if step > self.schedule.prune_scale_after else math.inf
         plan = plan_edit(parameters, self.grad_sum / self.seen.clamp_min(1), self.options, self.extent, max_scale)
         kept, cloned, split = (torch.nonzero(mask)[:, 0] for mask in (plan.kept, plan.cloned, plan.split))
         source = torch.cat([kept, cloned, split, split])
@@ -184,7 +188,7 @@ def plan_edit(
     opaque = parameters.opacities >= options.prune_opacity
     survives = opaque & (scale <= max_scale)
     wanted = opaque & (score >= options.grad_threshold)
-    large = scale > options.dense_fraction * extent
+    large = scale > DENSE_FRACTION * extent
     wanted = wanted if options.grow else torch.zeros_like(wanted)
     split = wanted & large & (scale / SPLIT_SHRINK <= max_scale)
     cloned = wanted & ~large & survives

@@ -14,6 +14,8 @@ from dyngs.conventions import SH_C0, num_sh_terms
 from dyngs.gaussians import Gaussians
 
 START_OPACITY = 0.1
+MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1
+"""Opacity, and scale in distances to neighbours, that 3DGS-MCMC begins with."""
 MIN_SQUARED_DISTANCE = 1e-7
 EXTENT_MARGIN = 1.1
 CUBE_PER_EXTENT = 3.0
@@ -39,8 +41,7 @@ class StartValues:
         """The published start of ``strategy`` (3DGS-MCMC: more opaque and smaller)."""
         match strategy:
             case McmcStrategy():
-                opacity = min(max(strategy.init_opacity, 1e-3), 1 - 1e-3)
-                return StartValues(opacity, strategy.init_scale, strategy.max_gaussians)
+                return StartValues(MCMC_OPACITY, MCMC_SCALE, strategy.max_gaussians)
             case DefaultStrategy():
                 return StartValues(max_gaussians=strategy.max_gaussians)
             case FixedStrategy():

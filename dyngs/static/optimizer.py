@@ -13,6 +13,9 @@ from dyngs.gaussians import EditResult, Gaussians
 from dyngs.ops.adam import seen_rows
 from dyngs.state import State
 
+ADAM_EPS = 1e-15
+"""Epsilon of Adam (3DGS)."""
+
 
 class GaussianOptimizer:
     """The parameters of N Gaussians and their Adam moments.
@@ -47,7 +50,7 @@ class GaussianOptimizer:
         if frozen_rest is not None and self.parameters.sh.grad is not None:
             self.parameters.sh.grad[frozen_rest, 1:] = 0
         return sum(
-            self._adam.step_(name, x, lr=rates[name], step=step, eps=self.options.eps, rows=rows)
+            self._adam.step_(name, x, lr=rates[name], step=step, eps=ADAM_EPS, rows=rows)
             for name, x in self.parameters.tensors().items()
         )
 

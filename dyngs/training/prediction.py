@@ -29,6 +29,12 @@ from dyngs.training.events import StepReport
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
 
+WARM_UP = 0.05
+"""Share of the run in which the highest learning rate is reached."""
+WEIGHT_DECAY = 1e-5
+"""Of AdamW."""
+MAX_GRADIENT = 1.0
+"""Longer gradients are shortened to it."""
 MEAN_VIEWS = 8
 """Pictures of each person that the mean colours are taken from."""
 
@@ -165,7 +171,7 @@ class NetworkTrainer:
     def _update(self, loss: Tensor, step: int) -> None:
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        length = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.model.clip)
+        length = torch.nn.utils.clip_grad_norm_(self.network.parameters(), MAX_GRADIENT)
         if not bool(length.isfinite()):
             self.bad_gradients += 1
             return
@@ -195,7 +201,7 @@ def assemble_network(config: Config, model: HumanPredictorModel) -> NetworkTrain
         people=people,
         network=network,
         mean=mean_colours(people, model.resolution),
-        optimizer=torch.optim.AdamW(network.parameters(), lr=model.lr, weight_decay=model.weight_decay),
+        optimizer=torch.optim.AdamW(network.parameters(), lr=model.lr, weight_decay=WEIGHT_DECAY),
         sampler=ViewSampler(len(people)),
         background=background if background == "random" else evaluation_background(background, True)[0],
         generator=generator,
@@ -285,7 +291,7 @@ def mean_colours(people: list[Filmed], resolution: int) -> Tensor:
 
 def rate_at(model: HumanPredictorModel, step: int, steps: int) -> float:
     """Of AdamW: up along a line, then down along one (one cycle; Smith and Topin 2017)."""
-    top = max(1, round(model.warm_up * steps))
+    top = max(1, round(WARM_UP * steps))
     share = step / top if step <= top else (steps - step) / max(steps - top, 1)
     return model.lr * max(share, _LOWEST)
 

@@ -289,7 +289,7 @@ configs = st.builds(
     ),
     init=st.builds(RandomInit, half_extent=rates),
     strategy=st.builds(McmcStrategy, noise=rates) | st.builds(DefaultStrategy, prune_opacity=fractions),
-    optim=st.builds(OptimConfig, lr_means=rates, eps=rates),
+    optim=st.builds(OptimConfig, lr_means=rates, lr_scales=rates),
     train=st.builds(TrainConfig, steps=st.integers(1, 10**9), ssim_weight=fractions),
     run=st.builds(RunConfig, name=names, seed=st.integers(0, 2**63 - 1)),
 )

@@ -8,7 +8,7 @@ import pytest
 
 from dyngs.config import Config, DefaultStrategy
 from dyngs.config.io import load_config, load_resolved, packaged_preset, save_config
-from dyngs.config.renamed import KEYS, KINDS
+from dyngs.config.renamed import CONSTANTS, KEYS, KINDS
 from dyngs.config.schema import config_keys
 from dyngs.errors import DyngsError
 
@@ -69,6 +69,36 @@ def test_every_present_name_exists_and_no_former_one() -> None:
         allowed = next(row for row in config_keys() if row.name == key).allowed.removeprefix("one of ").split(", ")
         assert set(kinds.values()) <= set(allowed)
         assert not set(kinds) & set(allowed)
+
+
+@pytest.mark.parametrize("key", CONSTANTS)
+def test_keys_that_are_constants_are_gone(key: str) -> None:
+    allowed = {kind for row in config_keys() if row.name == key for kind in row.kinds or ("",)}
+    assert not allowed & set(CONSTANTS[key])
+    with pytest.raises(DyngsError) as caught:
+        load_config(None, ["data.root=x", f"{key}=1"])
+    assert str(caught.value) == f"{key}=1: {key} can no longer be chosen; leave it out"
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "key", "value"),
+    [
+        ("human", "lr_poses: 0.001", "model.lr_poses", "0.002"),
+        ("dynamic", "lr_decay: 0.2", "model.deform.lr_decay", "0.01"),
+        ("static", "eps: 1.0e-15", "optim.eps", "1.0e-8"),
+        ("static", "eps: 1.0e-15", "optim.eps", "true"),
+    ],
+)
+def test_a_run_with_another_value_of_a_constant_is_refused(
+    name: str, line: str, key: str, value: str, tmp_path: Path
+) -> None:
+    text = (FORMER / f"{name}.yaml").read_text()
+    assert text.count(line) == 1
+    (tmp_path / "config.yaml").write_text(text.replace(line, f"{line.split(':')[0]}: {value}"))
+    with pytest.raises(DyngsError) as caught:
+        load_resolved(tmp_path)
+    assert f": {key} can no longer be chosen, it is always " in str(caught.value)
+    assert f"not {value}; train anew" in str(caught.value)
 
 
 @pytest.mark.parametrize("former", KEYS)

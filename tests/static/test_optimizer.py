@@ -7,7 +7,7 @@ import torch
 
 from dyngs.config import OptimConfig
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.static.optimizer import GaussianOptimizer
+from dyngs.static.optimizer import ADAM_EPS, GaussianOptimizer
 
 
 def _gaussians(n: int, seed: int = 0) -> Gaussians:
@@ -36,7 +36,7 @@ def test_equals_torch_adam_with_a_rate_per_group() -> None:
         "means": 0.3, "quats": options.lr_quats, "log_scales": options.lr_scales,
         "logit_opacities": options.lr_opacities, "dc": options.lr_sh_dc, "rest": options.lr_sh_rest,
     }  # fmt: skip
-    adam = torch.optim.Adam([{"params": [theirs[n]], "lr": lr} for n, lr in rates.items()], eps=options.eps)
+    adam = torch.optim.Adam([{"params": [theirs[n]], "lr": lr} for n, lr in rates.items()], eps=ADAM_EPS)
     for step in range(1, 6):
         gradients = _set_gradients(optimizer, step)
         gradients |= {"dc": gradients["sh"][:, :1], "rest": gradients["sh"][:, 1:]}

@@ -39,7 +39,6 @@ class HexplaneField(FieldSection):
     depth: int = Field(default=1, ge=1, description="hidden layers of the decoder before the heads")
     lr_planes: Positive = Field(default=1.6e-3, description="learning rate of the planes, times the scene extent")
     lr_decoder: Positive = Field(default=1.6e-4, description="learning rate of the decoder, times the scene extent")
-    lr_decay: Fraction = Field(default=0.01, description="last over first learning rate")
     space_smoothness: float = Field(
         default=1e-4, ge=0, description="weight of the mean squared second difference of the space planes"
     )
@@ -62,7 +61,6 @@ class MlpField(FieldSection):
     space_frequencies: int = Field(default=10, ge=0, le=16, description="octaves of the positional encoding of places")
     time_frequencies: int = Field(default=6, ge=0, le=16, description="octaves of the positional encoding of time")
     lr: Positive = Field(default=8e-4, description="learning rate")
-    lr_decay: Fraction = Field(default=0.002, description="last over first learning rate")
 
 
 class ControlNodesField(FieldSection):
@@ -77,11 +75,6 @@ class ControlNodesField(FieldSection):
         default=0, ge=0, description="polynomial pieces of each spline; 0: 0.3 times the number of training times"
     )
     lr_means: Positive = Field(default=6e-4, description="learning rate of the nodes' places, times the scene extent")
-    lr_quats: Positive = Field(default=6e-3, description="learning rate of their rotations")
-    lr_scales: Positive = Field(default=1e-3, description="learning rate of the changes of log-scales")
-    lr_opacities: Positive = Field(default=1e-2, description="learning rate of the changes of opacity")
-    lr_colors: Positive = Field(default=2e-3, description="learning rate of the changes of base colour")
-    lr_decay: Fraction = Field(default=0.2, description="last over first learning rate")
     rigidity: float = Field(
         default=0.5,
         ge=0,
@@ -102,8 +95,6 @@ class TrajectoryField(FieldSection):
     lr_means: Positive = Field(
         default=1.6e-4, description="learning rate of the coefficients of positions, times the scene extent"
     )
-    lr_quats: Positive = Field(default=1e-3, description="learning rate of the other coefficients")
-    lr_decay: Fraction = Field(default=0.01, description="last over first learning rate")
 
 
 DeformField = HexplaneField | MlpField | TrajectoryField | ControlNodesField

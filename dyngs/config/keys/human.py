@@ -40,20 +40,10 @@ class HumanModel(_OnTemplate):
         default=True, description="learn corrections of poses, skeleton and skinning weights with the Gaussians"
     )
     refine_from: Fraction = Field(default=0.1, description="share of the run after which these are learned")
-    lr_poses: Positive = Field(default=1e-3, description="of the poses of single frames, rad")
-    lr_trans: Positive = Field(default=5e-4, description="of the places of single frames, m")
-    lr_turns: Positive = Field(default=1e-3, description="of what is added to the poses of all frames, rad")
-    lr_joints: Positive = Field(default=5e-4, description="of the joints at rest, m")
-    lr_log_scale: Positive = Field(default=2e-4, description="of the logarithm of the body's size")
-    lr_weights: Positive = Field(default=5e-3, description="of the logarithms of skinning weights")
-    lr_decay: Fraction = Field(default=0.1, description="last over first rate of all these")
     pose_offsets: bool = Field(
         default=False,
         description="learn offsets at rest that are linear in the rotations of nearby joints (pose blend shapes)",
     )
-    lr_pose_offsets: Positive = Field(default=1e-4, description="m per unit of a rotation matrix")
-    pose_weight: float = Field(default=1e-4, ge=0, description="of the squared corrections of the fit")
-    weights_weight: float = Field(default=1e-3, ge=0, description="of the squared corrections of skinning weights")
     offset_weight: float = Field(
         default=2e-4, ge=0, description="weight of the squared distances from the scaffold, cm^2"
     )
@@ -93,6 +83,3 @@ class HumanPredictorModel(_OnTemplate):
         description="channels of the U-Net at 1/2, 1/4, ... of the atlas's resolution",
     )
     lr: Positive = Field(default=2e-3, description="highest learning rate of AdamW (one cycle)")
-    warm_up: Fraction = Field(default=0.05, description="share of the run in which it is reached; then it falls to 0")
-    weight_decay: float = Field(default=1e-5, ge=0, description="of AdamW")
-    clip: Positive = Field(default=1.0, description="gradients longer than this are shortened to it")

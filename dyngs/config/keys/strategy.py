@@ -25,14 +25,10 @@ class DefaultStrategy(Section):
         description="Gaussians with a larger mean gradient of their 2D mean, NDC units, are cloned or split; lowered "
         "in runs shorter than 30,000 steps",
     )
-    dense_fraction: Positive = Field(
-        default=0.01, description="of the extent: smaller ones are cloned, larger ones split"
-    )
     start: int = Field(default=500, description=f"step {_OF_30000}, after which Gaussians are added and removed")
     stop: int = Field(default=15_000, description=f"step {_OF_30000}, from which their number is fixed")
     every: int = Field(default=100, ge=1, description="steps between these changes; not scaled")
     prune_opacity: Fraction = Field(default=0.005, description="Gaussians with a lower opacity are removed")
-    prune_scale: Positive = Field(default=0.1, description="of the extent, after the first opacity reset")
     reset_every: int | None = Field(
         default=3000,
         ge=1,
@@ -70,8 +66,6 @@ class McmcStrategy(Section):
     )
     opacity_reg: float = Field(default=0.01, ge=0, description="weight of the mean opacity")
     scale_reg: float = Field(default=0.01, ge=0, description="weight of the mean scale, world units")
-    init_opacity: Fraction = Field(default=0.5, description="opacity of the first Gaussians")
-    init_scale: Positive = Field(default=0.1, description="scale of the first Gaussians, in distances to neighbours")
 
     @property
     def growth_limit(self) -> int:
@@ -123,7 +117,6 @@ class OptimConfig(Section):
     lr_opacities: Positive = Field(default=0.05, description="learning rate of the logits of opacities")
     lr_scales: Positive = Field(default=5e-3, description="learning rate of log-scales")
     lr_quats: Positive = Field(default=1e-3, description="learning rate of rotations (quaternions)")
-    eps: Positive = Field(default=1e-15, description="epsilon of Adam")
     sparse: bool = Field(
         default=False, description="update only Gaussians that received a gradient in the step; faster, not the same"
     )

@@ -20,6 +20,20 @@ from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.parameters import Parameters
 from dyngs.state import Role
 
+LR = {
+    "poses": 1e-3,  # of single frames, rad
+    "trans": 5e-4,  # of single frames, m
+    "turns": 1e-3,  # of all frames, rad
+    "joints": 5e-4,  # at rest, m
+    "log_scale": 2e-4,
+    "weights": 5e-3,  # logarithms
+    "pose_dirs": 1e-4,  # m per unit of a rotation matrix
+}
+"""Learning rates."""
+LR_DECAY = 0.1
+"""Last over first learning rate."""
+POSE_WEIGHT, WEIGHTS_WEIGHT = 1e-4, 1e-3
+"""Of the squared corrections of poses and joints, and of skinning weights, in the loss."""
 POSE_CM = 0.05
 """Turn of a joint, rad, that counts as much as a centimetre."""
 
@@ -45,15 +59,6 @@ def new_corrections(options: HumanModel, clip: MotionClip, skeleton: Skeleton, a
     ``pose_dirs`` (N, 27), see ``dyngs.human.avatar.posing.learned_offsets``.
     """
     unit = float(clip.scale.mean())
-    rates = {
-        "poses": options.lr_poses,
-        "trans": options.lr_trans * unit,
-        "turns": options.lr_turns,
-        "joints": options.lr_joints,
-        "log_scale": options.lr_log_scale,
-        "weights": options.lr_weights,
-        "pose_dirs": options.lr_pose_offsets,
-    }
     zeros = {
         "poses": torch.zeros_like(clip.poses),
         "trans": torch.zeros_like(clip.trans),
@@ -65,19 +70,16 @@ def new_corrections(options: HumanModel, clip: MotionClip, skeleton: Skeleton, a
     if options.pose_offsets:
         zeros["pose_dirs"] = anchors.weights.new_zeros(len(anchors), 27)
     roles = dict.fromkeys(zeros, Role.SHARED) | dict.fromkeys(("weights", "pose_dirs"), Role.PER_GAUSSIAN)
-    return Parameters(zeros, rates, options.lr_decay, roles)
+    return Parameters(zeros, LR | {"trans": LR["trans"] * unit}, LR_DECAY, roles)
 
 
 def correction_penalties(learned: Parameters, options: HumanModel) -> dict[str, Tensor]:
     """Return weighted mean squares: fits and weights should stay near what was given."""
-    terms = {}
-    if options.pose_weight > 0:
-        turns = (learned["poses"].square().mean() + learned["turns"].square().mean()) / POSE_CM**2
-        terms["pose"] = options.pose_weight * (turns + (100 * learned["joints"]).square().mean())
+    turns = (learned["poses"].square().mean() + learned["turns"].square().mean()) / POSE_CM**2
+    terms = {"pose": POSE_WEIGHT * (turns + (100 * learned["joints"]).square().mean())}
     if "pose_dirs" in learned and options.offset_weight > 0:
         terms["pose offsets"] = options.offset_weight * (100 * learned["pose_dirs"]).square().sum(1).mean()
-    if options.weights_weight > 0:
-        terms["skinning weights"] = options.weights_weight * learned["weights"].square().mean()
+    terms["skinning weights"] = WEIGHTS_WEIGHT * learned["weights"].square().mean()
     return terms
 
 
