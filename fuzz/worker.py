@@ -10,6 +10,8 @@ import faulthandler
 import importlib
 import json
 import os
+import pkgutil
+import re
 import resource
 import shutil
 import signal
@@ -173,31 +175,20 @@ def _tell(pipe: int, what: object) -> None:
 
 
 def import_everything() -> None:
-    """So that processes forked from this one share it, with one thread each."""
+    """Import dyngs and the libraries that it imports on first use, so that forked workers share them; one thread."""
     import torch
 
+    import dyngs
+
     torch.set_num_threads(1)
-    for name in (
-        "OpenImageIO",
-        "av",
-        "pycolmap",
-        "trimesh",
-        "kornia",
-        "scipy.sparse",
-        "scipy.spatial.transform",
-        "h5py",
-    ):
+    own = [module.name for module in pkgutil.walk_packages(dyngs.__path__, "dyngs.")]
+    for name in (*_LIBRARIES, *(name for name in own if not _RUNS_ON_IMPORT.search(name))):
         try:
             importlib.import_module(name)
-        except ImportError:
+        except ImportError:  # an optional package is missing
             continue
-    for name in (
-        "data.read",
-        "data.inspect",
-        "data.loader",
-        "runs.checkpoint",
-        "export.avatar",
-        "view.job_of_run",
-        "demo",
-    ):
-        importlib.import_module(f"dyngs.{name}")
+
+
+_LIBRARIES = ("OpenImageIO", "av", "pycolmap", "trimesh", "kornia", "scipy.sparse", "scipy.spatial.transform", "h5py")
+_RUNS_ON_IMPORT = re.compile(r"__main__$|\._core")
+"""The command line, and native cores of which only one may suit this processor."""
