@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from threading import Lock
 
 import torch
@@ -60,6 +61,17 @@ class Picture:
             return self.rgb_premultiplied
         return self.rgb_premultiplied + (1 - self.alpha[..., None]) * background
 
+    def to(self, device: torch.device | str) -> Picture:
+        """The same picture, its camera and mask on another device."""
+        alpha, mask = (None if x is None else x.to(device) for x in (self.alpha, self.mask))
+        return replace(
+            self,
+            cameras=self.cameras.to(device=device),
+            rgb_premultiplied=self.rgb_premultiplied.to(device),
+            alpha=alpha,
+            mask=mask,
+        )
+
     def shrunk(self, factor: int) -> Picture:
         """The picture with both sides divided by ``factor``, averaged over pixel areas, and the camera that sees it."""
         if factor == 1:
@@ -97,18 +109,18 @@ class PictureLoader:
     The same index always gives the same bytes, cached or not. Safe to use from several threads.
     """
 
-    def __init__(self, views: Sequence[View], options: DataConfig) -> None:
-        """Checks every file (not every pixel) at once, so that a bad capture fails before training starts.
+    def __init__(self, views: Sequence[View], options: DataConfig | None = None) -> None:
+        """Check every file (not every pixel) at once, so that a bad capture fails before training starts.
 
         Args:
             views: one split of a capture.
-            options: downscale, longest_side, cache_mb, max_megapixels.
+            options: ``downscale``, ``longest_side``, ``cache_mb`` and ``max_megapixels`` count; None: the defaults.
 
         Raises:
             DyngsError: missing pictures (count and first), damaged ones, or a size that is not the view's.
         """
         self._views = tuple(views)
-        self._options = options
+        self._options = options = options or DataConfig(root=Path())
         self._cache: OrderedDict[int, _Decoded] = OrderedDict()
         self._cached_bytes = 0
         self._last_map: tuple[object, LensMap] | None = None
@@ -143,8 +155,8 @@ class PictureLoader:
         return Picture(
             name=view.name,
             cameras=Cameras(
-                torch.from_numpy(view.cam_from_world).float()[None],
-                torch.from_numpy(intrinsics).float()[None],
+                torch.as_tensor(view.cam_from_world, dtype=torch.float32, device="cpu")[None],
+                torch.as_tensor(intrinsics, dtype=torch.float32, device="cpu")[None],
                 width,
                 height,
             ),

@@ -212,6 +212,18 @@ def test_silhouettes_become_alpha(tmp_path: Path) -> None:
         loader(tuple(views))
 
 
+def test_a_picture_on_another_device(tmp_path: Path) -> None:
+    """The device "meta" holds no numbers; it only shows that nothing is left behind."""
+    view = views_of(tmp_path)[0]
+    write_picture(tmp_path / "mask.png", random_pixels(8, 12, 1))
+    moved = PictureLoader([replace(view, mask_path=tmp_path / "mask.png")])[0].to("meta").shrunk(2)
+    cameras, background = moved.cameras, torch.zeros(3, device="meta")
+    tensors = (cameras.cam_from_world, cameras.intrinsics, moved.rgb_premultiplied, moved.composite(background))
+    assert moved.alpha is not None
+    assert moved.mask is not None
+    assert {x.device.type for x in (*tensors, moved.alpha, moved.mask)} == {"meta"}
+
+
 def test_pictures_beyond_the_limit_are_refused_at_the_beginning(blender_root: Path) -> None:
     views = views_of(blender_root)
     with pytest.raises(DyngsError, match=r"12x8 pixels are 9\.6e-05 megapixels, but data\.max_megapixels is 9e-05"):

@@ -94,7 +94,7 @@ def _decoded(path: Path) -> Tensor:
     rgb = pixels[..., colour_channels]
     if is_linear:
         rgb, alpha = _encode_linear(rgb, alpha)
-    return torch.from_numpy(np.ascontiguousarray(rgb if alpha is None else np.dstack([rgb, alpha])))
+    return torch.as_tensor(np.ascontiguousarray(rgb if alpha is None else np.dstack([rgb, alpha])), device="cpu")
 
 
 def read_mask(path: Path) -> Tensor:
@@ -194,14 +194,15 @@ def _shrink_axis(pixels: Tensor, axis: int, size: int) -> Tensor:
     if size > old:
         raise ValueError(f"area_downscale cannot enlarge {old} to {size}")
     # Output i covers [i * old / size, (i + 1) * old / size): integer arithmetic keeps the shares exact.
-    first = torch.arange(size) * old // size
+    starts = torch.arange(size + 1, device=pixels.device) * old
+    first = starts[:-1] // size
     shape = [1] * pixels.ndim
     shape[axis] = size
-    total = torch.zeros(1)
+    total = pixels.new_zeros(1)
     for tap in range(-(-old // size) + 1):
         index = first + tap
-        begin = torch.maximum(index * size, torch.arange(size) * old)
-        end = torch.minimum((index + 1) * size, torch.arange(1, size + 1) * old)
+        begin = torch.maximum(index * size, starts[:-1])
+        end = torch.minimum((index + 1) * size, starts[1:])
         share = ((end - begin).clamp(min=0).double() / old).to(pixels.dtype).reshape(shape)
         total = total + pixels.index_select(axis, index.clamp(max=old - 1)) * share
     return total

@@ -43,8 +43,8 @@ def distort(lens: Lens, points: Tensor) -> Tensor:
         return _distort_fisheye(lens, points)
     from kornia.geometry.calibration import distort_points
 
-    identity = torch.eye(3, dtype=points.dtype)[None]
-    coefficients = torch.tensor([_padded(lens.params)], dtype=points.dtype)
+    identity = torch.eye(3, dtype=points.dtype, device=points.device)[None]
+    coefficients = torch.tensor([_padded(lens.params)], dtype=points.dtype, device=points.device)
     return distort_points(points.reshape(1, -1, 2), identity, coefficients).reshape(points.shape)
 
 
@@ -55,15 +55,14 @@ def undistort_map(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -
     otherwise the inside of the picture would appear there a second time.
     """
     fx, fy, cx, cy = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    center, focal = torch.tensor([cx, cy], dtype=torch.float64), torch.tensor([fx, fy], dtype=torch.float64)
-    size = torch.tensor([width, height], dtype=torch.float64)
-    x = torch.arange(width, dtype=torch.float64) + 0.5
+    center, focal, size = torch.tensor([(cx, cy), (fx, fy), (width, height)], dtype=torch.float64, device="cpu")
+    x = torch.arange(width, dtype=torch.float64, device="cpu") + 0.5
     limit = _radius_limit(lens, intrinsics, width, height)
-    grid = torch.empty(height, width, 2)
-    valid = torch.empty(height, width, dtype=torch.bool)
+    grid = torch.empty(height, width, 2, device="cpu")
+    valid = torch.empty(height, width, dtype=torch.bool, device="cpu")
     for top in range(0, height, _ROWS_PER_CHUNK):
         rows = slice(top, min(top + _ROWS_PER_CHUNK, height))
-        y = torch.arange(rows.start, rows.stop, dtype=torch.float64) + 0.5
+        y = torch.arange(rows.start, rows.stop, dtype=torch.float64, device="cpu") + 0.5
         points = (torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1) - center) / focal
         found = distort(lens, points) * focal + center
         grid[rows] = (2 * found / size - 1).nan_to_num(2.0).clamp(-2, 2).float()
@@ -107,7 +106,8 @@ def _radius_limit(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -
     """Radius on z = 1 up to which the distorted radius grows, looked for within the picture's corners."""
     corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], dtype=np.float64)
     corners = (corners - intrinsics[:2, 2]) / np.diag(intrinsics)[:2]
-    radii = torch.linspace(0, float(np.linalg.norm(corners, axis=1).max()), 4096, dtype=torch.float64)
+    farthest = float(np.linalg.norm(corners, axis=1).max())
+    radii = torch.linspace(0, farthest, 4096, dtype=torch.float64, device="cpu")
     if lens.model == "fisheye":
         distorted = _fisheye_radius(lens, torch.atan(radii))
     else:

@@ -41,7 +41,7 @@ def _levels(silhouette: Silhouette) -> Tensor:
         row = read_hdf5(silhouette.path, MASKS, silhouette.row)
         if row.ndim != 2 or row.dtype not in (np.uint8, np.bool_):
             raise DyngsError(f"{silhouette.path}: '{MASKS}' must hold bytes in the shape (F, H, W); export it again")
-        levels = torch.from_numpy(row.astype(np.uint8))
+        levels = torch.as_tensor(row.astype(np.uint8), device="cpu")
     if silhouette.person == "nonzero":
         return (levels > 0).to(torch.uint8) * 255
     return 255 - levels if silhouette.person == "black" else levels

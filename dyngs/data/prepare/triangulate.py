@@ -28,7 +28,8 @@ MIN_POINTS = 30
 LONGEST_SIDE = 1000
 MAX_FEATURES = 2048
 """SIFT features per picture."""
-GREY = torch.full((3,), 0.5)
+GREY = 0.5
+"""Background of pictures with alpha."""
 
 
 def views_of_a_moment(views: Sequence[View], limit: int) -> list[View]:
@@ -83,7 +84,8 @@ def _triangulated(folder: Path, pictures: Sequence[Picture]) -> PointCloud | Non
     model.mkdir()
     names = [f"{i:05d}.png" for i in range(len(pictures))]
     for name, picture in zip(names, pictures, strict=True):
-        rgb = (picture.composite(GREY).clamp(0, 1) * 255).round().to(torch.uint8)
+        grey = picture.rgb_premultiplied.new_full((3,), GREY)
+        rgb = (picture.composite(grey).clamp(0, 1) * 255).round().to(torch.uint8)
         write_image(images / name, rgb.numpy())
     _find_and_match(database, images, names)
     posed = _posed(database, dict(zip(names, pictures, strict=True)))
