@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dyngs.camera import Cameras
     from dyngs.compat import rasterization
+    from dyngs.data.read import read_capture
     from dyngs.errors import DyngsError
     from dyngs.gaussians import Gaussians
     from dyngs.rendering import Rendering, RenderOptions, contributions, render
@@ -24,6 +25,7 @@ __all__ = [
     "Rendering",
     "contributions",
     "rasterization",
+    "read_capture",
     "render",
 ]
 
@@ -35,6 +37,7 @@ _HOMES = {
     "Rendering": "dyngs.rendering",
     "contributions": "dyngs.rendering",
     "rasterization": "dyngs.compat",
+    "read_capture": "dyngs.data.read",
     "render": "dyngs.rendering",
 }
 

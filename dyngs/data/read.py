@@ -59,12 +59,15 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
 
     Example::
 
-        capture = dyngs.read_capture("lego")  # or DataConfig(root="lego", downscale=2) with options of the section data
-        pictures = PictureLoader(capture.splits["train"])
-        pictures[0].cameras, pictures[0].rgb_premultiplied
+        import dyngs
+        from dyngs.data.loader import PictureLoader
+
+        capture = dyngs.read_capture("lego")
+        picture = PictureLoader(capture.splits["train"])[0].to("cpu")
+        picture.cameras, picture.rgb_premultiplied  # what to render from, and what should come out
 
     Args:
-        source: the folder, or the section ``data`` of a configuration: the folder and how to read it.
+        source: the folder, or a ``dyngs.config.DataConfig``: the folder as ``root``, and options such as ``frames``.
         decode_videos: write the chosen frames of videos as picture files, see ``pictures.frame_cache``; otherwise views
             may name files that do not exist yet.
 

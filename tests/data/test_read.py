@@ -15,6 +15,7 @@ from tiny_captures import (
     write_video,
 )
 
+import dyngs
 from dyngs.config import DataConfig
 from dyngs.data import readers
 from dyngs.data.capture import Capture
@@ -55,7 +56,7 @@ def test_formats_are_recognised(blender_root: Path) -> None:
 def test_a_folder_alone_is_read_with_default_options(blender_root: Path) -> None:
     expected = read(blender_root)
     for source in (blender_root, str(blender_root)):
-        capture = read_capture(source)
+        capture = dyngs.read_capture(source)
         assert {split: names(capture, split) for split in capture.splits} == {
             split: names(expected, split) for split in expected.splits
         }
