@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.data.capture import BODY_KINDS, BodyFrames, Split, View
 from dyngs.errors import DyngsError
-from dyngs.files.fields import float_array, numbers_of, some
+from dyngs.files.fields import first_few, float_array, numbers_of
 
 
 def body_frames(
@@ -109,8 +109,8 @@ def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
     lacking = sorted({view.frame for view, row in zip(views, found, strict=True) if row < 0 and view.frame is not None})
     if lacking:
         raise DyngsError(
-            f"{where}: no body parameters for {len(lacking)} frames that have pictures ({some(lacking)}); the file has "
-            f"{len(rows)} frames from {body.frames[0]} to {body.frames[-1]}; add them or remove the pictures"
+            f"{where}: no body parameters for {len(lacking)} frames that have pictures ({first_few(lacking)}); the "
+            f"file has {len(rows)} frames from {body.frames[0]} to {body.frames[-1]}; add them or remove the pictures"
         )
     return np.array(found, dtype=np.int64)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -87,6 +88,15 @@ class View:
     silhouette: Silhouette | None = None
 
 
+Splits = dict[Split, tuple[View, ...]]
+"""Split name to its views."""
+
+
+def all_views(splits: Mapping[Split, tuple[View, ...]]) -> list[View]:
+    """The views of all splits, one split after the other."""
+    return [view for views in splits.values() for view in views]
+
+
 @dataclass(frozen=True)
 class PointCloud:
     """Sparse points: ``xyz`` (P, 3) float64 in the rebased world, ``rgb`` (P, 3) uint8."""
@@ -145,7 +155,7 @@ class Capture:
 
     root: Path
     format: str
-    splits: dict[Split, tuple[View, ...]]
+    splits: Splits
     points: PointCloud | None = None
     world_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     has_alpha: bool = False

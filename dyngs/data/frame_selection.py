@@ -6,11 +6,9 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from dyngs.data.capture import Split, View
+from dyngs.data.capture import Splits, all_views
 from dyngs.data.times import distinct_times
 from dyngs.errors import DyngsError, printable
-
-Splits = dict[Split, tuple[View, ...]]
 
 
 def parse_frames(text: str) -> slice:
@@ -42,7 +40,7 @@ def select_frames(root: Path, splits: Splits, frames: str) -> Splits:
         DyngsError: a bad slice, one that picks nothing or nothing to train on, or views without times.
     """
     part = parse_frames(frames)
-    views = [view for kept in splits.values() for view in kept]
+    views = all_views(splits)
     if any(view.time is None for view in views):
         raise DyngsError(f"{root}: data.frames={frames} picks times, but the capture has none; remove data.frames")
     distinct = distinct_times(views)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.config import DataConfig
-from dyngs.data.capture import Capture, PointCloud, Split, View
+from dyngs.data.capture import Capture, PointCloud, Splits, View, all_views
 from dyngs.data.frame_selection import select_frames
 from dyngs.data.geometry.recenter import recenter
 from dyngs.data.pictures.frame_cache import decode_frames
@@ -29,8 +29,6 @@ from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.times import sequence_warnings, still_if_constant, unit_times
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside, pictures_up_to, staying_within
-
-Splits = dict[Split, tuple[View, ...]]
 
 FARTHEST = 1e18
 """Points with larger coordinates are mistakes; their squares would not fit into float32."""
@@ -130,10 +128,10 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
     splits.setdefault("val", ())
     if new_poses is not None:
         splits["pose"] = new_poses
-    for view in (view for views in splits.values() for view in views):
+    for view in all_views(splits):
         _check_places(view)
     if decode_videos:
-        frames = {view.image_path: view.video for views in splits.values() for view in views if view.video is not None}
+        frames = {view.image_path: view.video for view in all_views(splits) if view.video is not None}
         decode_frames(capture.root, frames, options.frame_cache_mb)
     warnings = [*capture.warnings, *_check_names(capture.root, splits), *_missing_pictures(splits)]
     points, more = _finite_points(capture.points)
@@ -157,7 +155,7 @@ def _check_places(view: View) -> None:
 
 def _check_names(root: Path, splits: Splits) -> list[str]:
     named: dict[str, Path] = {}
-    for view in (view for views in splits.values() for view in views):
+    for view in all_views(splits):
         if named.setdefault(view.name, view.image_path) != view.image_path:
             raise DyngsError(
                 f"{root}: the pictures {named[view.name]} and {view.image_path} share the name {view.name}; rename one"
@@ -168,7 +166,7 @@ def _check_names(root: Path, splits: Splits) -> list[str]:
 
 
 def _missing_pictures(splits: Splits) -> list[str]:
-    seen = [view for views in splits.values() for view in views]
+    seen = all_views(splits)
     missing = [view.image_path for view in seen if view.video is None and not view.image_path.is_file()]
     return [f"{len(missing)} of {len(seen)} pictures are missing, first {missing[0]}"] if missing else []
 

@@ -8,10 +8,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from dyngs.data.capture import Split, View
+from dyngs.data.capture import Splits, View, all_views
 from dyngs.errors import DyngsError
-
-Splits = dict[Split, tuple[View, ...]]
+from dyngs.files.fields import is_number
 
 SAME_TIME = 1e-6
 """Times in [0, 1] that lie no farther apart are one time (files of one capture are often rounded differently)."""
@@ -26,10 +25,9 @@ def unit_times(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
     Raises:
         DyngsError: a time that is no finite number, or some views with and some without a time; names the view.
     """
-    views = _all(splits)
+    views = all_views(splits)
     for view in views:
-        number = view.time is None or (isinstance(view.time, (int, float)) and not isinstance(view.time, bool))
-        if not number or (view.time is not None and not math.isfinite(view.time)):
+        if view.time is not None and not (is_number(view.time) and math.isfinite(view.time)):
             raise DyngsError(f"{root}: the time of {view.name} must be a finite number, got {view.time!r:.40}")
     timed = [view.time for view in views if view.time is not None]
     if not timed:
@@ -49,18 +47,18 @@ def unit_times(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
 
 def still_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
     """The splits without times, and a warning, if several pictures all have one time; a lone one is kept in [0, 1]."""
-    times = {view.time for view in _all(splits)}
+    times = {view.time for view in all_views(splits)}
     if len(times) != 1 or times == {None}:
         return splits, []
     time = times.pop() or 0.0
-    if len(_all(splits)) == 1:
+    if len(all_views(splits)) == 1:
         return _with_time(splits, time if 0 <= time <= 1 else 0.0), []
     return _with_time(splits, None), [f"all pictures have time {time:g}: treated as a still scene"]
 
 
 def sequence_warnings(splits: Splits) -> list[str]:
     """What is suspicious about cameras and times: pictures that only differ by chance, cameras that lack frames."""
-    views = [view for view in _all(splits) if view.time is not None]
+    views = [view for view in all_views(splits) if view.time is not None]
     return [*_repeated(views), *_frame_counts(views)]
 
 
@@ -130,10 +128,6 @@ def _camera_labels(cameras: dict[int, list[View]]) -> dict[int, str]:
         else f"camera {camera}"
         for camera in cameras
     }
-
-
-def _all(splits: Splits) -> list[View]:
-    return [view for kept in splits.values() for view in kept]
 
 
 def _with_time(splits: Splits, time: float | None) -> Splits:

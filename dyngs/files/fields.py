@@ -4,11 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
 from dyngs.errors import DyngsError
+
+
+def is_number(value: object) -> TypeGuard[int | float]:
+    """Whether a value out of a JSON file is a number; true and false are none."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def matrix_of(where: str, key: str, value: object) -> np.ndarray:
+    """The float64 numbers that a 4x4 matrix in a JSON file holds; their shape and values are not checked.
+
+    Raises:
+        DyngsError: other things than numbers; ``where`` and ``key`` say which.
+    """
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise DyngsError(f"{where}: {key} must hold 4x4 numbers; export it again") from None
 
 
 def entry(where: object, fields: object, key: str) -> Any:
@@ -38,7 +55,7 @@ def numbers_of(where: object, value: object, shape: tuple[int, ...] | None) -> n
     return array.ravel() if shape is None else array.reshape(shape)
 
 
-def some(items: Collection[object]) -> str:
+def first_few(items: Collection[object]) -> str:
     """The first few, for messages."""
     return ", ".join(str(item) for item in list(items)[:5]) + (f" and {len(items) - 5} more" if len(items) > 5 else "")
 

@@ -35,32 +35,24 @@ def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     try:
         yield temporary
         if durable:
-            _flush_file(temporary)
+            _flush(temporary, os.O_RDWR)
         os.replace(temporary, path)
         if durable:
-            _flush_folder(path.parent)
+            with suppress(OSError):  # not every system can flush a folder
+                _flush(path.parent, os.O_RDONLY)
     except OSError as error:
         raise DyngsError(f"cannot write {path}: {error.strerror or error}") from error
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def _flush_file(path: Path) -> None:
-    file = os.open(path, os.O_RDWR)
+def _flush(path: Path, flags: int) -> None:
+    """Wait until the disk has a file, or the names in a folder."""
+    opened = os.open(path, flags)
     try:
-        os.fsync(file)
+        os.fsync(opened)
     finally:
-        os.close(file)
-
-
-def _flush_folder(folder: Path) -> None:
-    """Wait until the disk has the names in ``folder``, where the system can do that."""
-    with suppress(OSError):
-        opened = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(opened)
-        finally:
-            os.close(opened)
+        os.close(opened)
 
 
 def write_text(path: Path, text: str, *, durable: bool = False) -> None:

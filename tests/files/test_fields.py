@@ -10,11 +10,11 @@ import pytest
 from measured import cost_of
 
 from dyngs.errors import DyngsError
-from dyngs.files.fields import numbers_of, some
+from dyngs.files.fields import first_few, numbers_of
 
 
 def test_some() -> None:
-    assert (some([1, 2]), some(range(7))) == ("1, 2", "0, 1, 2, 3, 4 and 2 more")
+    assert (first_few([1, 2]), first_few(range(7))) == ("1, 2", "0, 1, 2, 3, 4 and 2 more")
 
 
 def test_numbers_in_another_shape() -> None:

@@ -66,6 +66,11 @@ def cam_from_opengl(world_from_cam: np.ndarray) -> np.ndarray:
     return inverse_rigid(world_from_cam @ OPENGL_FROM_OPENCV)
 
 
+def opengl_from_cam(cam_from_world: np.ndarray) -> np.ndarray:
+    """(4, 4) OpenGL camera-to-world pose of a rigid OpenCV ``cam_from_world``; the inverse of ``cam_from_opengl``."""
+    return inverse_rigid(cam_from_world) @ OPENGL_FROM_OPENCV
+
+
 def inverse_rigid(pose: np.ndarray) -> np.ndarray:
     """(4, 4) inverse of a rigid transform."""
     inverse = np.eye(4)

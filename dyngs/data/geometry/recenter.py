@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from dyngs.data.body_frames import moved
-from dyngs.data.capture import Capture, PointCloud, View
+from dyngs.data.capture import Capture, PointCloud, View, all_views
 from dyngs.data.geometry.poses import camera_center
 
 MAX_DISTANCE = 1e5
@@ -23,7 +23,7 @@ def recenter(capture: Capture) -> Capture:
     (median distance from that centre). ``world_offset`` of the result is what was subtracted, on top of what the
     capture already carried.
     """
-    centers = np.array([camera_center(view.cam_from_world) for views in capture.splits.values() for view in views])
+    centers = np.array([camera_center(view.cam_from_world) for view in all_views(capture.splits)])
     median = np.median(centers, axis=0)
     spread = float(np.median(np.linalg.norm(centers - median, axis=1)))
     distance = float(np.linalg.norm(median))

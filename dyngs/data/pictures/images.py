@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import check_size, max_decoded_mb
+from dyngs.files.containment import check_size, inside, max_decoded_mb
 from dyngs.files.picture_errors import picture_error
 
 if TYPE_CHECKING:
@@ -52,6 +52,21 @@ def read_header(path: Path) -> PictureHeader:
         spec = source.spec()
         source.close()
         return PictureHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0)
+
+
+def header_if_readable(path: Path) -> PictureHeader | None:
+    """Size and channels of a capture's picture; None where it is missing or damaged, which the loader reports.
+
+    Raises:
+        DyngsError: the picture lies outside the capture, or is larger than ``data.max_megapixels``.
+    """
+    inside(path)
+    try:
+        header = read_header(path)
+    except DyngsError:
+        return None
+    check_size(path, header.width, header.height, header.channels)
+    return header
 
 
 def read_picture(path: Path) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dyngs.data.capture import Capture, Split, View
+from dyngs.data.capture import Capture, Split, Splits
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import read_frame_file, read_views
 
@@ -22,7 +22,7 @@ def read_blender(root: Path) -> Capture:
     Raises:
         DyngsError: see ``dyngs.data.readers.shared.transforms.read_views``.
     """
-    splits: dict[Split, tuple[View, ...]] = {}
+    splits: Splits = {}
     warnings: list[str] = []
     fps = None
     names: tuple[Split, ...] = ("train", "val", "test")

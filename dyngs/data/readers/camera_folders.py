@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from dyngs.data.capture import Capture, Split, View
-from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV, checked_pose, inverse_rigid
+from dyngs.data.capture import Capture, Splits, View
+from dyngs.data.geometry.poses import checked_pose, opengl_from_cam
 from dyngs.data.readers.shared.camera_sequences import (
+    MIN_CAMERAS_TO_HOLD_OUT,
     find_cameras,
     open_camera,
     sequence_views,
@@ -19,10 +17,10 @@ from dyngs.data.readers.shared.camera_sequences import (
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import MAX_FPS
 from dyngs.errors import DyngsError
+from dyngs.files.fields import first_few, is_number, matrix_of
 from dyngs.files.json_files import read_json_object
 
 CALIBRATION = "cameras.json"
-_MIN_TO_HOLD_ONE_OUT = 3
 
 
 @dataclass(frozen=True)
@@ -55,14 +53,14 @@ def read_camera_folders(root: Path) -> Capture:
     found = find_cameras(root)
     names = [name for name in sorted(calibrated) if name in found]
     if not names:
-        raise DyngsError(f"{path}: no folder or video is named like its cameras ({_some(sorted(calibrated))})")
+        raise DyngsError(f"{path}: no folder or video is named like its cameras ({first_few(sorted(calibrated))})")
     warnings = []
     if len(names) < len(calibrated):
         absent = sorted(calibrated.keys() - found.keys())
-        warnings.append(f"{path.name}: no folder or video for {_some(absent)}, left out")
+        warnings.append(f"{path.name}: no folder or video for {first_few(absent)}, left out")
     unknown = sorted(found.keys() - calibrated.keys())
     if unknown:
-        warnings.append(f"{path.name}: no calibration for {_some(unknown)}, left out")
+        warnings.append(f"{path.name}: no calibration for {first_few(unknown)}, left out")
     cameras = [open_camera(name, found[name]) for name in names]
     own = {name: _calibration(calibrated[name], f"{path}, camera {name}") for name in names}
     views, notes = sequence_views(path, cameras, own)
@@ -78,7 +76,7 @@ def _read_calibration(path: Path) -> _CalibrationFile:
     if not isinstance(cameras, dict) or not cameras:
         raise DyngsError(f"{path}: {wrong}")
     fps = fields.get("fps")
-    if fps is not None and (isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps < MAX_FPS):
+    if fps is not None and not (is_number(fps) and 0 < fps < MAX_FPS):
         raise DyngsError(f"{path}: 'fps' must be a positive number, got {fps!r:.40}")
     return _CalibrationFile(cameras, None if fps is None else float(fps), fields.get("test"))
 
@@ -95,22 +93,16 @@ def _calibration(value: object, where: str) -> dict[str, object]:
         )
     if "cam_from_world" not in own:
         return own
-    try:
-        matrix = np.array(own.pop("cam_from_world"), dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise DyngsError(f"{where}: cam_from_world must hold 4x4 numbers; export it again") from None
-    pose, _ = checked_pose(matrix, where)
-    own["transform_matrix"] = (inverse_rigid(pose) @ OPENGL_FROM_OPENCV).tolist()
+    pose, _ = checked_pose(matrix_of(where, "cam_from_world", own.pop("cam_from_world")), where)
+    own["transform_matrix"] = opengl_from_cam(pose).tolist()
     return own
 
 
-def _splits(
-    path: Path, test: object, views: dict[str, tuple[View, ...]]
-) -> tuple[dict[Split, tuple[View, ...]], list[str]]:
+def _splits(path: Path, test: object, views: dict[str, tuple[View, ...]]) -> tuple[Splits, list[str]]:
     """Test cameras by ``test``, else the first one if there are enough; no test split if there are not."""
     notes = []
     if test is None:
-        if len(views) < _MIN_TO_HOLD_ONE_OUT:
+        if len(views) < MIN_CAMERAS_TO_HOLD_OUT:
             return {"train": tuple(view for kept in views.values() for view in kept)}, []
         test = [min(views)]
         notes = [f"{path.name} names no 'test' cameras: the first one, {test[0]}, is held out"]
@@ -118,15 +110,11 @@ def _splits(
         raise DyngsError(f"{path}: 'test' must be a list of camera names")
     unknown = sorted(set(test) - views.keys())
     if unknown:
-        raise DyngsError(f"{path}: 'test' names {_some(unknown)}, but the cameras are {_some(sorted(views))}")
+        raise DyngsError(f"{path}: 'test' names {first_few(unknown)}, but the cameras are {first_few(sorted(views))}")
     return {
         "train": tuple(view for name, kept in views.items() if name not in test for view in kept),
         "test": tuple(view for name, kept in views.items() if name in test for view in kept),
     }, notes
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 FORMAT = CaptureFormat("camera_folders", CALIBRATION, is_camera_folders, read_camera_folders)

@@ -10,12 +10,12 @@ import numpy as np
 from dyngs.data.capture import Capture, Lens, PointCloud, View
 from dyngs.data.geometry.intrinsics import match_size, pinhole_matrix, rescale_warning
 from dyngs.data.geometry.poses import checked_pose, repair_warning
-from dyngs.data.pictures.images import SUFFIXES, read_header
+from dyngs.data.pictures.images import SUFFIXES, header_if_readable
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.colmap_check import check_model_file
 from dyngs.data.readers.shared.transforms import view_name
 from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import check_size, inside
+from dyngs.files.containment import inside
 
 if TYPE_CHECKING:
     import pycolmap
@@ -78,7 +78,9 @@ def read_colmap(root: Path) -> Capture:
         pose, repaired[where] = checked_pose(np.asarray(image.cam_from_world().matrix()), where)
         intrinsics, lens = pinhole_and_lens(camera, where)
         path = root / "images" / image.name
-        intrinsics, size, changed = match_size(intrinsics, (camera.width, camera.height), _stored_size(path), where)
+        header = header_if_readable(path)
+        stored = None if header is None else (header.width, header.height)
+        intrinsics, size, changed = match_size(intrinsics, (camera.width, camera.height), stored, where)
         if changed:
             rescaled.append(where)
         name, mask = view_name(path, root / "images"), _mask_of(image.name, masks)
@@ -124,17 +126,6 @@ def _load_model(folder: Path) -> pycolmap.Reconstruction:
     with reading(folder, "the COLMAP model is inconsistent; export it again"):
         (model.read_binary if extension == ".bin" else model.read_text)(str(folder))
     return model
-
-
-def _stored_size(path: Path) -> tuple[int, int] | None:
-    """(width, height), None where the picture is missing or damaged: the loader refuses it when it is wanted."""
-    inside(path)
-    try:
-        header = read_header(path)
-    except DyngsError:
-        return None
-    check_size(path, header.width, header.height, header.channels)
-    return header.width, header.height
 
 
 def _find_masks(folder: Path) -> dict[str, Path]:

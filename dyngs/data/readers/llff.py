@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.capture import Capture, Split, View
+from dyngs.data.capture import Capture, Splits, View
 from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV
 from dyngs.data.readers.shared.camera_sequences import (
     find_cameras,
@@ -83,7 +83,7 @@ def _calibration(row: np.ndarray) -> dict[str, object]:
     }
 
 
-def _splits(views: dict[str, tuple[View, ...]], names: list[str]) -> dict[Split, tuple[View, ...]]:
+def _splits(views: dict[str, tuple[View, ...]], names: list[str]) -> Splits:
     """The first camera for testing if there is another one to train on."""
     test = names[:1] if len(names) > 1 else []
     return {

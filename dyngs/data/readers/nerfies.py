@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.capture import Capture, PointCloud, Split, View
+from dyngs.data.capture import Capture, PointCloud, Splits
 from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV
-from dyngs.data.pictures.images import SUFFIXES, read_header
+from dyngs.data.pictures.images import SUFFIXES, header_if_readable
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
-from dyngs.files.containment import check_size, inside
+from dyngs.files.fields import is_number
 from dyngs.files.json_files import read_json_object
 from dyngs.files.numpy_files import read_npy
 
@@ -79,7 +79,7 @@ def read_nerfies(root: Path) -> Capture:
     }
     if skewed:
         warnings.append(f"{len(skewed)} cameras have skew, which is ignored; first {skewed[0]}")
-    splits: dict[Split, tuple[View, ...]] = {"train": tuple(views[name] for name in train)}
+    splits: Splits = {"train": tuple(views[name] for name in train)}
     if lists["val_ids"]:
         splits["test"] = tuple(views[name] for name in lists["val_ids"])
     return Capture(root, "nerfies", splits, _points(root / "points.npy", scene), warnings=tuple(warnings))
@@ -116,7 +116,7 @@ def _times(root: Path, metadata: dict[str, dict[str, object]]) -> dict[str, floa
         value = own.get("warp_id", own.get("time_id"))
         if value is None:
             continue
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or value % 1 or value < 0:
+        if not is_number(value) or value % 1 or value < 0:
             raise DyngsError(
                 f"{root / 'metadata.json'}, '{name}': warp_id must be a whole number >= 0, got {value!r:.40}"
             )
@@ -127,7 +127,7 @@ def _times(root: Path, metadata: dict[str, dict[str, object]]) -> dict[str, floa
 
 def _frame(own: dict[str, object]) -> int | None:
     value = own.get("warp_id", own.get("time_id"))
-    return int(value) if isinstance(value, (int, float)) else None
+    return int(value) if is_number(value) else None
 
 
 def _numbers(path: Path, fields: dict[str, object], key: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -202,12 +202,9 @@ def _camera(path: Path, scene: _Scene, pictures: _Pictures, name: str, skewed: l
 def _scaled_size(full: np.ndarray, factor: int, picture: Path) -> tuple[int, int]:
     """(width, height) of the picture; as it is stored if that is a rounding of ``full / factor``."""
     nominal = round(float(full[0]) / factor), round(float(full[1]) / factor)
-    inside(picture)
-    try:
-        header = read_header(picture)
-    except DyngsError:
+    header = header_if_readable(picture)
+    if header is None:
         return nominal
-    check_size(picture, header.width, header.height, header.channels)
     near = abs(header.width - full[0] / factor) <= 1 and abs(header.height - full[1] / factor) <= 1
     return (header.width, header.height) if near else nominal
 

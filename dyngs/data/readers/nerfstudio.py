@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.data.capture import Capture, PointCloud, Split, View
+from dyngs.data.capture import Capture, PointCloud, Split, Splits, View
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import FrameFile, read_frame_file, read_views
 from dyngs.errors import DyngsError, reading
@@ -59,13 +59,13 @@ def read_points(path: Path) -> PointCloud:
     return PointCloud(xyz, rgb)
 
 
-def _splits(file: FrameFile, views: dict[str, View]) -> tuple[dict[Split, tuple[View, ...]], list[str]]:
+def _splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits, list[str]]:
     """Splits by the file's lists; all views as train where it has none."""
     names: tuple[Split, ...] = ("train", "val", "test")
     listed = {name: file.fields.get(f"{name}_filenames") for name in names}
     if all(value is None for value in listed.values()):
         return {"train": tuple(views.values())}, []
-    splits: dict[Split, tuple[View, ...]] = {}
+    splits: Splits = {}
     unknown: list[str] = []
     for name in names:
         value = listed[name]

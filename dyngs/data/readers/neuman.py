@@ -10,13 +10,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import body_frames, of_one_clip
-from dyngs.data.capture import BodyFrames, Capture, Silhouette, Split, View
+from dyngs.data.capture import BodyFrames, Capture, Silhouette, Split, Splits, View
 from dyngs.data.geometry.poses import checked_pose
 from dyngs.data.readers.colmap import is_colmap, read_colmap
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
-from dyngs.files.fields import entry, numbers_of, some
+from dyngs.files.fields import entry, first_few, numbers_of
 from dyngs.files.numpy_files import read_npz
 from dyngs.files.pickles import read_pickle, read_pickled_array
 
@@ -122,9 +122,9 @@ def _number(root: Path, name: str) -> int:
     return int(digits[-1])
 
 
-def _splits(root: Path, people: dict[str, View]) -> tuple[dict[Split, tuple[View, ...]], list[str]]:
+def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
     """As the lists of names say; all for training where there are none."""
-    splits: dict[Split, tuple[View, ...]] = {}
+    splits: Splits = {}
     unposed: list[str] = []
     names: tuple[Split, ...] = ("train", "val", "test")
     for split in names:
@@ -138,8 +138,9 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[dict[Split, tuple[View
     if "train" not in splits:
         held_out = {view.name for views in splits.values() for view in views}
         splits["train"] = tuple(view for view in people.values() if view.name not in held_out)
-    notes = [f"{len(unposed)} pictures of the splits have no pose and are left out: {some(unposed)}"] if unposed else []
-    return splits, notes
+    if not unposed:
+        return splits, []
+    return splits, [f"{len(unposed)} pictures of the splits have no pose and are left out: {first_few(unposed)}"]
 
 
 FORMAT = CaptureFormat(

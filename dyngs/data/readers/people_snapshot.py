@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
-from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV, inverse_rigid
+from dyngs.data.geometry.poses import opengl_from_cam
 from dyngs.data.pictures.silhouettes import MASKS
 from dyngs.data.pictures.video import VIDEO_SUFFIXES
 from dyngs.data.readers.shared.camera_sequences import open_camera, sequence_views, video_fps
@@ -99,7 +99,7 @@ def _calibration(path: Path) -> dict[str, object]:
         "cx": cx,
         "cy": cy,
         **dict(zip(("k1", "k2", "p1", "p2", "k3"), lens, strict=True)),
-        "transform_matrix": (inverse_rigid(pose) @ OPENGL_FROM_OPENCV).tolist(),
+        "transform_matrix": opengl_from_cam(pose).tolist(),
     }
 
 

@@ -10,13 +10,14 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from dyngs.data.body_frames import body_frames, of_one_clip, rows_of
-from dyngs.data.capture import BodyFrames, Capture, Silhouette, Split, View
-from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV, checked_pose, inverse_rigid
+from dyngs.data.capture import BodyFrames, Capture, Silhouette, Splits, View
+from dyngs.data.geometry.poses import checked_pose, opengl_from_cam
+from dyngs.data.readers.shared.camera_sequences import MIN_CAMERAS_TO_HOLD_OUT
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
-from dyngs.files.fields import entry, numbers_of, some
+from dyngs.files.fields import entry, first_few, numbers_of
 from dyngs.files.pickles import read_pickle, read_pickled_array
 
 ANNOTATIONS = "annots.npy"
@@ -24,7 +25,6 @@ CAMERAS = "cameras.pkl"
 MESHES = "mesh_infos.pkl"
 
 _MASK_FOLDERS = ("mask_cihp", "mask", "masks")
-_MIN_TO_HOLD_ONE_OUT = 3
 _NUM_JOINTS = 24
 
 
@@ -143,7 +143,7 @@ def _params_per_file(root: Path, frames: Iterable[int]) -> tuple[Path, BodyFrame
     missing = [f"{number}.npy" for number in numbers if not (folder / f"{number}.npy").is_file()]
     if missing:
         raise DyngsError(
-            f"{folder}: no body parameters for {len(missing)} of {len(numbers)} frames ({some(missing)}); restore "
+            f"{folder}: no body parameters for {len(missing)} of {len(numbers)} frames ({first_few(missing)}); restore "
             f"these or remove the frames from {ANNOTATIONS}"
         )
     paths = [folder / f"{number}.npy" for number in numbers]
@@ -185,7 +185,7 @@ def _calibration(where: str, intrinsics: object, lens: object, cam_from_world: n
         "cy": float(k[1, 2]) + 0.5,
         "camera_model": "FULL_OPENCV" if len(values) == 8 else "OPENCV",
         **dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), values, strict=False)),
-        "transform_matrix": (inverse_rigid(pose) @ OPENGL_FROM_OPENCV).tolist(),
+        "transform_matrix": opengl_from_cam(pose).tolist(),
     }
 
 
@@ -202,8 +202,8 @@ def _views(path: Path, shots: Sequence[_Shot]) -> tuple[list[View], list[str]]:
     return list(views.values()), warnings
 
 
-def _splits(views: Sequence[View]) -> tuple[dict[Split, tuple[View, ...]], list[str]]:
-    if len({view.camera_id for view in views}) < _MIN_TO_HOLD_ONE_OUT:
+def _splits(views: Sequence[View]) -> tuple[Splits, list[str]]:
+    if len({view.camera_id for view in views}) < MIN_CAMERAS_TO_HOLD_OUT:
         return {"train": tuple(views)}, []
     return {
         "train": tuple(view for view in views if view.camera_id != 0),

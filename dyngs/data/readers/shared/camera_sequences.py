@@ -16,6 +16,9 @@ from dyngs.data.pictures.video import VIDEO_SUFFIXES, VideoInfo
 from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
 
+MIN_CAMERAS_TO_HOLD_OUT = 3
+"""With so many cameras the first one is for testing where the capture names none."""
+
 
 @dataclass(frozen=True)
 class CameraSource:

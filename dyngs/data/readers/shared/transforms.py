@@ -13,9 +13,9 @@ import numpy as np
 from dyngs.data.capture import Lens, VideoFrame, View
 from dyngs.data.geometry.intrinsics import MAX_SIDE, match_size, pinhole_matrix, rescale_warning
 from dyngs.data.geometry.poses import cam_from_opengl, checked_pose, repair_warning
-from dyngs.data.pictures.images import SUFFIXES, PictureHeader, read_header
+from dyngs.data.pictures.images import SUFFIXES, PictureHeader, header_if_readable, read_header
 from dyngs.errors import DyngsError
-from dyngs.files.containment import check_size, inside
+from dyngs.files.fields import is_number, matrix_of
 from dyngs.files.json_files import read_json_object
 
 MAX_FPS = 1e6
@@ -50,7 +50,7 @@ class Frame:
     def integer(self, key: str) -> int | None:
         """The whole number at ``key`` of this frame alone, None if absent or something else."""
         value = self.own.get(key)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
+        if not is_number(value):
             return None
         return int(value) if value % 1 == 0 and abs(value) < _LARGEST_INTEGER else None
 
@@ -74,7 +74,7 @@ class FrameFile:
     def fps(self) -> float | None:
         """Frames per second as the file says, None where it does not."""
         fps = self.fields.get("fps")
-        if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps < MAX_FPS:
+        if not is_number(fps) or not 0 < fps < MAX_FPS:
             return None
         return float(fps)
 
@@ -123,7 +123,10 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
     twice = [path for path, count in Counter(paths).items() if count > 1]
     if twice:
         raise DyngsError(f"{file.path}: {twice[0]} is listed more than once; remove the duplicate frames")
-    headers = [_header(path) if frame.video is None else None for frame, path in zip(file.frames, paths, strict=True)]
+    headers = [
+        header_if_readable(path) if frame.video is None else None
+        for frame, path in zip(file.frames, paths, strict=True)
+    ]
     common = _common_size(file, paths, headers)
     notes = _Notes()
     views = {}
@@ -172,7 +175,7 @@ def _view(
 def _number(value: object, key: str, where: str) -> float | None:
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < _LARGEST:
+    if not is_number(value) or not abs(value) < _LARGEST:
         raise DyngsError(f"{where}: '{key}' must be a finite number, got {value!r:.40}")
     return float(value)
 
@@ -196,17 +199,6 @@ def _image_path(root: Path, frame: Frame) -> Path:
         return path
     candidates = [path.with_name(path.name + ending) for suffix in SUFFIXES for ending in (suffix, suffix.upper())]
     return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
-
-
-def _header(path: Path) -> PictureHeader | None:
-    """None where the file is missing or damaged: the loader refuses it, with its reason, when it is wanted."""
-    inside(path)
-    try:
-        header = read_header(path)
-    except DyngsError:
-        return None
-    check_size(path, header.width, header.height, header.channels)
-    return header
 
 
 def _described_size(frame: Frame) -> tuple[int, int] | None:
@@ -288,7 +280,4 @@ def _matrix(frame: Frame) -> np.ndarray:
     value = frame.own.get("transform_matrix")
     if value is None:
         raise DyngsError(f"{frame.where}: the key 'transform_matrix' is missing")
-    try:
-        return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise DyngsError(f"{frame.where}: transform_matrix must hold 4x4 numbers; export it again") from None
+    return matrix_of(frame.where, "transform_matrix", value)

@@ -1,0 +1,84 @@
+"""Facts about a capture for people: views, sizes, lenses, times, points, as pairs of a name and a value."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from dyngs.data.capture import Capture, all_views
+from dyngs.data.geometry.poses import camera_center
+from dyngs.data.times import distinct_times
+
+
+def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
+    """Return what a capture holds as (name, value) pairs, in the order in which they are shown."""
+    views = all_views(capture.splits)
+    sizes = Counter(f"{view.width}x{view.height}" for view in views)
+    lenses = Counter(view.lens.model for view in views)
+    focal_px = [float(f) for view in views for f in (view.intrinsics[0, 0], view.intrinsics[1, 1])]
+    fov_deg = [float(np.degrees(2 * np.arctan2(0.5 * view.width, view.intrinsics[0, 0]))) for view in views]
+    centers = np.array([camera_center(view.cam_from_world) for view in views]).reshape(-1, 3)
+    facts = [
+        ("format", capture.format),
+        ("views", ", ".join(f"{len(views)} {split}" for split, views in capture.splits.items() if views)),
+        ("sizes", counted(sizes)),
+        ("cameras", str(len({view.camera_id for view in views}))),
+        ("focal length", f"{_range(focal_px)} px"),
+        ("field of view", f"{_range(fov_deg)} degrees across"),
+        ("lens", counted(lenses)),
+        ("alpha", "transparent background" if capture.has_alpha else "none"),
+        ("masks", str(sum(view.mask_path is not None for view in views))),
+        *_time_facts(capture),
+        ("points", str(len(capture.points.xyz)) if capture.points is not None else "none"),
+    ]
+    if len(centers):
+        spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+        box = ", ".join(_range(axis) for axis in centers.T)
+        facts.append(("camera centres", f"{box}; within {spread:.4g} of their mean"))
+    if np.any(capture.world_offset):
+        facts.append(("world offset", " ".join(f"{x:.10g}" for x in capture.world_offset) + " (rebased)"))
+    if capture.body is not None:
+        frames = ", ".join(
+            f"{len(capture.body[name].frames)} {name}" for name in capture.splits if name in capture.body
+        )
+        facts.append(("body", f"{next(iter(capture.body.values())).kind}, frames: {frames}"))
+    return tuple(facts)
+
+
+def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
+    """Distinct times, cameras by times, the frame rate, and how many frames of videos are decoded."""
+    views = [view for view in all_views(capture.splits) if view.time is not None]
+    if not views:
+        yield "times", "none (a still scene)"
+        return
+    times = set(distinct_times(views).values())
+    yield "times", f"{len(times)} in {_range(times)}"
+    cameras: defaultdict[int, set[bytes]] = defaultdict(set)
+    for view in views:
+        cameras[view.camera_id].add(view.cam_from_world.round(9).tobytes())
+    what = "camera" + ("s" if len(cameras) > 1 else "")
+    moving = sum(len(poses) > 1 for poses in cameras.values())
+    motion = "" if not moving else " (moving)" if moving == len(cameras) else f" ({moving} moving)"
+    yield "sequence", f"{len(cameras)} {what}{motion} x {len(times)} times, {len(views)} pictures"
+    if capture.fps is not None:
+        yield "frame rate", f"{capture.fps:.6g} per second"
+    frames = [view.image_path for view in views if view.video is not None]
+    if frames:
+        yield "video frames", f"{sum(path.is_file() for path in frames)} of {len(frames)} are decoded already"
+
+
+def _range(values: Iterable[float]) -> str:
+    """Return "lowest to highest", or one number where both are about the same."""
+    listed = list(values)
+    if not listed:
+        return "none"
+    low, high = min(listed), max(listed)
+    return f"{low:.4g}" if np.isclose(low, high) else f"{low:.4g} to {high:.4g}"
+
+
+def counted(counter: Counter[Any]) -> str:
+    """Return the most frequent keys with their counts."""
+    return ", ".join(f"{key} ({count})" if len(counter) > 1 else f"{key}" for key, count in counter.most_common(6))
