@@ -1,4 +1,4 @@
-"""``python -m fuzz READER --minutes N``: readers under changed files, a line for each, failures kept in the corpus."""
+"""``python -m fuzz READER --minutes N``: fuzz readers, print one line for each, keep failures in the corpus."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fuzz.worker import Limits, import_everything
 
 
 def main() -> int:
-    """0 where nothing failed, else 1."""
+    """Run the command line; return 0 if nothing failed, else 1."""
     arguments = _parser().parse_args()
     names = list(READERS) if "all" in arguments.readers else arguments.readers
     import_everything()
@@ -61,7 +61,7 @@ def _tried(name: str, arguments: argparse.Namespace, count: int) -> Tally:
 
 
 def replayed(name: str) -> Tally:
-    """What comes of the corpus of a reader."""
+    """Return the outcomes of the stored cases of a reader."""
     import tempfile
     import time
 

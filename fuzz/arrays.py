@@ -1,4 +1,4 @@
-"""Changes to NumPy's files: headers that lie, other types, odd numbers, members of archives."""
+"""Mutations of NumPy files: wrong headers, other types, odd numbers, members of archives."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _LARGEST = 1 << 24
 
 
 def npy_changed(data: bytes, rng: Random) -> bytes:
-    """A ``.npy`` after one change to its header or its numbers."""
+    """Return a ``.npy`` file after one mutation of its header or its numbers."""
     try:
         version, header, body = _parts(data)
     except Exception:  # not a .npy, or no longer
@@ -74,7 +74,7 @@ def npy_changed(data: bytes, rng: Random) -> bytes:
 
 
 def npz_changed(data: bytes, rng: Random) -> bytes:
-    """A ``.npz`` after one change to a member or to the archive."""
+    """Return a ``.npz`` file after one mutation of a member or of the archive."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(info.file_size for info in archive.infolist()) > _LARGEST:
@@ -104,7 +104,7 @@ def npz_changed(data: bytes, rng: Random) -> bytes:
 
 
 def _parts(data: bytes) -> tuple[bytes, dict, bytes]:
-    """Version, header and what follows."""
+    """Split a file into version, header and data."""
     if not data.startswith(_MAGIC):
         raise ValueError
     version = data[6:8]
@@ -121,7 +121,7 @@ def _joined(version: bytes, header: dict, body: bytes) -> bytes:
 
 
 def _values_changed(data: bytes, rng: Random) -> bytes:
-    """Other numbers, another type or another shape, all valid."""
+    """Change numbers, type or shape to other valid ones."""
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
     except Exception:  # a header that lies

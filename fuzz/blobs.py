@@ -1,4 +1,4 @@
-"""Changes to bytes and to text that know no format."""
+"""Mutations of bytes and of text that know no format."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _FLOATS = (0.0, -0.0, -1.0, float("nan"), float("inf"), float("-inf"), 1e300, 1e
 
 
 def bytes_changed(data: bytes, rng: Random) -> bytes:
-    """``data`` after one random change that knows nothing of its format."""
+    """Return ``data`` after one random mutation that knows nothing of its format."""
     if not data:
         return rng.choice((b"\0", b"{}", b"\xff" * 9))
     change = rng.choice((_flipped, _flipped, _integer, _integer, _float, _cut, _doubled, _removed, _inserted, _zeroed))
@@ -51,12 +51,12 @@ def bytes_changed(data: bytes, rng: Random) -> bytes:
 
 
 def head_changed(data: bytes, rng: Random, size: int = 300) -> bytes:
-    """As ``bytes_changed``, within the first ``size`` bytes, where headers are."""
+    """Mutate as ``bytes_changed`` within the first ``size`` bytes, where headers are."""
     return bytes_changed(data[:size], rng) + data[size:]
 
 
 def strings_changed(data: bytes, rng: Random) -> bytes:
-    """``data`` with one run of printable characters replaced."""
+    """Return ``data`` with one run of printable characters replaced."""
     runs = list(re.finditer(rb"[\x20-\x7e]{3,}", data))
     if not runs:
         return bytes_changed(data, rng)
@@ -68,7 +68,7 @@ def strings_changed(data: bytes, rng: Random) -> bytes:
 
 
 def text_changed(data: bytes, rng: Random) -> bytes:
-    """Text with a number, a word or a line changed."""
+    """Return text with a number, a word or a line changed."""
     text = data.decode("utf-8", "surrogateescape")
     change = rng.choice((_number, _number, _number, _word, _word, _line, _line))
     return change(text, rng).encode("utf-8", "surrogateescape" if "\ud800" not in text else "surrogatepass")

@@ -1,4 +1,4 @@
-"""Many cases of one reader: workers are started, watched and replaced; what fails is made small and kept."""
+"""Fuzzing of one reader with many cases: workers are started, watched and replaced; failures are minimised and kept."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from fuzz.worker import STANDARD, Limits, run_child
 CORPUS = Path(__file__).resolve().parent / "corpus"
 KEPT_PER_REASON = 1
 MOST_PER_PROCESS = 2000
-"""Cases after which a worker is replaced, so that what leaks stays small."""
+"""Cases after which a worker is replaced, which bounds its leaks."""
 
 
 @dataclass
 class Tally:
-    """What came of the cases of a reader.
+    """Outcomes of the cases of a reader.
 
     Attributes:
-        reader: its name.
-        outcomes: how many of each.
-        failures: reason to the cases that failed so.
-        seconds: of processor time, of the workers.
+        reader: name of the reader.
+        outcomes: number of cases of each outcome.
+        failures: reason to the cases that failed for it.
+        seconds: processor time of the workers.
         kept: files written to the corpus.
     """
 
@@ -51,14 +51,14 @@ class Tally:
 
     @property
     def line(self) -> str:
-        """For people."""
+        """The tally as one line of text."""
         counts = " ".join(f"{self.outcomes[o]:>7} {o.value}" for o in Outcome)
         kinds = f"{len(self.failures):>3} kinds" if self.failures else ""
         return f"{self.reader:<16} {self.inputs:>8} inputs {counts} {self.seconds:>6.1f} s of CPU {kinds}".rstrip()
 
 
 def seeds_of(reader: Reader) -> dict[str, Case]:
-    """The reader's seeds, written afresh."""
+    """Write the seeds of a reader and return them as cases."""
     found = {}
     for name, write in sorted(reader.seeds.items()):
         with tempfile.TemporaryDirectory() as folder:
@@ -68,24 +68,24 @@ def seeds_of(reader: Reader) -> dict[str, Case]:
 
 
 def cases(seeds: dict[str, Case], name: str, seed: int, numbers: range) -> Iterator[tuple[int, Case]]:
-    """The cases of these ``numbers``, which depend on nothing else than the arguments."""
+    """Yield the cases with these ``numbers``; they depend on the arguments only."""
     for number in numbers:
         yield number, changed_case(seeds, Random(f"{name}/{seed}/{number}"))
 
 
 def cpu_seconds() -> float:
-    """Of this process and of those that it has waited for."""
+    """Return the processor time of this process and of the children it has waited for."""
     return sum(os.times()[:4])
 
 
 def stored_cases(name: str, seeds: dict[str, Case]) -> dict[str, Case]:
-    """The corpus of a reader: file name to case."""
+    """Read the corpus of a reader: file name to case."""
     folder = CORPUS / name
     return {path.name: from_json(path.read_text(), seeds) for path in sorted(folder.glob("*.json"))}
 
 
 def campaign(name: str, seed: int, inputs: int, seconds: float, limits: Limits = STANDARD) -> Tally:
-    """What came of ``inputs`` cases, fewer where ``seconds`` are over before."""
+    """Run ``inputs`` cases, or as many as ``seconds`` allow, and return their outcomes."""
     reader = READERS[name]
     seeds = seeds_of(reader)
     tally, begin, number, before = Tally(name), time.monotonic(), 0, cpu_seconds()
@@ -101,7 +101,7 @@ def campaign(name: str, seed: int, inputs: int, seconds: float, limits: Limits =
             count = min(inputs - number, MOST_PER_PROCESS)
             own = cases(seeds, name, seed, range(number, number + count))
             for i, verdict in run_cases(reader, own, Path(folder), limits, begin + seconds):
-                if i is None:  # the case could not even be made
+                if i is None:  # the case could not be made
                     number += 1
                     break
                 number = i + 1
@@ -114,7 +114,7 @@ def campaign(name: str, seed: int, inputs: int, seconds: float, limits: Limits =
 
 
 def verdict_of(reader: Reader, case: Case, limits: Limits = STANDARD) -> Verdict:
-    """How one case ends, in a process of its own."""
+    """Run one case in a process of its own and return its verdict."""
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         verdicts = list(run_cases(reader, iter([(0, case)]), Path(folder), limits, time.monotonic() + 600))
     return verdicts[0][1]
@@ -123,10 +123,10 @@ def verdict_of(reader: Reader, case: Case, limits: Limits = STANDARD) -> Verdict
 def run_cases(
     reader: Reader, numbered: Iterator[tuple[int, Case]], folder: Path, limits: Limits, until: float
 ) -> Iterator[tuple[int | None, Verdict]]:
-    """Numbers and verdicts, up to the first case that ends the process, or the time ``until``; the worker is gone then.
+    """Yield numbers and verdicts up to the first case that ends the worker process, or the time ``until``.
 
-    A case that ends the process, or hangs, is a failure like others; call again with those after it. Where the process
-    ends between two cases, the number is None.
+    A case that ends the process, or hangs, is a failure; call again with the cases after it. If the process ends
+    between two cases, the number is None.
     """
     out, pipe = os.pipe()
     clear(folder)
@@ -171,7 +171,7 @@ def _verdicts(
 
 
 def _death(status: int, folder: Path) -> Verdict:
-    """Why the process ended in the middle of a case."""
+    """Return the verdict on a case during which the process ended."""
     if os.WIFSIGNALED(status):
         name = signal.Signals(os.WTERMSIG(status)).name
         what = "takes too long" if name == "SIGPROF" else f"ends the process by {name}"
@@ -197,7 +197,7 @@ def _end(worker: int) -> None:
 
 
 def minimised(reader: Reader, case: Case, reason: str, seed: Case, tries: int = 60) -> Case:
-    """The case with as little changed of its seed as still fails for the same reason."""
+    """Minimise a case: undo changes to its seed as long as it fails for the same reason."""
     for name in sorted(case.files.keys() | seed.files.keys()):
         if case.files.get(name) == seed.files.get(name):
             continue
@@ -214,7 +214,7 @@ def minimised(reader: Reader, case: Case, reason: str, seed: Case, tries: int = 
 
 
 def _nearer(reader: Reader, case: Case, reason: str, to: tuple[str, bytes], tries: int) -> tuple[Case, int]:
-    """With ranges of a file put back as they were, where lengths are equal; otherwise cut shorter."""
+    """Restore ranges of a file, if its length is unchanged, or else cut them out, as long as the case still fails."""
     name, original = to
     size = len(case.files[name])
     step = size // 2
@@ -241,7 +241,7 @@ def _without(files: dict[str, bytes], name: str) -> dict[str, bytes]:
 
 
 def keep(tally: Tally, known: set[str]) -> None:
-    """Put one small case of each kind of failure into the corpus, but for the reasons ``known``."""
+    """Add one minimised case of each kind of failure to the corpus, except for the reasons ``known``."""
     reader = READERS[tally.reader]
     seeds = seeds_of(reader)
     for reason, failures in sorted(tally.failures.items()):

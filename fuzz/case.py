@@ -1,4 +1,4 @@
-"""An input of a reader: files in a folder, as a seed makes them or changed, and how it is stored in the corpus."""
+"""Cases: inputs of a reader as files in a folder, seeds or mutated ones, and their form in the corpus."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Case:
     Attributes:
         seed: name of the seed that it was made from.
         files: path below the folder, with "/", to content.
-        links: path below the folder to what the symbolic link there says.
-        steps: what was changed, for people.
+        links: path below the folder to the target of the symbolic link there.
+        steps: descriptions of the mutations.
     """
 
     seed: str
@@ -28,15 +28,15 @@ class Case:
     steps: tuple[str, ...] = ()
 
     def changed(self, step: str, files: dict[str, bytes], links: dict[str, str] | None = None) -> Case:
-        """The same with other files, and links if given."""
+        """Return the case with other files, and other links if given."""
         return replace(self, files=files, links=self.links if links is None else links, steps=(*self.steps, step))
 
     def write(self, folder: Path, before: Case | None = None) -> None:
-        """Put it in ``folder``; names that the file system refuses are left out.
+        """Write it to ``folder``; names that the file system refuses are left out.
 
         Args:
-            folder: emptied first, unless
-            before: lies in it, of which only what differs is written then.
+            folder: emptied first, unless it holds ``before``.
+            before: case that lies in the folder; only files that differ are then written.
         """
         if before is not None and not before.links and not self.links and before.files.keys() == self.files.keys():
             for name, content in self.files.items():
@@ -50,7 +50,7 @@ class Case:
             _try(lambda path=folder / name, target=target: _link(path, target))
 
     def to_json(self, seed: Case) -> str:
-        """What differs from the seed, with the steps; ``from_json`` reads it."""
+        """Return the differences from the seed, and the steps, as JSON; ``from_json`` reads it."""
         different = {name: _text(data) for name, data in self.files.items() if seed.files.get(name) != data}
         stored: dict[str, object] = {"seed": self.seed, "steps": list(self.steps), "files": different}
         stored["removed"] = sorted(seed.files.keys() - self.files.keys())
@@ -59,7 +59,7 @@ class Case:
 
 
 def from_json(text: str, seeds: dict[str, Case]) -> Case:
-    """The case of a file of the corpus, laid over its seed."""
+    """Return the case of a file of the corpus: its seed with the stored differences."""
     stored = json.loads(text)
     seed = seeds[stored["seed"]]
     files = {name: data for name, data in seed.files.items() if name not in stored["removed"]}
@@ -68,13 +68,13 @@ def from_json(text: str, seeds: dict[str, Case]) -> Case:
 
 
 def case_of(name: str, folder: Path) -> Case:
-    """The seed that ``folder`` holds."""
+    """Return the files in ``folder`` as a case without mutations."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     return Case(name, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths})
 
 
 def clear(folder: Path) -> None:
-    """Leave an empty ``folder``."""
+    """Empty ``folder``; create it if missing."""
     if folder.is_dir() and not folder.is_symlink():
         if not any(folder.iterdir()):
             return
@@ -103,7 +103,7 @@ def _link(path: Path, target: str) -> None:
 
 
 def _text(data: bytes) -> object:
-    """Readable where it is short text, so that a corpus can be reviewed."""
+    """Return short text as it is, so that the corpus can be reviewed, and anything else as base64."""
     try:
         text = data.decode("ascii")
         return text if len(text) < 20_000 else {"base64": base64.b64encode(data).decode()}

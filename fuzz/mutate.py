@@ -1,4 +1,4 @@
-"""Changed cases: which file is changed, and by what knows its format."""
+"""Mutation of cases: choice of a file, and of the mutation for its format."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ CHANGES: Mapping[str, Change] = {
     ".safetensors": safetensors_changed,
     ".dyngs": dyngs_changed,
 }
-"""What changes a file, by the ending of its name."""
+"""Mutations of files by suffix."""
 
 _PICTURES = (".png", ".jpg", ".exr", ".tif", ".bmp", ".webp")
 _LINKS = ("..", "../precious", ".", "../precious/keep.txt", "none", "/dev/zero", "/dev/null", "../capture")
 
 
 def changed_case(seeds: Mapping[str, Case], rng: Random) -> Case:
-    """One of the seeds with one to three changes."""
+    """Return one of the seeds after one to three mutations."""
     case = seeds[rng.choice(sorted(seeds))]
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         is_alone = len(case.files) == 1
@@ -71,7 +71,7 @@ def _file_changed(case: Case, rng: Random) -> Case:
 
 
 def _chosen(case: Case, rng: Random) -> str | None:
-    """A file; all pictures together count as one, so that what describes them is changed more often."""
+    """Choose a file; all pictures together count as one, so that files that describe them are mutated more often."""
     pictures = [name for name in sorted(case.files) if name.endswith(_PICTURES)]
     others = [name for name in sorted(case.files) if not name.endswith(_PICTURES)]
     choices = others + ([rng.choice(pictures)] if pictures else [])
@@ -79,7 +79,7 @@ def _chosen(case: Case, rng: Random) -> str | None:
 
 
 def _folder_changed(case: Case, rng: Random) -> Case:
-    """A file gone, renamed, exchanged, empty, or replaced by a link."""
+    """Remove, rename, exchange or empty a file, or replace it by a folder or a link."""
     name, other = rng.choice(sorted(case.files)), rng.choice(sorted(case.files))
     files = dict(case.files)
     change = rng.randrange(7)

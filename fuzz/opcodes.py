@@ -1,4 +1,4 @@
-"""Changes to pickles, opcode by opcode."""
+"""Mutations of pickles, opcode by opcode."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _HOSTILE = (
 
 
 def pickle_changed(data: bytes, rng: Random) -> bytes:
-    """A pickle after one change to its opcodes."""
+    """Return a pickle after one mutation of its opcodes."""
     if rng.random() < 0.04:
         return rng.choice(_HOSTILE)
     if rng.random() < 0.15:
@@ -90,7 +90,7 @@ def pickle_changed(data: bytes, rng: Random) -> bytes:
 
 
 def _codes(data: bytes) -> list[bytes]:
-    """The opcodes with their arguments, as far as they can be told, without frames, whose bytes are counted."""
+    """Split a pickle into opcodes with arguments as far as possible, without frames, which count bytes."""
     codes: list[bytes] = []
     starts: list[int] = []
     names: list[str] = []
@@ -109,7 +109,7 @@ def _codes(data: bytes) -> list[bytes]:
 
 
 def _argument_changed(code: bytes, rng: Random) -> bytes:
-    """A number or a text of the same opcode, or its bytes, changed."""
+    """Change the number, the text or the bytes of an opcode's argument."""
     if code[:1] in (b"c", b"\x93"):
         return rng.choice(_GLOBALS)
     return code[:1] + bytes_changed(code[1:], rng) if len(code) > 1 else rng.choice(_VALUES)

@@ -1,4 +1,4 @@
-"""Changes to pictures and videos: their chunks, segments, attributes and boxes."""
+"""Mutations of pictures and videos: chunks, segments, attributes and boxes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts", b"udta", b"
 
 
 def png_changed(data: bytes, rng: Random) -> bytes:
-    """A PNG after one change to a chunk, its checksum right."""
+    """Return a PNG after one mutation of a chunk, with the right checksum."""
     chunks = _png_chunks(data)
     if not chunks or rng.random() < 0.15:
         return bytes_changed(data, rng)
@@ -43,7 +43,7 @@ def png_changed(data: bytes, rng: Random) -> bytes:
 
 
 def jpeg_changed(data: bytes, rng: Random) -> bytes:
-    """A JPEG after one change to a segment."""
+    """Return a JPEG after one mutation of a segment."""
     marks = [m.start() for m in re.finditer(rb"\xff[\xc0-\xfe]", data)]
     if len(marks) < 2 or rng.random() < 0.2:
         return bytes_changed(data, rng)
@@ -64,7 +64,7 @@ def jpeg_changed(data: bytes, rng: Random) -> bytes:
 
 
 def exr_changed(data: bytes, rng: Random) -> bytes:
-    """An EXR after one change to its attributes or pixels."""
+    """Return an EXR after one mutation of its attributes or pixels."""
     change = rng.randrange(4)
     if change == 0:
         return strings_changed(data[:400], rng) + data[400:]
@@ -78,7 +78,7 @@ def exr_changed(data: bytes, rng: Random) -> bytes:
 
 
 def video_changed(data: bytes, rng: Random) -> bytes:
-    """An MP4 after one change to a box."""
+    """Return an MP4 after one mutation of a box."""
     boxes = _boxes(data, 0, len(data))
     if not boxes or rng.random() < 0.1:
         return bytes_changed(data, rng)
@@ -127,7 +127,7 @@ def _extra_chunks() -> tuple[tuple[bytes, bytes], ...]:
 
 
 def _boxes(data: bytes, begin: int, end: int) -> list[tuple[int, int, bytes]]:
-    """Begin, end and kind of the boxes and those within them."""
+    """List begin, end and kind of all boxes, nested ones included."""
     found, at = [], begin
     while at + 8 <= end and len(found) < 500:
         size, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]

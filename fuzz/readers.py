@@ -1,4 +1,4 @@
-"""What is fuzzed: every reader of files or texts from others, with its seeds and what a user does with what it read."""
+"""The fuzzed readers: every reader of untrusted files or text, with its seeds and the first use of its result."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from dyngs.scene import Scene
 
 Read = Callable[[Path], object]
-"""Reads what is in a folder and uses it; returns what must be finite."""
+"""Reads the input in a folder and uses it; returns values that must be finite."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class Reader:
     """A reader under test.
 
     Attributes:
-        seeds: name to what writes it.
+        seeds: name to function that writes the seed.
         read: reads the folder.
-        writes: it is a run folder, in which may be written.
-        names_file: errors must name the file; those about words of the command line name the word.
-        needs: package without which it cannot be tried.
+        writes: whether the reader may write into the folder, as into a run folder.
+        names_file: whether errors must name the file; those about arguments of the command line name the argument.
+        needs: optional package without which the reader cannot run.
     """
 
     seeds: Mapping[str, Seed]
@@ -56,7 +56,7 @@ class Reader:
 
 
 def read_whole_capture(root: Path) -> object:
-    """As ``dyngs data inspect --deep`` and the first steps of ``dyngs train``: report, views, points, pictures."""
+    """Read as ``dyngs data inspect --deep`` and ``dyngs train`` do: report, views, points, body, pictures."""
     from dyngs.config import DataConfig
     from dyngs.data.inspection.report import format_report, inspect_capture
     from dyngs.data.loader import PictureLoader
@@ -89,13 +89,13 @@ def read_whole_capture(root: Path) -> object:
 
 
 def require_lines(report: str) -> None:
-    """Nothing, if no line of the report can steer a terminal."""
+    """Check that no line of a report holds control characters."""
     bad = [line for line in report.splitlines() if any(ord(c) < 32 or 0x7F <= ord(c) < 0xA0 for c in line)]
     assert not bad, f"control characters in a report: {bad[0]!r}"
 
 
 def read_a_picture(root: Path) -> object:
-    """Header, check and pixels."""
+    """Read header and pixels of a picture."""
     from dyngs.data.pictures.images import check_picture, read_picture
 
     path = only(root)
@@ -103,7 +103,7 @@ def read_a_picture(root: Path) -> object:
 
 
 def read_a_video(root: Path) -> object:
-    """What it says of itself, and its frames."""
+    """Read size, length and first frames of a video."""
     from dyngs.data.pictures.video import probe_video, read_frames
 
     path = only(root)
@@ -112,7 +112,7 @@ def read_a_video(root: Path) -> object:
 
 
 def read_a_pickle(root: Path) -> object:
-    """Its values; what a pickle of numbers may hold is checked by those who use it, so that NaN is no failure."""
+    """Read a pickle; NaN in it is no failure, because its users check the numbers."""
     from dyngs.files.pickles import read_pickle
 
     read_pickle(only(root))
@@ -120,7 +120,7 @@ def read_a_pickle(root: Path) -> object:
 
 
 def read_a_body(root: Path) -> object:
-    """The body, posed."""
+    """Read a body template and pose it."""
     import torch
 
     from dyngs.human.template.body import posed_vertices
@@ -136,7 +136,7 @@ def read_a_body(root: Path) -> object:
 
 
 def read_a_motion(root: Path) -> object:
-    """The motion, as a clip on a small body."""
+    """Read a motion and make it a clip on a small body."""
     from dyngs.human.motion.clip import motion_clip
     from dyngs.human.motion.read import read_motion
 
@@ -145,7 +145,7 @@ def read_a_motion(root: Path) -> object:
 
 
 def read_splats(root: Path) -> object:
-    """The Gaussians, drawn."""
+    """Read a .ply of Gaussians and render it."""
     from dyngs.export.ply import read_ply
     from dyngs.view.job_of_ply import splat_options
 
@@ -154,7 +154,7 @@ def read_splats(root: Path) -> object:
 
 
 def read_a_run(root: Path) -> object:
-    """The scene of a run at two moments, drawn, and its times."""
+    """Read a run, and render it at two times."""
     from dyngs.scene import render_options
     from dyngs.runs.checkpoint import load_run, seconds_at
 
@@ -163,7 +163,7 @@ def read_a_run(root: Path) -> object:
 
 
 def read_a_person(root: Path) -> object:
-    """The avatar, drawn."""
+    """Read an avatar and render it."""
     from dyngs.scene import render_options
     from dyngs.export.avatar import read_avatar
 
@@ -172,7 +172,7 @@ def read_a_person(root: Path) -> object:
 
 
 def read_a_preset(root: Path) -> object:
-    """The configuration, with what it lacks, and as it comes back from a run folder."""
+    """Read a configuration, and read it back after saving."""
     from dyngs.config.io import load_config, load_resolved, save_config
 
     config = load_config(only(root))
@@ -182,7 +182,7 @@ def read_a_preset(root: Path) -> object:
 
 
 def read_override_lines(root: Path) -> object:
-    """The configuration that they make."""
+    """Read overrides of the command line into a configuration."""
     from dyngs.config.io import load_config, save_config
 
     config = load_config(None, words(root))
@@ -191,7 +191,7 @@ def read_override_lines(root: Path) -> object:
 
 
 def read_a_path(root: Path) -> object:
-    """The cameras."""
+    """Read a camera path."""
     from dyngs.view.camera_paths import read_path
 
     path = read_path(only(root))
@@ -199,7 +199,7 @@ def read_a_path(root: Path) -> object:
 
 
 def read_a_point(root: Path) -> object:
-    """The point and its row of the report."""
+    """Read a measured point and make its row of the report."""
     from dyngs.tradeoff.measurements import read_measurement
     from dyngs.tradeoff.report import rows_of
 
@@ -208,7 +208,7 @@ def read_a_point(root: Path) -> object:
 
 
 def read_option_values(root: Path) -> object:
-    """Values of options of the command line; each must be read or refused."""
+    """Parse values of options of the command line."""
     from dyngs.data.frame_selection import parse_frames
     from dyngs.tradeoff.requirements import parse_requirements
     from dyngs.tradeoff.variants import parse_variations
@@ -220,7 +220,7 @@ def read_option_values(root: Path) -> object:
 
 
 def read_a_log(root: Path) -> object:
-    """Log and times of an interrupted run, taken up again."""
+    """Read log and timing of an interrupted run, as resuming does."""
     from dyngs.runs.checkpoint import seconds_at
     from dyngs.runs.log import RunLog
 
@@ -230,24 +230,24 @@ def read_a_log(root: Path) -> object:
 
 
 def read_a_load(root: Path) -> object:
-    """The workload of a benchmark."""
+    """Read the workload of a benchmark."""
     from dyngs.bench.rasterize import garden_workload
 
     return garden_workload(only(root))
 
 
 def only(root: Path) -> Path:
-    """The file of the folder."""
+    """Return the file of the folder that is named ``a``."""
     return next((path for path in sorted(root.iterdir()) if path.stem == "a"), root / "a")
 
 
 def words(root: Path) -> list[str]:
-    """Words of a command line, as Python hands them over."""
+    """Read arguments of a command line, one a line, with the escapes that Python uses."""
     return only(root).read_bytes().decode("utf-8", "surrogateescape").split("\n")
 
 
 def drawn(gaussians: object, options: object) -> Rendering:
-    """A small picture."""
+    """Render a small picture of Gaussians."""
     from moving_scene import camera
 
     from dyngs.rendering import render
@@ -256,7 +256,7 @@ def drawn(gaussians: object, options: object) -> Rendering:
 
 
 def played(scene: Scene, options: object) -> object:
-    """Pictures of two moments."""
+    """Render a scene at two times."""
     from moving_scene import camera
 
     from dyngs.scene import moment_of
@@ -266,7 +266,7 @@ def played(scene: Scene, options: object) -> object:
 
 @cache
 def small_body(joints: int) -> BodyTemplate:
-    """A body of few vertices."""
+    """Return a body with few vertices."""
     from motion_files import tiny_body
 
     return tiny_body(joints)
@@ -318,4 +318,4 @@ READERS: dict[str, Reader] = {
     "logs": Reader({"log": files.write_log}, read_a_log, writes=True),
     "bench": Reader({"load": files.write_load}, read_a_load),
 }
-"""By name, as the command line takes it."""
+"""Readers by their names on the command line."""

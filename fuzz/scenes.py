@@ -1,4 +1,4 @@
-"""Changes to files of Gaussians, meshes and motions: PLY, BVH, glTF, COLMAP, safetensors, scene.dyngs, HDF5."""
+"""Mutations of files of Gaussians, meshes and motions: PLY, BVH, glTF, COLMAP, safetensors, scene.dyngs, HDF5."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _DTYPES = (torch.float16, torch.float64, torch.int64, torch.uint8, torch.bool, t
 
 
 def ply_changed(data: bytes, rng: Random) -> bytes:
-    """A PLY after one change to its header or its numbers."""
+    """Return a PLY after one mutation of its header or its numbers."""
     end = data.find(b"end_header\n") + len(b"end_header\n")
     if end < 12 or rng.random() < 0.1:
         return bytes_changed(data, rng)
@@ -42,7 +42,7 @@ def ply_changed(data: bytes, rng: Random) -> bytes:
 
 
 def bvh_changed(data: bytes, rng: Random) -> bytes:
-    """A BVH after one change to its text."""
+    """Return a BVH after one mutation of its text."""
     change = rng.randrange(8)
     if change == 0:
         return strings_changed(data, rng)
@@ -59,7 +59,7 @@ def bvh_changed(data: bytes, rng: Random) -> bytes:
 
 
 def glb_changed(data: bytes, rng: Random) -> bytes:
-    """A GLB after one change to its JSON or its numbers, the lengths of its chunks right."""
+    """Return a GLB after one mutation of its JSON or its numbers, the lengths of its chunks right."""
     size = int.from_bytes(data[12:16], "little")
     text, body = data[20 : 20 + size], data[20 + size + 8 :]
     if rng.random() < 0.1 or not text.startswith(b"{"):
@@ -75,7 +75,7 @@ def glb_changed(data: bytes, rng: Random) -> bytes:
 
 
 def colmap_changed(data: bytes, rng: Random) -> bytes:
-    """A binary COLMAP file after one change to a count, a name or a number."""
+    """Return a binary COLMAP file after one mutation of a count, a name or a number."""
     change = rng.randrange(5)
     if change == 0:
         count = rng.choice((0, 1, 2, 255, 2**31, 2**32, 2**61, 2**64 - 1))
@@ -89,7 +89,7 @@ def colmap_changed(data: bytes, rng: Random) -> bytes:
 
 
 def safetensors_changed(data: bytes, rng: Random) -> bytes:
-    """A file of tensors after one change, mostly with the checksum that fits."""
+    """Return a tensor file after one mutation, mostly with the right checksum."""
     if rng.random() < 0.2:
         return bytes_changed(data, rng)
     size = int.from_bytes(data[:8], "little")
@@ -103,7 +103,7 @@ def safetensors_changed(data: bytes, rng: Random) -> bytes:
 
 
 def dyngs_changed(data: bytes, rng: Random) -> bytes:
-    """A ``scene.dyngs`` after one change, mostly with the checksum that fits."""
+    """Return a ``scene.dyngs`` after one mutation, mostly with the right checksum."""
     from dyngs.storage.coding import compressed, decompressed
     from dyngs.storage.file import MAGIC, MAX_HEADER
 
@@ -127,7 +127,7 @@ def dyngs_changed(data: bytes, rng: Random) -> bytes:
 
 
 def hdf5_changed(data: bytes, rng: Random) -> bytes:
-    """An HDF5 file after one change to a data set or its bytes."""
+    """Return an HDF5 file after one mutation of a data set or its bytes."""
     if rng.random() < 0.35:
         return bytes_changed(data, rng)
     import h5py
@@ -187,7 +187,7 @@ def _data_set_changed(file: Any, name: str, rng: Random) -> None:
 
 
 def _tensors_changed(data: bytes, rng: Random) -> bytes:
-    """Tensors or header changed, written as dyngs writes them."""
+    """Change tensors or header and write them as dyngs does."""
     from safetensors.torch import save
 
     from dyngs.files.tensor_file import _digest

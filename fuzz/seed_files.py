@@ -1,4 +1,4 @@
-"""Small valid files of all other kinds: pictures, bodies, motions, runs, configurations, texts."""
+"""Seeds that are no captures: pictures, bodies, motions, runs, configurations, text."""
 
 from __future__ import annotations
 
@@ -31,44 +31,44 @@ _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 
 
 def write_png(root: Path) -> None:
-    """With alpha."""
+    """Write a PNG with alpha."""
     write_picture(root / "a.png", random_pixels(5, 7, 4))
 
 
 def write_png16(root: Path) -> None:
-    """16 bits, grey."""
+    """Write a PNG of 16 bits, grey."""
     write_picture(root / "a.png", random_pixels(5, 7, 1).astype(np.uint16) * 257)
 
 
 def write_jpeg(root: Path) -> None:
-    """Colour."""
+    """Write a JPEG."""
     write_picture(root / "a.jpg", random_pixels(9, 17, 3))
 
 
 def write_exr(root: Path) -> None:
-    """Floats with alpha."""
+    """Write an EXR of floats with alpha."""
     write_picture(root / "a.exr", random_pixels(5, 7, 4).astype(np.float32) / 255)
 
 
 def write_tiff(root: Path) -> None:
-    """Colour."""
+    """Write a TIFF."""
     write_picture(root / "a.tif", random_pixels(5, 7, 3))
 
 
 def write_mp4(root: Path) -> None:
-    """Three frames."""
+    """Write a video of three frames."""
     write_video(root / "a.mp4", 3)
 
 
 def write_fits(root: Path) -> None:
-    """A pickle of arrays in a dictionary, as today's NumPy writes it."""
+    """Write a pickle of arrays in a dictionary, as current NumPy does."""
     (root / "a.pkl").write_bytes(
         pickle.dumps({"pose": np.ones((2, 72)), "names": ["a", "b"], "scale": 1.5, 3: (1, None)})
     )
 
 
 def write_old_fits(root: Path) -> None:
-    """The same with protocol 0, an array of objects, and text."""
+    """Write a pickle of protocol 0 with an array of objects and text."""
     fits = {
         "pose": np.ones((2, 3), np.float32),
         "o": np.array([1, "x", None], dtype=object),
@@ -79,12 +79,12 @@ def write_old_fits(root: Path) -> None:
 
 
 def write_smpl_npz(root: Path) -> None:
-    """SMPL."""
+    """Write an SMPL body as .npz."""
     write_npz(root / "a.npz", model("smpl", directions=2))
 
 
 def write_smpl_pickle(root: Path) -> None:
-    """SMPL, with a sparse regressor as in the real files."""
+    """Write an SMPL body as a pickle, with a sparse regressor as in the real files."""
     import scipy.sparse
 
     arrays = model("smpl", directions=2)
@@ -92,14 +92,14 @@ def write_smpl_pickle(root: Path) -> None:
 
 
 def write_smplx_with_uv(root: Path) -> None:
-    """SMPL-X, and an OBJ with its texture coordinates."""
+    """Write an SMPL-X body, and an OBJ with its texture coordinates."""
     arrays = model("smplx", directions=2)
     write_npz(root / "a.npz", arrays)
     write_obj(root / "uv.obj", arrays["f"].astype(np.int64), arrays["vt"], arrays["ft"].astype(np.int64))
 
 
 def write_smplh_motion(root: Path) -> None:
-    """As AMASS has SMPL-H."""
+    """Write a motion of SMPL-H as in AMASS."""
     motion = random_motion(3)
     poses = motion.for_joints(52).poses.reshape(3, -1).numpy()
     rest = {"betas": np.zeros(16), "gender": np.array("neutral"), "mocap_framerate": np.array(120.0)}
@@ -107,42 +107,42 @@ def write_smplh_motion(root: Path) -> None:
 
 
 def write_own_motion(root: Path) -> None:
-    """As dyngs writes it."""
+    """Write a motion as dyngs does."""
     write_amass(random_motion(3), root / "a.npz")
 
 
 def write_walk_bvh(root: Path) -> None:
-    """The joints of SMPL."""
+    """Write a motion of SMPL's joints as BVH."""
     own, motion = skeleton(JOINT_NAMES[:22]), random_motion(3)
     write_bvh(root / "a.bvh", own, as_local(motion, own), motion.trans.double().numpy())
 
 
 def write_walk_glb(root: Path) -> None:
-    """The joints of SMPL, linear."""
+    """Write a motion of SMPL's joints as glTF, linear."""
     own, motion = skeleton(JOINT_NAMES[:22]), random_motion(3)
     glb_of(own, Clip(as_local(motion, own), motion.trans.double().numpy())).write(root / "a.glb")
 
 
 def write_cubic_glb(root: Path) -> None:
-    """The joints of SMPL, cubic splines, a node above."""
+    """Write a motion of SMPL's joints as glTF, with cubic splines and a node above the root."""
     own, motion = skeleton(JOINT_NAMES[:22]), random_motion(3)
     clip = Clip(as_local(motion, own), motion.trans.double().numpy(), interpolation="CUBICSPLINE", above=np.eye(4))
     glb_of(own, clip).write(root / "a.glb")
 
 
 def write_splats(root: Path) -> None:
-    """Five Gaussians."""
+    """Write a .ply of five Gaussians."""
     write_ply(root / "a.ply", row_of_balls(), world_offset=(1.0, 2.0, 3.0))
 
 
 def write_still_run(root: Path) -> None:
-    """A run of a still scene."""
+    """Write a run of a still scene."""
     save_config(Config(data=DataConfig.model_validate({"root": "capture"}), model=StaticModel()), root / RESOLVED_NAME)
     save_checkpoint(root, Checkpoint(_INFO, _gaussians()), 1.0)
 
 
 def write_moving_runs(kind: str, root: Path) -> None:
-    """A run whose scene moves by a field of ``kind``."""
+    """Write a run of a moving scene with a field of ``kind``."""
     config, tensors = _moving(kind)
     save_config(config, root / RESOLVED_NAME)
     save_checkpoint(root, Checkpoint(_INFO, tensors), 1.0)
@@ -164,7 +164,7 @@ def write_scene_file_moving(root: Path) -> None:
 
 
 def write_person(root: Path) -> None:
-    """An avatar of three Gaussians on 24 joints."""
+    """Write an avatar of three Gaussians on 24 joints."""
     n, k = 3, 2
     joints, parents = tiny_body(24).joints, tiny_body(24).parents
     count = len(joints)
@@ -208,7 +208,7 @@ def write_person(root: Path) -> None:
 
 
 def write_preset(root: Path) -> None:
-    """Some keys of every kind."""
+    """Write a preset with keys of every kind."""
     data = "data:\n  root: capture\n  downscale: 2\n"
     model = "model:\n  kind: dynamic\n  sh_degree: 2\n  deform:\n    kind: hexplane\n    levels: [1, 2]\n"
     text = data + model + "    lr_planes: 1e-3\ntrain:\n  steps: 30000\nrun:\n  name: night\n"
@@ -216,21 +216,21 @@ def write_preset(root: Path) -> None:
 
 
 def write_overrides(root: Path) -> None:
-    """Some keys of every kind, one override a line."""
+    """Write overrides of keys of every kind, one a line."""
     lines = ("data.root=capture", "train.steps=2000", "model.kind=dynamic", "model.deform.kind=mlp", "run.name=night")
     lines += ("data.frames=0:10:2", "model.deform={kind: hexplane, levels: [1, 2]}", "data.cache_mb=1e3", "run.dir=~/x")
     (root / "a.overrides").write_text("\n".join(lines))
 
 
 def write_frames_path(root: Path) -> None:
-    """A camera path of two frames."""
+    """Write a camera path of two frames."""
     one = camera()
     poses, intrinsics = one.cam_from_world.expand(2, 4, 4).clone(), one.intrinsics.expand(2, 3, 3).clone()
     write_path(root / "a.json", CameraPath(Cameras(poses, intrinsics, one.width, one.height), 30.0, (0.0, 1.0)))
 
 
 def write_keyframes(root: Path) -> None:
-    """Key poses."""
+    """Write a camera path of keyframes."""
     frame = {"cam_from_world": np.eye(4).tolist(), "fl_x": 20.0, "fl_y": 20.0, "cx": 10.0, "cy": 7.0}
     keys = [{**frame, "at": 0.0, "time": 0.0}, {**frame, "at": 0.2, "time": 1.0}]
     document = {"width": 20, "height": 14, "fps": 10, "loop": False, "keyframes": keys}
@@ -238,7 +238,7 @@ def write_keyframes(root: Path) -> None:
 
 
 def write_measurement(root: Path) -> None:
-    """A measured point of ``dyngs tradeoff``."""
+    """Write a measured point of ``dyngs tradeoff``."""
     from dyngs.tradeoff.measurements import Measurement, Quartiles, Speed
     from dyngs.tradeoff.measurements import write_measurement as write
     from dyngs.tradeoff.variants import Variant
@@ -248,19 +248,19 @@ def write_measurement(root: Path) -> None:
 
 
 def write_words(root: Path) -> None:
-    """Values of options, one a line: requirements, knobs, frames, times."""
+    """Write values of options, one a line: requirements, knobs, frames, times."""
     lines = ("psnr>=30,fps>=20,mb<=5", "prune=0.5,0.7", "0:10:2", "0:1:5")
     (root / "a.overrides").write_text("\n".join(lines))
 
 
 def write_log(root: Path) -> None:
-    """The log and the times of a run."""
+    """Write the log and the timing of a run."""
     (root / "log.jsonl").write_text('{"step": 1, "loss": 0.5}\n{"step": 2, "loss": 0.4}\n')
     (root / "timing.json").write_text('{"seconds_train": {"7": 1.0}}\n')
 
 
 def write_load(root: Path) -> None:
-    """A workload of ``dyngs bench``."""
+    """Write a workload of ``dyngs bench``."""
     pose = np.eye(4)[None]
     pose[0, 2, 3] = 3
     k = np.array([[[20.0, 0, 10], [0, 20, 7], [0, 0, 1]]])

@@ -1,4 +1,4 @@
-"""Small valid captures, made with what the tests make them of."""
+"""Seeds of the capture formats: small valid captures, written with the helpers of the tests."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from tiny_captures import (
 )
 
 Seed = Callable[[Path], object]
-"""Writes a valid input into an empty folder."""
+"""Writes a valid input to an empty folder."""
 
 _LENS = {"w": 6, "h": 4, "fl_x": 5.0, "fl_y": 5.0, "cx": 3.0, "cy": 2.0}
 
 
 def write_blender(root: Path) -> None:
-    """Three training pictures and one for testing, with alpha and times."""
+    """Write three training pictures and one for testing, with alpha and times."""
     for split, count in (("train", 3), ("test", 1)):
         names = [f"./{split}/r_{i}" for i in range(count)]
         for i, name in enumerate(names):
@@ -40,7 +40,7 @@ def write_blender(root: Path) -> None:
 
 
 def write_nerfstudio(root: Path) -> None:
-    """Three JPEG pictures with a lens, times, a mask and points."""
+    """Write three JPEG pictures with a lens, times, a mask and points."""
     names = [f"images/{i:02d}.jpg" for i in range(3)]
     for i, name in enumerate(names):
         write_picture(root / name, random_pixels(4, 6, 3, seed=i))
@@ -57,36 +57,36 @@ def write_nerfstudio(root: Path) -> None:
 
 
 def write_colmap_binary(root: Path) -> None:
-    """Four pictures."""
+    """Write a binary COLMAP model with four pictures."""
     write_colmap(root, "bin", "OPENCV", (10, 11, 6, 4, 0.1, 0, 0, 0), count=4)
 
 
 def write_colmap_text(root: Path) -> None:
-    """Four pictures."""
+    """Write a COLMAP model as text with four pictures."""
     write_colmap(root, "txt", count=4)
 
 
 def write_small_nerfies(root: Path) -> None:
-    """Four pictures."""
+    """Write a Nerfies capture with four pictures."""
     write_nerfies(root, count=4)
 
 
 def write_llff(root: Path) -> None:
-    """Three cameras with two pictures each."""
+    """Write three cameras with two pictures each."""
     write_poses_bounds(root, 3)
     for i in range(3):
         write_folder(root / f"cam0{i}" / "images", range(2))
 
 
 def write_llff_videos(root: Path) -> None:
-    """Two cameras with videos, as DyNeRF has them."""
+    """Write two cameras with videos, as DyNeRF has them."""
     write_poses_bounds(root, 2)
     for name in ("cam00", "cam01"):
         write_video(root / f"{name}.mp4", 2)
 
 
 def write_camera_folders(root: Path) -> None:
-    """Two cameras with folders and one with a video."""
+    """Write two cameras with folders and one with a video."""
     write_cameras_json(root, ["a", "b", "c"], fps=30, test=["a"])
     write_folder(root / "a", range(2))
     write_folder(root / "b" / "images", range(2))
@@ -94,7 +94,7 @@ def write_camera_folders(root: Path) -> None:
 
 
 def write_zju(root: Path) -> None:
-    """Three cameras by two frames, as ``annots.npy`` has them."""
+    """Write three cameras by two frames, as ``annots.npy`` has them."""
     poses = _cam_from_world(3)
     cams = {
         "K": [_intrinsics() for _ in poses],
@@ -112,7 +112,7 @@ def write_zju(root: Path) -> None:
 
 
 def write_zju_single(root: Path) -> None:
-    """Three frames of one camera, as ``cameras.pkl`` has them."""
+    """Write three frames of one camera, as ``cameras.pkl`` has them."""
     cameras, meshes = {}, {}
     joints = np.random.default_rng(7).normal(size=(24, 3))
     for frame in range(3):
@@ -127,7 +127,7 @@ def write_zju_single(root: Path) -> None:
 
 
 def write_neuman(root: Path) -> None:
-    """Four pictures with ROMP's fits and their alignments."""
+    """Write four pictures with ROMP's fits and their alignments."""
     _write_neuman_pictures(root)
     fit = {"pose": np.full((4, 72), 0.1, np.float32), "betas": np.ones((4, 10), np.float32)}
     (root / "smpl_output_romp.pkl").write_bytes(pickle.dumps({1: fit}))
@@ -137,7 +137,7 @@ def write_neuman(root: Path) -> None:
 
 
 def write_neuman_aligned(root: Path) -> None:
-    """Four pictures with refined fits."""
+    """Write four pictures with refined fits."""
     _write_neuman_pictures(root)
     fields: dict[str, Any] = {"global_orient": np.full((4, 3), 0.1), "body_pose": np.full((4, 69), 0.2)}
     fields |= {"betas": np.ones((4, 10)), "transl": np.arange(4)[:, None] * np.ones(3), "scale": np.full(4, 0.7)}
@@ -146,7 +146,7 @@ def write_neuman_aligned(root: Path) -> None:
 
 
 def write_people_snapshot(root: Path) -> None:
-    """A video of four frames with masks and fits."""
+    """Write a video of four frames with masks and fits."""
     import h5py
 
     count = 4
@@ -170,7 +170,7 @@ def write_people_snapshot(root: Path) -> None:
 
 
 def write_body_json(root: Path) -> None:
-    """Two frames by two cameras to train on and one to test, with SMPL-X poses."""
+    """Write two frames by two cameras to train on and one to test, with SMPL-X poses."""
     for split, cameras in (("train", (0, 1)), ("test", (2,))):
         names = [f"images/{split}/f{frame}_c{camera}.png" for frame in range(2) for camera in cameras]
         path = root / f"transforms_{split}.json"

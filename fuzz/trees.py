@@ -1,4 +1,4 @@
-"""Changes to trees of dictionaries, lists and values: JSON and YAML."""
+"""Mutations of trees of dictionaries, lists and values: JSON and YAML."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _DEEP = "[" * 3000 + "]" * 3000
 
 
 def json_changed(data: bytes, rng: Random) -> bytes:
-    """A JSON file after one change to a value, a key or the nesting; to its text where it is none."""
+    """Return a JSON file after one mutation of a value, a key or the nesting, or of its text if it is broken."""
     try:
         tree = json.loads(data)
     except (ValueError, RecursionError):
@@ -52,7 +52,7 @@ def json_changed(data: bytes, rng: Random) -> bytes:
 
 
 def json_bytes(tree: object) -> bytes:
-    """The tree as JSON; texts ``RAW:x`` become x without quotes, keys ``AGAIN:x`` a second x."""
+    """Return the tree as JSON; texts ``RAW:x`` become x without quotes, keys ``AGAIN:x`` a second x."""
     try:
         text = json.dumps(tree)
     except (TypeError, ValueError, RecursionError):
@@ -62,7 +62,7 @@ def json_bytes(tree: object) -> bytes:
 
 
 def yaml_changed(data: bytes, rng: Random) -> bytes:
-    """A YAML file after one change to a value, a key, or its text."""
+    """Return a YAML file after one mutation of a value, a key or its text."""
     if rng.random() < 0.5:
         return _yaml_text_changed(data, rng)
     try:
@@ -73,7 +73,7 @@ def yaml_changed(data: bytes, rng: Random) -> bytes:
 
 
 def tree_changed(tree: Any, rng: Random) -> Any:
-    """The tree, itself changed in one place."""
+    """Change the tree in place at one node and return it."""
     places = list(_places(tree))
     if not places or rng.random() < 0.02:
         return rng.choice((*_VALUES, "text", [tree]))
@@ -117,7 +117,7 @@ def _other_value(value: Any, rng: Random) -> Any:
 
 
 def _places(tree: Any) -> Iterator[Place]:
-    """Every place in the tree; those of long lists of numbers are thinned out, so that names get their share."""
+    """List the nodes of the tree; long lists of numbers are thinned out, so that names are chosen often enough."""
     if isinstance(tree, dict):
         for key, value in list(tree.items()):
             yield tree, key
@@ -161,7 +161,7 @@ _SCALARS += (
 
 
 def _yaml_text_changed(data: bytes, rng: Random) -> bytes:
-    """With a value of the file's text replaced by one that YAML reads in its own way."""
+    """Replace a value in the text by one that YAML reads in a special way."""
     text = data.decode("utf-8", "surrogateescape")
     found = list(re.finditer(r"(?<=[:=]) *[^\n:=]+$", text, re.M))
     if not found or rng.random() < 0.4:
@@ -173,7 +173,7 @@ def _yaml_text_changed(data: bytes, rng: Random) -> bytes:
 
 
 def override_changed(data: bytes, rng: Random) -> bytes:
-    """Overrides, one a line, with a key or a value changed."""
+    """Change a key or a value of overrides, one a line."""
     lines = data.decode("utf-8", "surrogateescape").split("\n")
     i = rng.randrange(len(lines))
     key, _, value = lines[i].partition("=")

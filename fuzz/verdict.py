@@ -1,4 +1,4 @@
-"""What a reader may do with a case: return finite values or refuse in one clear line, and touch nothing else."""
+"""Verdicts: a reader must return finite values or refuse with one clear line, and must change no other files."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ import torch
 from torch import Tensor
 
 LONGEST = 800
-"""Characters of an error, names of files in the case's folder counted as one; lists of our own keys take 600."""
+"""Longest error in characters, paths in the case's folder counted as one; lists of configuration keys take 600."""
 _WAY = re.compile(r"F/\S*")
 
 
 class Outcome(str, Enum):
-    """How a case ended."""
+    """Outcome of a case."""
 
     ACCEPTED = "accepted"
     REFUSED = "refused"
@@ -31,12 +31,12 @@ class Outcome(str, Enum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a case ended, and why.
+    """Outcome of a case and the reason.
 
     Attributes:
-        outcome: of these three.
-        reason: of a failure, the same for cases that fail at the same place; of a refusal the error.
-        detail: of a failure, for people.
+        outcome: accepted, refused or failed.
+        reason: the same for failures at the same place; the error of a refusal.
+        detail: description of a failure.
     """
 
     outcome: Outcome
@@ -45,12 +45,12 @@ class Verdict:
 
 
 def fault_of_message(message: str, folder: Path, names: set[str] | None) -> str | None:
-    """What is wrong with the text of an error, None where nothing is.
+    """Return the fault of an error's text, None if it has none.
 
     Args:
         message: the text.
-        folder: of the case.
-        names: of its files, one of which must be named, or the folder; None where none need be.
+        folder: folder of the case.
+        names: names of its files; the text must contain one of them or the folder. None: it need not.
     """
     odd = [c for c in message if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") or c in _BIDI]
     if odd:
@@ -68,7 +68,7 @@ _BIDI = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
 
 
 def not_finite(value: object) -> str | None:
-    """Where in what was read a number is not finite, None if nowhere."""
+    """Return the place of a number that is not finite in a result, None if there is none."""
     return next(_not_finite(value, "result", 0), None)
 
 
@@ -99,7 +99,7 @@ Snapshot = dict[str, tuple[int, ...] | str]
 
 
 def snapshot(folder: Path) -> Snapshot:
-    """Every path below ``folder`` with its size, time and kind, links not followed."""
+    """Map every path below ``folder`` to its size, time and kind; links are not followed."""
     found: Snapshot = {}
     stack = [str(folder)]
     while stack:
@@ -115,7 +115,7 @@ def snapshot(folder: Path) -> Snapshot:
 
 
 def difference(before: Snapshot, after: Snapshot) -> str | None:
-    """The first path that is new, gone or other, with what it is."""
+    """Return the first path that was written, removed or changed, None if all are the same."""
     for path in sorted(before.keys() | after.keys()):
         if path not in after:
             return f"removed {path}"
@@ -127,13 +127,13 @@ def difference(before: Snapshot, after: Snapshot) -> str | None:
 
 
 class Forbidden(BaseException):
-    """What a reader tried and must not."""
+    """A forbidden operation that a reader tried."""
 
 
 class Guard:
-    """Refuses, by an audit hook, what no reader may do: write outside some folders, start programs, open sockets.
+    """Audit hook that refuses forbidden operations: writing outside some folders, starting programs, opening sockets.
 
-    Once there, the hook stays until the process ends. What a library does in C it does not see: ``snapshot`` does.
+    The hook stays until the process ends. It does not see what a library does in C: ``snapshot`` does.
     """
 
     _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND

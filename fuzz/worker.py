@@ -1,7 +1,7 @@
-"""A process that runs cases of one reader, one after the other, with limits on time and memory.
+"""Worker process: runs cases of one reader, one after the other, with limits on time and memory.
 
-It is forked from one that has imported everything, and tells over a pipe what it begins and how it ended; whoever
-reads the pipe starts another one when it dies or hangs.
+It is forked from a process that has imported everything, and reports over a pipe each case that it begins and its
+verdict; the reader of the pipe starts another worker when this one dies or hangs.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from fuzz.verdict import Forbidden, Guard, Outcome, Verdict, difference, fault_o
 
 @dataclass(frozen=True)
 class Limits:
-    """What one case may take.
+    """Limits of one case.
 
     Attributes:
-        seconds: of processor time; ten times as many of the clock.
-        memory_mb: beyond what the process has before, both of addresses and of real memory.
+        seconds: processor time; ten times as much wall time.
+        memory_mb: memory beyond that of the process before the case, of address space and of resident memory.
     """
 
     seconds: float = 5.0
@@ -47,7 +47,7 @@ STANDARD = Limits()
 
 
 def run_child(reader: Reader, cases: Iterable[tuple[int, Case]], folder: Path, pipe: int, limits: Limits) -> NoReturn:
-    """Runs the cases and ends the process; lines of JSON go to ``pipe``: the number of a case, then its verdict."""
+    """Run the cases and end the process; write lines of JSON to ``pipe``: the number of a case, then its verdict."""
     try:
         _prepare(folder, limits)
         own = (folder / "box" / "capture",) if reader.writes else ()
@@ -66,7 +66,7 @@ def run_child(reader: Reader, cases: Iterable[tuple[int, Case]], folder: Path, p
 
 
 def judge(reader: Reader, case: Case, folder: Path, guard: Guard, limits: Limits) -> Verdict:
-    """What the reader does with a case, which lies in ``folder/box/capture``."""
+    """Run the reader on a case, which lies in ``folder/box/capture``, and return the verdict."""
     box = folder / "box"
     capture = box / "capture"
     for own in (box / "out", folder / "cache", folder / "tmp"):
@@ -115,13 +115,13 @@ def _run(reader: Reader, capture: Path, case: Case) -> Verdict:
 
 
 def _place(error: BaseException) -> str:
-    """The innermost function of dyngs, where failures are told apart."""
+    """Return the innermost function of dyngs in the traceback, by which failures are distinguished."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f"{os.sep}dyngs{os.sep}" in f.filename]
     return f"{Path(frames[-1].filename).stem}.{frames[-1].name}" if frames else "outside dyngs"
 
 
 def _prepare(folder: Path, limits: Limits) -> None:
-    """Limits, and places of its own for all that is written."""
+    """Set limits and redirect all output to folders of the worker."""
     errors = os.open(folder / "stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND)
     os.dup2(errors, 2)
     os.dup2(errors, 1)
@@ -150,7 +150,7 @@ def _prepare(folder: Path, limits: Limits) -> None:
 
 
 def _status(name: str) -> int:
-    """kB, of this process."""
+    """Return a value of /proc/self/status in kB."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(name + ":"):
             return int(line.split()[1])
@@ -158,7 +158,7 @@ def _status(name: str) -> int:
 
 
 def _reset_peak() -> int:
-    """kB of memory now, from which the peak is counted anew."""
+    """Reset the peak of memory and return the present use in kB."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:

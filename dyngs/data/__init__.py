@@ -1,1 +1,1 @@
-"""Captures on disk: one reader per format, pictures, lenses and the loader that feeds training."""
+"""Captures: posed pictures of a scene on disk, their readers, preparation, inspection and loading for training."""

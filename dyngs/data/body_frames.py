@@ -1,4 +1,4 @@
-"""Body parameters of captured people, one row per frame: checked, moved between frames of reference, found for views.
+"""Body parameters of captured people, one row per frame: checks, changes of reference frame, rows of views.
 
 Local letters: F frames, J joints, B shape coefficients. The bodies are those of SMPL (Loper et al. 2015) and its heirs.
 """
@@ -27,14 +27,14 @@ def body_frames(
     turns: object = None,
     pelvis: object = None,
 ) -> BodyFrames:
-    """Checked body parameters, sorted by frame; one row per frame in whatever shape the file has them.
+    """Return checked body parameters, sorted by frame; arrays may have any shape with one row per frame.
 
     Args:
         where: the file, for messages.
         frames: F distinct numbers.
         poses: F rows of 72, 156 or 165 numbers.
         trans: F rows of 3.
-        betas: (B,), or one such row per frame: then their mean counts.
+        betas: (B,), or one such row per frame, of which the mean is taken.
         scale: one number, or one per frame.
         turns: F rows of 3, or None.
         pelvis: (3,) or None.
@@ -69,11 +69,14 @@ def body_frames(
 
 
 def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
-    """The same bodies without ``turns``, for a template whose pelvis (joint 0, shaped, at rest) is at ``pelvis`` (3,).
+    """Return the same bodies with ``turns`` merged into the root joint's rotation.
 
-    The pelvis stays where it is in the world: at ``scale * turn(j) + trans`` with j that of the fitted body where the
-    files say it, else ``pelvis``. Hence the root turns by ``turn * poses[:, 0]``, and
+    The pelvis keeps its place in the world, ``scale * turn(j) + trans``, where j is the rest position of the fitted
+    body's pelvis if the files say it, else ``pelvis``. Hence the root rotates by ``turn * poses[:, 0]``, and
     ``trans' = trans + scale * (turn(j) - pelvis)``.
+
+    Args:
+        pelvis: (3,) rest position of the pelvis (joint 0) of the shaped template that is to be posed.
     """
     fitted = pelvis if body.pelvis is None else body.pelvis
     poses, turned = body.poses, fitted
@@ -87,12 +90,12 @@ def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
 
 
 def moved(body: BodyFrames, offset: np.ndarray) -> BodyFrames:
-    """The bodies with ``offset`` (3,) subtracted from all positions, as ``geometry.recenter`` moves cameras."""
+    """Return the bodies with ``offset`` (3,) subtracted from all positions, as ``geometry.recenter`` moves cameras."""
     return replace(body, trans=body.trans - offset)
 
 
 def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
-    """(V,) row of ``body`` for each view, by frame number.
+    """(V,) index of the row of ``body`` for each view, by frame number.
 
     Args:
         where: the file of the body parameters, for messages.
@@ -116,7 +119,7 @@ def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
 
 
 def of_one_clip(body: BodyFrames) -> dict[Split, BodyFrames]:
-    """What ``Capture.body`` is where all splits show one clip."""
+    """``Capture.body`` for a capture whose splits all show the same clip."""
     return {"train": body, "val": body, "test": body}
 
 

@@ -1,4 +1,4 @@
-"""What a reader returns: an immutable description of a captured scene, images not yet decoded."""
+"""Captures in memory: views with cameras, sparse points and body parameters; pictures stay on disk."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Literal
 import numpy as np
 
 Split = Literal["train", "val", "test", "pose"]
-"""A "pose" split shows a person in another clip than the others: with times and frame numbers of its own."""
+"""The split "pose" shows a person in another clip, with times and frame numbers of its own."""
 
 BodyKind = Literal["smpl", "smplh", "smplx"]
 
 BODY_KINDS: dict[int, BodyKind] = {24: "smpl", 52: "smplh", 55: "smplx"}
-"""Number of joints to the body model that has so many."""
+"""Number of joints to body model."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class VideoFrame:
-    """A picture that comes out of a video: of this file the frame of this number, 0 being the first one."""
+    """One frame of a video file; ``number`` counts from 0."""
 
     video: Path
     number: int
@@ -41,13 +41,13 @@ class VideoFrame:
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Where a person is in a picture.
+    """Mask of a person in a picture, in a file.
 
     Attributes:
-        path: a picture of the same size, or an HDF5 file whose data set ``masks`` has a row (H, W) per frame.
-        person: how the person's pixels are marked: "white" (grey levels count as shares), "black" (as "white",
-            inverted), or "nonzero" (labels: everything but 0).
-        row: of the data set, None for a picture.
+        path: a picture of the same size, or an HDF5 file whose data set ``masks`` (F, H, W) has a row per frame.
+        person: how the person's pixels are marked: "white" (grey levels are partial coverage), "black" (the inverse of
+            "white"), or "nonzero" (labels: everything but 0).
+        row: row of the data set, None for a picture.
     """
 
     path: Path
@@ -61,16 +61,16 @@ class View:
 
     Attributes:
         name: unique within the capture (usually the path below the root, without extension).
-        image_path: picture file; of a ``video``'s frame where it lies or will lie, see ``pictures.frame_cache``.
-        cam_from_world: (4, 4) float64, OpenCV axes, in the capture's rebased world (see ``Capture.world_offset``).
+        image_path: picture file; for a frame of a ``video`` the file it is decoded to, see ``pictures.frame_cache``.
+        cam_from_world: (4, 4) float64, OpenCV axes, in the capture's recentred world (see ``Capture.world_offset``).
         intrinsics: (3, 3) float64 in pixels of the *stored* picture size.
         width, height: stored picture size in pixels.
-        camera_id: which physical camera took it.
+        camera_id: index of the physical camera.
         mask_path: white = keep, black = ignore; None without a mask.
         time: in [0, 1], or None for a still scene.
         frame: frame number of a sequence, or None.
         video: the video frame that ``image_path`` is decoded from, None where it is a file of the capture.
-        silhouette: the person in the picture, becomes its alpha; None: no person is cut out.
+        silhouette: mask of the person, which becomes the picture's alpha; None where nobody is cut out.
     """
 
     name: str
@@ -99,7 +99,7 @@ def all_views(splits: Mapping[Split, tuple[View, ...]]) -> list[View]:
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Sparse points: ``xyz`` (P, 3) float64 in the rebased world, ``rgb`` (P, 3) uint8."""
+    """Sparse points: ``xyz`` (P, 3) float64 in the recentred world, ``rgb`` (P, 3) uint8."""
 
     xyz: np.ndarray
     rgb: np.ndarray
@@ -107,19 +107,20 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class BodyFrames:
-    """Body parameters of the frames of one clip, float64, in the world and the unit of the cameras of that clip.
+    """Body parameters of the frames of one clip, float64, in the world and the unit of the clip's cameras.
 
-    A point x of the shaped template at rest comes to ``scale * turn(LBS(x; poses)) + trans``. LBS turns everything by
-    ``poses[:, 0]`` about the pelvis (joint 0), ``turn`` about the template's origin; ``about_pelvis`` does without.
+    A point x of the shaped template at rest is mapped to ``scale * turn(LBS(x; poses)) + trans``. LBS rotates the whole
+    body by ``poses[:, 0]`` about the pelvis (joint 0), ``turn`` about the template's origin; ``about_pelvis`` merges
+    the two.
 
     Attributes:
-        frames: (F,) numbers, ascending, as in ``View.frame`` of the views of the same clip.
+        frames: (F,) ascending frame numbers, as in ``View.frame``.
         poses: (F, J, 3) axis-angle, radians, J = 24, 52 or 55.
         trans: (F, 3).
         betas: (B,) shape coefficients.
         scale: (F,) world units per metre of the template, positive.
-        turns: (F, 3) axis-angle, radians; None where there is nothing to turn.
-        pelvis: (3,) where the pelvis of the body that was fitted is at rest, None where the files do not say.
+        turns: (F, 3) axis-angle, radians, rotation about the template's origin; None for none.
+        pelvis: (3,) rest position of the pelvis of the fitted body, None where the files do not say.
     """
 
     frames: tuple[int, ...]
@@ -132,7 +133,7 @@ class BodyFrames:
 
     @property
     def kind(self) -> BodyKind:
-        """The model whose joints these are."""
+        """The body model with that number of joints."""
         return BODY_KINDS[self.poses.shape[1]]
 
 
@@ -145,12 +146,12 @@ class Capture:
         format: name of the reader, as ``data.format`` has it.
         splits: split name to views, each tuple sorted by name; train is never empty.
         points: sparse points or None.
-        world_offset: (3,) float64 added to rebased coordinates to get the file's coordinates (zero unless the scene
-            lies far from its origin).
+        world_offset: (3,) float64, added to recentred coordinates gives those of the files; zero unless the scene lies
+            far from its origin.
         has_alpha: pictures carry straight alpha that means "transparent here".
         body: body parameters of each split, by frame number, for captures of people, else None.
         fps: frames per second of the recording, None where the capture does not say.
-        warnings: suspicious things met while reading, one line each.
+        warnings: suspicious findings of the reader, one line each.
     """
 
     root: Path
@@ -164,4 +165,5 @@ class Capture:
     warnings: tuple[str, ...] = ()
 
     def replace(self, **changes: object) -> Capture:
+        """Return the capture with other attributes."""
         return replace(self, **changes)  # type: ignore[arg-type]

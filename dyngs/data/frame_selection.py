@@ -1,4 +1,4 @@
-"""Part of a sequence: ``data.frames`` as a Python slice over the capture's times."""
+"""Selection of frames: ``data.frames`` as a Python slice over the times of a capture."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dyngs.errors import DyngsError, printable
 
 
 def parse_frames(text: str) -> slice:
-    """The slice that ``text`` writes: ``start:stop`` or ``start:stop:step``, whole numbers, each of which may lack.
+    """Parse ``start:stop`` or ``start:stop:step``: whole numbers, each optional.
 
     Raises:
         DyngsError: anything else, or a step of 0.
@@ -27,17 +27,17 @@ def parse_frames(text: str) -> slice:
 
 
 def select_frames(root: Path, splits: Splits, frames: str) -> Splits:
-    """The views whose time the slice ``frames`` picks from all distinct times of all splits, in order.
+    """Return the views at the times that the slice ``frames`` selects from the sorted distinct times of all splits.
 
-    The first time picked becomes 0 and the last one 1; a single one becomes 0.
+    The first selected time becomes 0 and the last one 1; a single one becomes 0.
 
     Args:
         root: the capture, for messages.
-        splits: every view with a time in [0, 1], or none with one.
+        splits: views with times in [0, 1], or all without.
         frames: see ``parse_frames``.
 
     Raises:
-        DyngsError: a bad slice, one that picks nothing or nothing to train on, or views without times.
+        DyngsError: a bad slice, one that selects no time or no training view, or views without times.
     """
     part = parse_frames(frames)
     views = all_views(splits)
@@ -63,6 +63,6 @@ def select_frames(root: Path, splits: Splits, frames: str) -> Splits:
 
 
 def evenly_spaced(length: int, count: int) -> list[int]:
-    """At most ``count`` of the indices below ``length``, evenly chosen."""
+    """Return at most ``count`` indices below ``length``, evenly spaced."""
     count = min(count, length)
     return [i * length // count for i in range(count)]

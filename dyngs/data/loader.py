@@ -1,4 +1,4 @@
-"""Pictures ready for training: decoded, undistorted, downscaled and cached within a memory limit."""
+"""Pictures for training: decoded on demand, undistorted, downscaled, and cached within a memory limit."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from dyngs.data.pictures.silhouettes import cut_out
 from dyngs.errors import DyngsError
 from dyngs.files.containment import pictures_up_to
 
-ALL_COUNTS = 1 - 1e-4
-"""Mean of a mask from which all that a shrunk pixel covers counts."""
+FULLY_KEPT = 1 - 1e-4
+"""Mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One view as a training target.
+    """The picture of one view with its camera, as a training target.
 
     Attributes:
-        name: the view's.
-        cameras: V = 1 pinhole camera of this picture's size, float32.
+        name: name of the view.
+        cameras: one pinhole camera (V = 1) of this picture's size, float32.
         rgb_premultiplied: (H, W, 3) float32, colours times alpha.
         alpha: (H, W) float32 in [0, 1], None where the file has no alpha.
         mask: (H, W) float32, 1 = counts in the loss, 0 = ignore; None where all pixels count.
@@ -56,13 +56,13 @@ class Picture:
     frame: int | None = None
 
     def composite(self, background: Tensor) -> Tensor:
-        """(H, W, 3) picture over ``background`` (3,)."""
+        """Return the (H, W, 3) picture over the colour ``background`` (3,)."""
         if self.alpha is None:
             return self.rgb_premultiplied
         return self.rgb_premultiplied + (1 - self.alpha[..., None]) * background
 
     def to(self, device: torch.device | str) -> Picture:
-        """The same picture, its camera and mask on another device."""
+        """Return the same picture, with its camera, on another device."""
         alpha, mask = (None if x is None else x.to(device) for x in (self.alpha, self.mask))
         return replace(
             self,
@@ -73,7 +73,7 @@ class Picture:
         )
 
     def shrunk(self, factor: int) -> Picture:
-        """The picture with both sides divided by ``factor``, averaged over pixel areas, and the camera that sees it."""
+        """Return the picture with both sides divided by ``factor``, averaged over pixel areas, and its camera."""
         if factor == 1:
             return self
         old = self.cameras
@@ -87,13 +87,13 @@ class Picture:
             cameras=Cameras(old.cam_from_world, scale[:, None] * old.intrinsics, width, height),
             rgb_premultiplied=area_downscale(self.rgb_premultiplied, width, height),
             alpha=alpha,
-            mask=None if mask is None else (mask > ALL_COUNTS).float(),
+            mask=None if mask is None else (mask > FULLY_KEPT).float(),
         )
 
 
 @dataclass(frozen=True)
 class _Decoded:
-    """What the cache holds: (H, W, 3 or 4) uint8 straight-alpha pixels and the (H, W) bool mask."""
+    """A cached picture: (H, W, 3 or 4) uint8 straight-alpha pixels and the (H, W) bool mask."""
 
     pixels: Tensor
     mask: Tensor | None
@@ -104,9 +104,9 @@ class _Decoded:
 
 
 class PictureLoader:
-    """A sequence of pictures that decodes on demand and keeps the last used ones, up to ``options.cache_mb``.
+    """A sequence of pictures, decoded on demand; the last used ones are cached up to ``options.cache_mb``.
 
-    The same index always gives the same bytes, cached or not. Safe to use from several threads.
+    The same index always gives the same bytes, cached or not. Safe to use from several threads. Tensors are on the CPU.
     """
 
     def __init__(self, views: Sequence[View], options: DataConfig | None = None) -> None:
@@ -133,16 +133,16 @@ class PictureLoader:
 
     @property
     def times(self) -> tuple[float | None, ...]:
-        """Of the views, in [0, 1]; None without times."""
+        """Times of the views in [0, 1], None where a view has none."""
         return tuple(view.time for view in self._views)
 
     @property
     def views(self) -> tuple[View, ...]:
-        """Whose pictures these are."""
+        """The views, in the order of the pictures."""
         return self._views
 
     def __getitem__(self, index: int) -> Picture:
-        """The picture of view ``index``.
+        """Return the picture of view ``index``.
 
         Raises:
             DyngsError: the file turns out to be truncated, or its mask has another size.
@@ -169,7 +169,7 @@ class PictureLoader:
 
     @property
     def cached_bytes(self) -> int:
-        """Memory that decoded pictures occupy at the moment."""
+        """Bytes of memory that cached pictures take."""
         return self._cached_bytes
 
     def _decoded(self, index: int) -> _Decoded:
@@ -208,12 +208,12 @@ class PictureLoader:
             mask = _undistorted_mask(mask, lens_map)
         linear = area_downscale(linear, *size)
         if mask is not None:
-            # A pixel counts only if all that it covers counts: otherwise what is masked out bleeds in.
-            mask = area_downscale(mask.float()[..., None], *size)[..., 0] > ALL_COUNTS
+            # A pixel counts only if all that it covers is kept: otherwise masked colours would bleed in.
+            mask = area_downscale(mask.float()[..., None], *size)[..., 0] > FULLY_KEPT
         return _Decoded(straight_uint8(linear), mask)
 
     def _lens_map(self, view: View) -> LensMap:
-        """The map of the last used camera is kept: captures mostly have one camera, and a map is big."""
+        """Return the undistortion map; only the last is cached: most captures have one camera, and maps are large."""
         key = (view.lens, view.intrinsics.tobytes(), view.width, view.height)
         last = self._last_map
         if last is None or last[0] != key:
@@ -223,13 +223,13 @@ class PictureLoader:
 
 
 def check_files(views: Sequence[View]) -> None:
-    """Nothing, if all pictures and masks of ``views`` are there, look complete and have the size of their view.
+    """Check that all pictures and masks of ``views`` exist, look complete and have the size of their view.
 
     Raises:
-        DyngsError: otherwise; missing files are counted and the first is named.
+        DyngsError: a file is missing (says how many, and the first), damaged or of another size.
     """
-    outlines = [view.silhouette.path for view in views if view.silhouette]
-    paths = [path for view in views for path in (view.image_path, view.mask_path) if path is not None] + outlines
+    silhouettes = [view.silhouette.path for view in views if view.silhouette]
+    paths = [path for view in views for path in (view.image_path, view.mask_path) if path is not None] + silhouettes
     missing = [path for path in paths if not path.is_file()]
     if missing:
         raise DyngsError(
@@ -248,7 +248,7 @@ def check_files(views: Sequence[View]) -> None:
 
 
 def _undistorted_mask(mask: Tensor | None, lens_map: LensMap) -> Tensor | None:
-    """(H, W) bool: valid and kept with all of its neighbourhood; None where everything is."""
+    """(H, W) bool mask of pixels inside the stored picture with a kept neighbourhood; None if all are."""
     keep = lens_map.valid
     if mask is not None:
         keep = keep & (undistort(mask.float()[..., None], lens_map)[..., 0] > 0.999)

@@ -31,7 +31,7 @@ from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside, pictures_up_to, staying_within
 
 FARTHEST = 1e18
-"""Points with larger coordinates are mistakes; their squares would not fit into float32."""
+"""Points with larger coordinates are dropped as mistakes; their squares would not fit into float32."""
 
 FORMATS: tuple[CaptureFormat, ...] = (
     body_json.FORMAT,
@@ -94,7 +94,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
 
 
 def hold_out(views: tuple[View, ...], test_every: int) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """Training and test views of ``views`` sorted by name: index 0, n, 2n, .. are test; none if ``test_every`` is 0."""
+    """Split ``views`` into training and test views: indices 0, n, 2n, .. are for testing, none if n = 0."""
     if test_every == 0:
         return views, ()
     test = views[::test_every]
@@ -183,7 +183,7 @@ def _first_has_alpha(views: tuple[View, ...]) -> bool:
 
 
 def _timed(root: Path, splits: Splits, frames: str | None) -> tuple[Splits, list[str]]:
-    """The splits with their final times, reduced to the chosen ones, and warnings."""
+    """Return the splits with final times, without views of frames that are not selected, and warnings."""
     splits, notes = unit_times(root, splits)
     if frames is not None:
         splits = select_frames(root, splits, frames)

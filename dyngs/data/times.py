@@ -1,4 +1,4 @@
-"""Checks of the times of views, and bringing them to [0, 1]. Their order in the files does not matter."""
+"""Times of views: checked, scaled to [0, 1], compared between cameras. Their order in the files does not matter."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from dyngs.errors import DyngsError
 from dyngs.files.fields import is_number
 
 SAME_TIME = 1e-6
-"""Times in [0, 1] that lie no farther apart are one time (files of one capture are often rounded differently)."""
+"""Times closer than this are the same time: files of one capture are often rounded differently."""
 _MAX_NAMED = 5
 
 
 def unit_times(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
-    """The splits with times in [0, 1], shifted and scaled over all splits where one lies outside, and warnings.
+    """Return the splits with times in [0, 1], and warnings; all times are scaled together where one lies outside.
 
     Times that are all equal are left as they are, see ``still_if_constant``.
 
@@ -46,7 +46,7 @@ def unit_times(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
 
 
 def still_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
-    """The splits without times, and a warning, if several pictures all have one time; a lone one is kept in [0, 1]."""
+    """Return the splits without times, and a warning, if all of several pictures have the same time."""
     times = {view.time for view in all_views(splits)}
     if len(times) != 1 or times == {None}:
         return splits, []
@@ -57,13 +57,13 @@ def still_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
 
 
 def sequence_warnings(splits: Splits) -> list[str]:
-    """What is suspicious about cameras and times: pictures that only differ by chance, cameras that lack frames."""
+    """Warn of pictures with the same camera, pose and time, and of cameras with different numbers of frames."""
     views = [view for view in all_views(splits) if view.time is not None]
     return [*_repeated(views), *_frame_counts(views)]
 
 
 def distinct_times(views: Iterable[View]) -> dict[float, float]:
-    """Every time that a view has, to the first of those that count as the same time."""
+    """Map every time of the views to the first of those that count as the same time."""
     distinct: dict[float, float] = {}
     before = first = -math.inf
     for time in sorted({view.time for view in views if view.time is not None}):
@@ -75,9 +75,9 @@ def distinct_times(views: Iterable[View]) -> dict[float, float]:
 
 
 def static_cameras(views: Sequence[View]) -> list[list[int]]:
-    """Indices of the views, in order of time, of each camera (pose, lens and size) that has pictures of several times.
+    """Return indices of views, in order of time, for each static camera with pictures at several times.
 
-    Of several views with one pose and time, the first counts.
+    A camera is a pose, intrinsics, a lens and a size. Of several views with one camera and time the first is taken.
     """
     cameras: defaultdict[tuple[object, ...], dict[float, int]] = defaultdict(dict)
     for i, view in enumerate(views):
@@ -88,7 +88,7 @@ def static_cameras(views: Sequence[View]) -> list[list[int]]:
 
 
 def _repeated(views: list[View]) -> list[str]:
-    """One camera, one pose, one time, but several pictures."""
+    """Warn of several pictures with one camera, pose and time."""
     pictures: defaultdict[tuple[int, float | None, bytes], dict[Path, View]] = defaultdict(dict)
     for view in views:
         pictures[view.camera_id, view.time, view.cam_from_world.round(9).tobytes()].setdefault(view.image_path, view)
@@ -118,7 +118,7 @@ def _frame_counts(views: list[View]) -> list[str]:
 
 
 def _camera_labels(cameras: dict[int, list[View]]) -> dict[int, str]:
-    """Each camera's folder if it has one of its own, else its number."""
+    """Name cameras for messages: by the folder if a camera has one of its own, else by number."""
     folders = {camera: {view.name.rpartition("/")[0] for view in seen} for camera, seen in cameras.items()}
     firsts = {camera: min(names) for camera, names in folders.items()}
     own = Counter(firsts.values())

@@ -1,1 +1,1 @@
-"""Files on disk, safely: untrusted ones read within limits, our own written whole or not at all."""
+"""Files: untrusted ones are read within limits, our own are written atomically."""

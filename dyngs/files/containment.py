@@ -1,7 +1,7 @@
-"""What a capture from somebody else may do while it is read: where its files may lie, how large its pictures may be.
+"""Containment of untrusted captures: their files must lie in their folder, their pictures must not be too large.
 
-It may name any file of the user as one of its pictures, by a link, an absolute path or ``..``, and a picture of a few
-kilobytes may fill all memory. Each file is looked at here before it is opened, each picture before it is decoded.
+A capture may name any file of the user as one of its pictures, by a link, an absolute path or ``..``, and a picture of
+a few kilobytes may fill all memory. Every path is checked here before it is opened, every picture before it is decoded.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from pathlib import Path
 from dyngs.errors import DyngsError, require_regular
 
 MAX_MEGAPIXELS = 150.0
-"""1e6 pixels that a picture may have unless the configuration says otherwise."""
+"""Default of ``data.max_megapixels``: 1e6 pixels that a picture may have."""
 _MAX_LISTED = 100_000
-"""Entries of a capture that are looked through for links."""
+"""Entries of a capture that are searched for links."""
 
 
 @dataclass(frozen=True)
-class _Border:
-    """Where files may lie: below ``real``, which is ``root`` without links. ``folders``: real places already known."""
+class _Boundary:
+    """The folder that files must lie in: ``root``, and ``real`` with links resolved; ``folders`` is a cache."""
 
     root: Path
     real: str
     folders: dict[str, str] = field(default_factory=dict)
 
-    def real_place(self, path: Path) -> str:
-        """The path without links; that of a folder is looked up once."""
+    def resolved(self, path: Path) -> str:
+        """Resolve links in the path; each folder is resolved once."""
         folder, name = os.path.split(path)
         if name in ("", ".", "..") or os.path.islink(path):
             return os.path.realpath(path)
@@ -39,23 +39,23 @@ class _Border:
         return os.path.join(self.folders[folder], name)
 
 
-_border: ContextVar[_Border | None] = ContextVar("border", default=None)
+_boundary: ContextVar[_Boundary | None] = ContextVar("boundary", default=None)
 _max_megapixels: ContextVar[float] = ContextVar("max_megapixels", default=MAX_MEGAPIXELS)
 
 
 @contextmanager
 def staying_within(root: Path, follow_links: bool = False) -> Iterator[None]:
-    """A block in which ``inside`` refuses what does not lie below ``root``; nothing is refused if ``follow_links``."""
-    token = _border.set(None if follow_links else _Border(root, os.path.realpath(root)))
+    """Make ``inside`` refuse paths outside ``root`` in the block; nothing is refused if ``follow_links``."""
+    token = _boundary.set(None if follow_links else _Boundary(root, os.path.realpath(root)))
     try:
         yield
     finally:
-        _border.reset(token)
+        _boundary.reset(token)
 
 
 @contextmanager
 def pictures_up_to(megapixels: float) -> Iterator[None]:
-    """A block in which pictures may have so many 1e6 pixels, in place of ``MAX_MEGAPIXELS``."""
+    """Set how many 1e6 pixels a picture may have in the block, instead of ``MAX_MEGAPIXELS``."""
     token = _max_megapixels.set(megapixels)
     try:
         yield
@@ -64,30 +64,30 @@ def pictures_up_to(megapixels: float) -> Iterator[None]:
 
 
 def inside(path: Path) -> Path:
-    """``path``, if it may be opened: outside a block of ``staying_within`` any path may.
+    """Return ``path`` if it may be opened; outside a block of ``staying_within`` any path may.
 
     Raises:
-        DyngsError: it lies outside the capture, says where; it is a pipe or a device.
+        DyngsError: it lies outside the capture (says where), or it is a pipe or a device.
     """
-    border = _border.get()
-    if border is not None:
-        _require_below(border, path)
+    boundary = _boundary.get()
+    if boundary is not None:
+        _require_below(boundary, path)
     require_regular(path)
     return path
 
 
-def _require_below(border: _Border, path: Path) -> None:
-    place = border.real_place(path)
-    if not _is_below(place, border.real):
+def _require_below(boundary: _Boundary, path: Path) -> None:
+    place = boundary.resolved(path)
+    if not _is_below(place, boundary.real):
         leads = "" if place == str(path) else f" leads to {place}, which"
         raise DyngsError(
-            f"{path}:{leads} lies outside the capture {border.root}; copy the file into the capture, or, if you trust "
-            "it to name files of yours, set data.follow_links=true"
+            f"{path}:{leads} lies outside the capture {boundary.root}; copy the file into the capture, or, if you "
+            "trust it to name files of yours, set data.follow_links=true"
         )
 
 
 def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
-    """Check that a picture is not too large to be decoded; more than four channels count as so many pictures.
+    """Check that a picture is not too large to be decoded; more than four channels count in proportion.
 
     Raises:
         DyngsError: it has more pixels than are allowed; says how many and which key allows more.
@@ -102,12 +102,12 @@ def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
 
 
 def max_decoded_mb() -> int:
-    """What a picture of the largest size takes in 2^20 bytes, with four channels of floats."""
+    """Return the 2^20 bytes that the largest allowed picture takes with four channels of floats."""
     return max(1, round(_max_megapixels.get() * 16e6 / 2**20))
 
 
 def leaving_links(root: Path) -> list[tuple[Path, str]]:
-    """Links below ``root`` (its first 100,000 entries) that lead out of it, and where to; no link is followed."""
+    """List links among the first 100,000 entries below ``root`` that lead out of it, with targets; none is followed."""
     real = os.path.realpath(root)
     found, seen = [], 0
     for folder, names, files in os.walk(root):

@@ -1,4 +1,4 @@
-"""Checked values of dictionaries that were read from a file: required keys and finite numbers."""
+"""Checks of values in dictionaries from files: required keys, numbers, matrices."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from dyngs.errors import DyngsError
 
 
 def is_number(value: object) -> TypeGuard[int | float]:
-    """Whether a value out of a JSON file is a number; true and false are none."""
+    """Whether a value from a JSON file is a number; true and false are not."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def matrix_of(where: str, key: str, value: object) -> np.ndarray:
-    """The float64 numbers that a 4x4 matrix in a JSON file holds; their shape and values are not checked.
+    """Return the numbers of a 4x4 matrix in a JSON file as float64; shape and values are not checked.
 
     Raises:
         DyngsError: other things than numbers; ``where`` and ``key`` say which.
@@ -29,7 +29,7 @@ def matrix_of(where: str, key: str, value: object) -> np.ndarray:
 
 
 def entry(where: object, fields: object, key: str) -> Any:
-    """``fields[key]`` of a dictionary out of a file.
+    """Return ``fields[key]`` of a dictionary from a file.
 
     Raises:
         DyngsError: it is no dictionary or lacks the key; ``where`` says which file.
@@ -42,10 +42,10 @@ def entry(where: object, fields: object, key: str) -> Any:
 
 
 def numbers_of(where: object, value: object, shape: tuple[int, ...] | None) -> np.ndarray:
-    """The finite float64 numbers of ``value`` in ``shape``, or flat where that is None; a file may have another shape.
+    """Return finite float64 numbers, reshaped to ``shape``, or flat if that is None; the file may have another shape.
 
     Raises:
-        DyngsError: other things, or another count; ``where`` says which file.
+        DyngsError: no numbers, or another number of them; ``where`` says which file.
     """
     array = float_array(value)
     fits = array is not None and (shape is None or array.size == math.prod(shape))
@@ -56,12 +56,12 @@ def numbers_of(where: object, value: object, shape: tuple[int, ...] | None) -> n
 
 
 def first_few(items: Collection[object]) -> str:
-    """The first few, for messages."""
+    """Return the first five items as text for messages, and how many more there are."""
     return ", ".join(str(item) for item in list(items)[:5]) + (f" and {len(items) - 5} more" if len(items) > 5 else "")
 
 
 def float_array(value: object) -> np.ndarray | None:
-    """float64, None where these are no numbers."""
+    """Return ``value`` as a float64 array, None where it holds anything but numbers."""
     try:
         array = np.asarray(value) if _is_numeric(value) else None
         return array.astype(np.float64) if array is not None and array.dtype.kind in "biuf" else None
@@ -70,7 +70,7 @@ def float_array(value: object) -> np.ndarray | None:
 
 
 def _is_numeric(value: object) -> bool:
-    """Whether there are but numbers in it: NumPy would make every text among them as long as the longest."""
+    """Whether it holds only numbers: NumPy would pad every text among them to the longest."""
     if isinstance(value, (list, tuple)):
         return all(_is_numeric(part) for part in value)
     if isinstance(value, np.ndarray):

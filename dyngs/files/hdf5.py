@@ -1,4 +1,4 @@
-"""Data sets in HDF5 files of others, read within limits; needs the optional package h5py."""
+"""Data sets of untrusted HDF5 files, read within limits; needs the optional package h5py."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dyngs.files.containment import check_size, inside
 
 
 def read_hdf5(path: Path, key: str, rows: int | EllipsisType = ...) -> np.ndarray:
-    """The data set ``key`` of an HDF5 file, or one row of it.
+    """Read the data set ``key`` of an HDF5 file, or one row of it.
 
     Raises:
         DyngsError: h5py is not installed; the file is missing or damaged, or lacks the data set or the row.
@@ -24,12 +24,12 @@ def read_hdf5(path: Path, key: str, rows: int | EllipsisType = ...) -> np.ndarra
 
 
 def hdf5_length(path: Path, key: str) -> int:
-    """Number of rows of the data set ``key``. Raises as ``read_hdf5``."""
+    """Return the number of rows of the data set ``key``; raises as ``read_hdf5``."""
     return int(_hdf5(path, key, None)[0])
 
 
 def _hdf5(path: Path, key: str, rows: int | EllipsisType | None) -> Any:
-    """Rows of a data set; its shape where ``rows`` is None."""
+    """Read rows of a data set, or return its shape if ``rows`` is None."""
     try:
         h5py = import_module("h5py")
     except ImportError:

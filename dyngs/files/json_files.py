@@ -1,4 +1,4 @@
-"""Reading a JSON file that must be an object, with one clear line for whatever is wrong with it."""
+"""Reading of JSON files that must hold an object, with one clear line for anything else."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from dyngs.files.containment import inside
 
 
 def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, object]:
-    """The object in ``path``; a byte order mark is allowed.
+    """Read the JSON object in ``path``; a byte order mark is allowed.
 
     Args:
-        what: said of a file that holds something else than an object.
+        what: text of the error for a file that holds anything else than an object.
 
     Raises:
         DyngsError: unreadable, broken JSON (with line and column), or no object.

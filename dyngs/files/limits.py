@@ -1,4 +1,4 @@
-"""How much a file from others may ask for, checked before it is allocated, and the one variable that allows more."""
+"""Limits on the memory that untrusted files may ask for, and the environment variable that raises them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 from dyngs.errors import DyngsError
 
 VARIABLE = "DYNGS_LIMITS"
-"""Name of the environment variable: 4 allows four times what is allowed without it, of everything."""
+"""Environment variable that multiplies all limits: 4 allows four times as much of everything."""
 
 
 def allowed(most: int) -> int:
-    """``most`` times what the environment variable ``DYNGS_LIMITS`` says, 1 if it says nothing.
+    """Return ``most`` times the value of the environment variable ``DYNGS_LIMITS``, 1 if it is not set.
 
     Raises:
         DyngsError: the variable is not a number of at least 1.
@@ -29,13 +29,13 @@ def allowed(most: int) -> int:
 
 
 def require_at_most(where: Path | str, amount: int, most: int, what: str) -> None:
-    """Check that a file does not ask for more than is read by default, or than ``DYNGS_LIMITS`` allows.
+    """Check that a file asks for no more than the limit, which ``DYNGS_LIMITS`` may raise.
 
     Args:
         where: the file.
-        amount: how many it asks for.
-        most: that are read by default.
-        what: they are, in the plural.
+        amount: number that the file asks for.
+        most: the limit.
+        what: what is counted, in the plural, for the message.
 
     Raises:
         DyngsError: names the file, both numbers, and the variable that allows more.

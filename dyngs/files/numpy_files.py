@@ -1,4 +1,4 @@
-"""NumPy files of others, checked before they are read: ``.npy`` arrays and chosen arrays of ``.npz`` archives."""
+"""Untrusted NumPy files, checked before memory is allocated: ``.npy`` arrays, arrays of ``.npz`` archives."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from dyngs.files.fields import entry
 from dyngs.files.limits import require_at_most
 
 MOST_BYTES = 1 << 29
-"""Of the arrays that are read of one file, each number counted as 8 at least. SMPL-X has half as many."""
+"""Limit on the arrays of one file, each number counted as at least 8 bytes; SMPL-X takes half of it."""
 _HIGHEST_RATIO = 1032
-"""Of deflate: more is a lie of the directory."""
+"""Highest compression ratio of deflate: an archive that claims more is damaged or hostile."""
 _CHUNK = 1 << 20
 
 
 def read_arrays(path: Path, choose: Callable[[Collection[str]], Iterable[str]]) -> dict[str, np.ndarray]:
-    """The arrays of numbers or text in a ``.npz`` that ``choose`` picks of the names in it; others are not touched.
+    """Read the arrays of numbers or text in a ``.npz`` whose names ``choose`` selects; others are not read.
 
     Raises:
-        DyngsError: the file is missing or damaged, or what is picked holds objects or takes more than ``MOST_BYTES``.
+        DyngsError: the file is missing or damaged, or a selected array holds objects or takes more than ``MOST_BYTES``.
     """
     if path.exists() and not path.is_file():
         raise DyngsError(f"{path}: is no file; name a .npz")
@@ -49,7 +49,7 @@ def read_arrays(path: Path, choose: Callable[[Collection[str]], Iterable[str]]) 
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """The float64 array of a ``.npy`` file; archives and Python objects are refused.
+    """Read the float64 array of a ``.npy`` file; archives and Python objects are refused.
 
     Raises:
         DyngsError: the file is missing, damaged, or holds something else than numbers.
@@ -60,7 +60,7 @@ def read_npy(path: Path) -> np.ndarray:
 
 
 def read_npz(path: Path, keys: Collection[str], optional: Collection[str] = ()) -> dict[str, np.ndarray]:
-    """The arrays of a ``.npz`` file: ``keys``, and of ``optional`` what is there; Python objects are refused.
+    """Read the arrays ``keys`` of a ``.npz`` file, and those of ``optional`` that exist; Python objects are refused.
 
     Raises:
         DyngsError: the file is missing or damaged, holds objects there, lacks a key, or asks for too much memory.
@@ -74,13 +74,13 @@ def read_npz(path: Path, keys: Collection[str], optional: Collection[str] = ()) 
 
 
 def require_text(raw: bytes | bytearray, dtype: np.dtype) -> None:
-    """Check that the bytes of an array are text, if its type says so. Raises ValueError."""
+    """Check that the bytes of an array of text are valid characters; raises ValueError."""
     if dtype.kind == "U" and (np.frombuffer(raw, dtype.byteorder + "u4") > 0x10FFFF).any():
         raise ValueError("an array of text in it holds what is no text")
 
 
 def _array(path: Path, name: str, size: int, stream: IO[bytes], before: int) -> np.ndarray:
-    """An array; ``before`` are the bytes of those read earlier."""
+    """Read one array; ``before`` is the number of bytes of those read earlier."""
     try:
         version = np.lib.format.read_magic(stream)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -96,7 +96,7 @@ def _array(path: Path, name: str, size: int, stream: IO[bytes], before: int) -> 
         for start in range(0, count, _CHUNK):
             part = stream.read(min(_CHUNK, count - start))
             view[start : start + len(part)] = part
-        stream.read()  # whose end checks the sum
+        stream.read()  # at the end zipfile compares the checksum
         require_text(raw, dtype)
         return np.frombuffer(raw, dtype, math.prod(shape)).reshape(shape, order="F" if by_columns else "C")
     except DyngsError:

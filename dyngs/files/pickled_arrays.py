@@ -1,7 +1,7 @@
-"""Arrays as pickles spell them: what the few names that their writers use stand for, without running any of them.
+"""Arrays in pickles: interpretation of the few classes and functions that their writers name, without calling them.
 
-A name in a pickle becomes a ``Name``, a word that nothing can be done with; ``Arrays`` knows what a call of it by a
-writer of NumPy, SciPy, chumpy or joblib means.
+A name in a pickle becomes a ``Name``, which is only text; ``Arrays`` rebuilds the arrays that calls of these names by
+NumPy, SciPy, chumpy or joblib stand for.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from dyngs.files.limits import require_at_most
 from dyngs.files.numpy_files import require_text
 
 _MOST_ENTRIES = 1 << 24
-"""Of the sparse matrices of a file together, zeros included. The regressors of bodies have half a million."""
+"""Entries of all sparse matrices of a file, zeros included; joint regressors of bodies have half a million."""
 _MOST_AXES = 32
 _LARGEST_AXIS = 1 << 48
 _MOST_LEVELS = 8
-"""Of arrays of objects in each other: NumPy frees them by recursion."""
+"""Nesting of arrays of objects; NumPy frees them by recursion."""
 _BYTES_PER_BYTE = 16
-"""Memory of arrays for each byte of the file; 8 are a reference to an object, which a writer can name by 2."""
+"""Bytes of arrays per byte of the file: a reference to an object takes 8, and 2 in a pickle."""
 
 _ARRAYS = {
     "numpy.ndarray": "plain",
@@ -34,25 +34,25 @@ _ARRAYS = {
     **{f"scipy.sparse.csr_{kind}": "rows" for kind in ("matrix", "array")},
 }
 CONTAINERS = ("builtins.set", "builtins.frozenset", "collections.OrderedDict")
-"""Names of what holds other things by keys; calls of these are for who checks keys."""
+"""Names of containers with keys; calls of these are left to the unpickler, which checks keys."""
 _OLD_NAMES = (
     (r"numpy\._core\.", "numpy.core."),
     (r"scipy\.sparse\..*\.(cs[cr]_)", r"scipy.sparse.\1"),
     (r"__builtin__\.", "builtins."),
     (r"copy_reg\.", "copyreg."),
 )
-"""Patterns at the start of a name, and what is known for it: modules were moved between versions."""
+"""Patterns of old and new module names to the name used here: modules moved between versions."""
 
 
 @dataclass(frozen=True)
 class Name:
-    """A class or function that a pickle names, by its present name."""
+    """A class or function named in a pickle, by its current name."""
 
     text: str
 
     @property
     def array(self) -> str | None:
-        """How the state of such an object spells an array; None where it is no array."""
+        """Layout of the array in the state of such an object, None if it is no array."""
         return "chumpy" if self.text.startswith("chumpy.") else _ARRAYS.get(self.text)
 
 
@@ -78,12 +78,12 @@ class Array(np.ndarray):
 
 
 def shown(value: object) -> str:
-    """What to say of a value in a message: text, numbers and None themselves (cut short), else the name of its type."""
+    """Return a short text for messages: strings, numbers and None as they are, else the name of the type."""
     return repr(value)[:20] if isinstance(value, (str, float, bool, type(None))) else type(value).__name__
 
 
 class Arrays:
-    """What names mean in one file.
+    """Interpretation of the names in one pickle.
 
     Args:
         path: the file, for messages.
@@ -100,7 +100,7 @@ class Arrays:
         self.sparse_entries = 0
 
     def named(self, module: object, name: object) -> Name:
-        """What the file calls ``module.name``. Raises ValueError for what is not known."""
+        """Return the name ``module.name``; raises ValueError for unknown ones."""
         if not isinstance(module, str) or not isinstance(name, str):
             raise ValueError("a class in it has no proper name")
         key = f"{module[:200]}.{name[:200]}"
@@ -112,7 +112,7 @@ class Arrays:
         return found
 
     def called(self, name: object, arguments: object) -> object:
-        """What a call stands for. Raises an Exception of any kind for what it cannot stand for."""
+        """Return the object that a call stands for; raises exceptions of any kind for wrong arguments."""
         if not isinstance(name, Name) or not isinstance(arguments, tuple):
             raise ValueError("it calls what is no function")
         if name.array is not None:
@@ -124,7 +124,7 @@ class Arrays:
         return _CALLS[name.text](self, *arguments)
 
     def build(self, target: object, state: object) -> None:
-        """Give ``target``, made by ``called``, its state. Raises an Exception of any kind where that is none."""
+        """Set the state of ``target``, made by ``called``; raises exceptions of any kind for a wrong state."""
         if isinstance(target, Dtype):
             _set_order(target, state)
             return
@@ -144,7 +144,7 @@ class Arrays:
             self._become(target, dense if spelled == "columns" else np.ascontiguousarray(dense.T))
 
     def charge(self, count: int) -> None:
-        """Count bytes of memory that are made from the file. Raises ValueError if it is too small for so many."""
+        """Count bytes of memory allocated for the file; raises ValueError if there are too many for its size."""
         self._bytes_left -= count
         if self._bytes_left < 0:
             raise ValueError("it makes many large arrays out of the same bytes")
@@ -167,12 +167,12 @@ class Arrays:
         target.__setstate__((1, tuple(shape), dtype.value, bool(fortran), raw))  # type: ignore[arg-type]
 
     def _become(self, target: Array, array: np.ndarray) -> None:
-        """Give it the numbers of another array."""
+        """Copy the numbers of another array."""
         self.charge(array.nbytes)
         target.__setstate__((1, array.shape, array.dtype, False, array.tobytes()))  # type: ignore[arg-type]
 
     def _beside(self, state: dict[str, Any]) -> tuple[Any, ...]:
-        """The state of an array whose bytes joblib wrote into the file behind this entry."""
+        """State of an array whose bytes joblib wrote into the file after this entry."""
         shape, dtype = state["shape"], state["dtype"]
         if not isinstance(dtype, Dtype) or dtype.value.kind == "O":
             raise ValueError("an array in it does not hold numbers")
@@ -181,7 +181,7 @@ class Arrays:
         return 1, shape, dtype, state["order"] == "F", self._read(_count(shape) * dtype.value.itemsize)
 
     def _dense(self, state: dict[str, Any], height: Any, width: Any) -> np.ndarray:
-        """(height, width) of compressed columns."""
+        """Return the dense (height, width) array of a matrix of compressed columns."""
         data, row, pointers = (_numbers(state[name]) for name in ("data", "indices", "indptr"))
         entries = _count((height, width))
         fits = data.ndim == row.ndim == pointers.ndim == 1 and len(pointers) == width + 1
@@ -247,7 +247,7 @@ def _set_order(dtype: Dtype, state: Any) -> None:
 
 
 def _count(shape: object) -> int:
-    """Entries of an array of that shape."""
+    """Number of entries of an array of that shape."""
     if not isinstance(shape, (tuple, list)) or len(shape) > _MOST_AXES:
         raise ValueError("an array in it has no proper type and shape")
     if not all(isinstance(n, (int, np.integer)) and 0 <= n < _LARGEST_AXIS for n in shape):
@@ -256,7 +256,7 @@ def _count(shape: object) -> int:
 
 
 def _levels(items: list[object]) -> int:
-    """Of arrays of objects in each other, that of ``items`` counted."""
+    """Nesting depth of arrays of objects, that of ``items`` included."""
     inside = [item for item in items if isinstance(item, Array)]
     levels = 1 + max((array.levels for array in inside), default=0)
     if levels > _MOST_LEVELS or any(array.awaits is not None for array in inside):

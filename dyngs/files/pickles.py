@@ -1,6 +1,6 @@
-"""What pickles hold, read without running anything: numbers, text, containers, and arrays of NumPy, SciPy and chumpy.
+"""Reading of pickles without executing them: numbers, text, containers, arrays of NumPy, SciPy and chumpy.
 
-Captures of people and body files come as pickles, of Python 2 and 3, of ``numpy.save`` and of joblib.
+Captures of people and body templates are distributed as pickles of Python 2 and 3, of ``numpy.save`` and of joblib.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from typing import BinaryIO
 import numpy as np
 
 from dyngs.errors import DyngsError
-from dyngs.files.unpickler import Machine
+from dyngs.files.unpickler import Unpickler
 
 
 def read_pickle(path: Path) -> object:
-    """What a pickle holds, if that is numbers, text, containers and arrays; nothing of the file is executed.
+    """Read a pickle of numbers, text, containers and arrays; nothing in the file is executed.
 
     Pickles of Python 2 and uncompressed ones of joblib are read, too. Sparse matrices of SciPy and arrays of chumpy
-    (none of which is needed for it) become plain arrays. What is returned never contains itself and is at most 100
-    containers deep; with shared parts counted wherever they are, it has two entries for each byte of the file and a
-    million more at most, beside those of sparse matrices (``dyngs.files.limits``).
+    become plain arrays; neither package is needed. The result never contains itself and is at most 100 containers deep.
+    With shared parts counted at each occurrence, it has at most two entries per byte of the file and a million more,
+    beside those of sparse matrices (``dyngs.files.limits``).
 
     Raises:
         DyngsError: the file is missing or damaged, or holds anything else, or asks for too much.
@@ -29,7 +29,7 @@ def read_pickle(path: Path) -> object:
 
 
 def read_pickled_array(path: Path) -> object:
-    """The Python object that ``numpy.save`` wrapped into an array without axes, read as ``read_pickle`` does.
+    """Read the Python object that ``numpy.save`` wrapped into a 0-dimensional array, as ``read_pickle`` does.
 
     Raises:
         DyngsError: the file is missing or damaged, or holds something else.
@@ -47,7 +47,7 @@ def _unpickled(path: Path, is_array: bool) -> object:
         with path.open("rb") as file:
             if is_array:
                 _skip_array_header(file)
-            return Machine(path, file, path.stat().st_size).load()
+            return Unpickler(path, file, path.stat().st_size).load()
     except DyngsError:
         raise
     except Exception as error:  # a damaged pickle raises nearly anything

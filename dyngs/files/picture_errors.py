@@ -1,4 +1,4 @@
-"""Texts of OpenImageIO, which quotes bytes of pictures that need not be text."""
+"""Error texts of OpenImageIO, which may quote bytes of pictures that are no text."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Protocol
 from dyngs.errors import printable
 
 
-class _Complaining(Protocol):
+class _HasErrors(Protocol):
     """OpenImageIO itself, or one of its readers and writers."""
 
     def geterror(self) -> str: ...
 
 
-def picture_error(source: _Complaining) -> str:
-    """What OpenImageIO complained about last, on one short line; "" if about nothing."""
+def picture_error(source: _HasErrors) -> str:
+    """Return the last error of OpenImageIO as one short line, "" if there is none."""
     text = any_text(source.geterror).strip()
     return printable(text.splitlines()[0], 100) if text else ""
 
 
 def any_text(ask: Callable[[], str]) -> str:
-    """What ``ask`` returns, with escapes for bytes that are not UTF-8, about which OpenImageIO's binding raises."""
+    """Return the text of ``ask``, with escapes for bytes that are not UTF-8, where OpenImageIO's binding raises."""
     try:
         return ask()
     except UnicodeDecodeError as error:

@@ -1,4 +1,4 @@
-"""Hidden names for what is not finished yet, and the removal of those that a killed process left behind."""
+"""Temporary files and folders beside their targets, and removal of those that killed processes left behind."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _NAME = re.compile(r"\.(?P<stem>.+)\.(?P<pid>\d{1,10})-(?P<home>[0-9a-f]{6})\.dy
 
 
 def temporary_beside(path: Path) -> Path:
-    """A hidden name of this process beside ``path``, with its suffix; the folder is made where it is missing.
+    """Return a hidden path beside ``path``, unique to this process, with its suffix; the folder is created if missing.
 
-    What killed processes left under such names in that folder is removed, once per folder and process.
+    Temporary files that killed processes left in that folder are removed, once per folder and process.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_once(str(path.parent.absolute()), os.getpid())
@@ -27,10 +27,10 @@ def temporary_beside(path: Path) -> Path:
 
 
 def temporary_folder_beside(path: Path) -> Path:
-    """An empty folder under such a name, to become ``path``; one that this process left there before is replaced.
+    """Create an empty temporary folder, to be renamed to ``path``; an earlier one of this process is replaced.
 
     Raises:
-        DyngsError: it cannot be made.
+        DyngsError: it cannot be created.
     """
     try:
         folder = temporary_beside(path)
@@ -48,8 +48,8 @@ def remove_leftovers(folder: Path, only_ours: Callable[[str], bool] | None = Non
 
     Args:
         folder: where to look.
-        only_ours: whether a file of this name is written by nobody else at present, so that what was to become it goes
-            whoever began it.
+        only_ours: whether no other process is writing a file of this name at present; its temporary files are then
+            removed whatever process they are of.
     """
     try:
         entries = list(os.scandir(folder))
@@ -66,7 +66,7 @@ def remove_leftovers(folder: Path, only_ours: Callable[[str], bool] | None = Non
 
 
 def remove_quietly(path: Path) -> None:
-    """Remove a regular file, or a folder that is no link, with what it holds; whatever cannot be removed stays."""
+    """Remove a regular file, or a folder with its contents, but no link; errors are ignored."""
     if path.is_symlink():
         return
     if path.is_dir():
@@ -79,13 +79,13 @@ def remove_quietly(path: Path) -> None:
 
 
 @lru_cache(maxsize=4096)
-def _remove_once(folder: str, pid: int) -> None:  # pid: a forked process looks for itself
+def _remove_once(folder: str, pid: int) -> None:  # pid: a forked process does this again
     remove_leftovers(Path(folder))
 
 
 @lru_cache(maxsize=1)
 def _home() -> str:
-    """Which processes share their numbers with this one: a name for the machine, and its container if there is one."""
+    """Return a name for the machine, and its container if there is one, within which process ids are unique."""
     try:
         namespace = os.readlink("/proc/self/ns/pid")
     except OSError:  # not on Linux
@@ -94,7 +94,7 @@ def _home() -> str:
 
 
 def _is_alive(pid: int) -> bool:
-    """Whether a process of this number exists; where that cannot be asked, as if it did."""
+    """Whether a process with this id exists; true where that cannot be found out."""
     if os.name != "posix":  # os.kill would end it there
         return True
     try:

@@ -1,4 +1,4 @@
-"""Files of named tensors with a header and a checksum: safetensors, so that reading them runs no code."""
+"""Files of named tensors with a header and a checksum, in the safetensors format: reading them runs no code."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from dyngs.files.write import atomic_file
 
 @dataclass(frozen=True)
 class FileKind:
-    """What a file holds.
+    """Kind of a tensor file.
 
     Attributes:
-        key: of the metadata, under which the header is.
-        what: with its article, for messages.
-        version: of the format; files of another one are refused.
+        key: key of the metadata that holds the header.
+        what: name of the kind with its article, for messages.
+        version: version of the format; files of others are refused.
     """
 
     key: str
@@ -41,10 +41,10 @@ def write_tensors(
     """Write the file, atomically; equal tensors and headers give equal bytes.
 
     Args:
-        path: of the file.
-        kind: what it holds.
-        tensors: contiguous.
-        header: what JSON can hold.
+        path: file to write.
+        kind: kind of the file.
+        tensors: contiguous tensors by name.
+        header: values that JSON can hold.
         advice: end of the message for a full disk.
 
     Raises:
@@ -53,7 +53,7 @@ def write_tensors(
     full = {"format": kind.version, **header}
     full["digest"] = _digest(tensors, full)
     with atomic_file(path, durable=True) as temporary:
-        # The library begins a file under a name of its own, which a kill would leave: so in a folder known as ours.
+        # The library writes to a temporary name of its own, which a kill would leave behind: so in a folder of ours.
         folder = temporary_folder_beside(path.with_suffix(""))
         try:
             # One key only: the library writes several in random order.
@@ -66,12 +66,12 @@ def write_tensors(
 
 
 def read_tensors(path: Path, kind: FileKind, advice: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Header and tensors of a file.
+    """Read header and tensors of a file.
 
     Args:
-        path: of the file.
-        kind: what it should hold.
-        advice: end of the messages: what to do where it is damaged.
+        path: file to read.
+        kind: expected kind.
+        advice: end of the messages for damaged files.
 
     Raises:
         DyngsError: a file that is missing, truncated, altered, of another kind or version.
@@ -81,8 +81,8 @@ def read_tensors(path: Path, kind: FileKind, advice: str) -> tuple[dict[str, Any
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {}).get(kind.key, "null"))
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except Exception as error:  # the library lists none of what it raises
-        if isinstance(error, OSError | MemoryError) or "allocate memory" in str(error):  # says nothing of the file
+    except Exception as error:  # the library does not document its exceptions
+        if isinstance(error, OSError | MemoryError) or "allocate memory" in str(error):  # not the file's fault
             is_there = not isinstance(error, FileNotFoundError)
             advice = "; the file itself may be whole: keep it, try again" if is_there else ""
         raise DyngsError(f"{path}: cannot be read as {kind.what} ({reason(error)}){advice}") from error

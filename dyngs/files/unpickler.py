@@ -1,8 +1,8 @@
-"""A machine that reads pickles as the data they are: it has no instruction that could run anything.
+"""An interpreter of pickles that cannot execute anything: it has no opcode for that.
 
-It knows the instructions that writers of numbers, text, containers and arrays use (protocols 0 to 5, of Python 2 and
-3). What a file names is looked up in ``pickled_arrays``, and stays a word. Time and memory are linear in the
-size of the file: reads never go beyond its end, and containers, keys and nesting are limited.
+It knows the opcodes for numbers, text, containers and arrays (protocols 0 to 5, of Python 2 and 3). Names of classes
+and functions are only looked up in ``pickled_arrays``. Time and memory are linear in the size of the file: reads never
+go beyond its end, and containers, keys and nesting are limited.
 """
 
 from __future__ import annotations
@@ -22,24 +22,23 @@ _MOST_CONTAINERS = 1 << 20
 _MOST_REMEMBERED = 1 << 20
 _MOST_NUMBER_KEYS = 1 << 16
 _LARGEST_KEY = 1 << 31
-"""Of keys that are no text: a file can choose large numbers, or fractions, that a dictionary finds slowly."""
+"""Limit of keys that are numbers: a file can choose large ones whose hashes collide."""
 _MOST_ENTRIES = 1 << 20
-"""Values with shared ones counted wherever they are, beside two for each byte of the file and those of its sparse
-matrices."""
+"""Entries, shared ones counted at each occurrence, beside two per byte of the file and those of sparse matrices."""
 _DEEPEST = 100
 _LONGEST_KEY = 4096
 _LONGEST_LINE = 1000
-"""Characters of a number or a name that is written as text."""
+"""Characters of a number or a name written as text."""
 _MOST_MARKS = 1000
 
 
-class Machine:
-    """The state of reading one pickle from where ``file`` stands.
+class Unpickler:
+    """State of reading one pickle from the position of ``file``.
 
     Args:
-        path: of the file, for messages.
-        file: opened for reading bytes.
-        size: of the file, in bytes.
+        path: file name, for messages.
+        file: binary file.
+        size: size of the file in bytes.
     """
 
     def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
@@ -52,7 +51,7 @@ class Machine:
         self._containers = self._number_keys = 0
 
     def load(self) -> object:
-        """What the pickle holds: a tree, which may share parts, but at no time contains itself.
+        """Return the contents of the pickle: a tree that may share parts but never contains itself.
 
         Raises:
             DyngsError: it asks for more than ``dyngs.files.limits`` allows.
@@ -70,18 +69,18 @@ class Machine:
     # --- the file -----------------------------------------------------------------------------------------------------
 
     def read(self, count: int) -> bytes:
-        """The next bytes. Raises ValueError where the file has no more so many."""
+        """Read the next bytes; raises ValueError at the end of the file."""
         if not 0 <= count <= self._left:
             raise ValueError("it is cut off")
         self._left -= count
         return self._file.read(count)
 
     def number(self, layout: str) -> Any:
-        """The next number, as ``struct`` spells its layout."""
+        """Read the next number; ``layout`` as in ``struct``."""
         return struct.unpack(layout, self.read(struct.calcsize(layout)))[0]
 
     def line(self, most: int | None = None) -> bytes:
-        """The rest of this line of text."""
+        """Read the rest of this line of text."""
         found = self._file.readline(-1 if most is None else most)
         self._left -= len(found)
         if not found.endswith(b"\n"):
@@ -89,40 +88,40 @@ class Machine:
         return found[:-1]
 
     def word(self) -> str:
-        """A line that is a number or a name."""
+        """Read a line that is a number or a name."""
         return self.line(_LONGEST_LINE).decode("utf-8")
 
     # --- the stack ----------------------------------------------------------------------------------------------------
 
     def push(self, value: object) -> None:
-        """Put a value on top."""
+        """Push a value."""
         self._stack.append(value)
 
     def pop(self) -> Any:
-        """Take the topmost value off, which lies above the last mark."""
+        """Pop the topmost value, which must lie above the last mark."""
         self._require(1)
         return self._stack.pop()
 
     def top(self) -> Any:
-        """The topmost value."""
+        """Return the topmost value."""
         self._require(1)
         return self._stack[-1]
 
     def mark(self) -> None:
-        """Remember how high the stack is."""
+        """Mark the height of the stack."""
         if len(self._marks) >= _MOST_MARKS:
             raise ValueError("it is nested too deeply")
         self._marks.append(len(self._stack))
 
     def above_mark(self) -> list[Any]:
-        """Take off what lies above the last mark."""
+        """Pop all values above the last mark."""
         start = self._marks.pop()
         items = self._stack[start:]
         del self._stack[start:]
         return items
 
     def pop_or_unmark(self) -> None:
-        """Take off the topmost value, or the mark that lies there."""
+        """Pop the topmost value, or the mark that lies there."""
         if self._marks and self._marks[-1] == len(self._stack):
             self._marks.pop()
         else:
@@ -135,24 +134,24 @@ class Machine:
     # --- the memo -----------------------------------------------------------------------------------------------------
 
     def remember(self, index: int) -> None:
-        """Keep the topmost value under a number."""
+        """Store the topmost value in the memo under a number."""
         require_at_most(self._path, len(self._memo) + 1, _MOST_REMEMBERED, "remembered values")
-        self._memo[str(index)] = self.top()  # text: of numbers a file can choose those that a dictionary finds slowly
+        self._memo[str(index)] = self.top()  # text: a file can choose numbers whose hashes collide
 
     def recall(self, index: int) -> None:
-        """Put the value of that number on top."""
+        """Push the memo's value of that number."""
         self.push(self._memo[str(index)])
 
     # --- containers ---------------------------------------------------------------------------------------------------
 
     def push_container(self, value: Any) -> None:
-        """Put a new container on top."""
+        """Push a new container."""
         self._containers += 1
         require_at_most(self._path, self._containers, _MOST_CONTAINERS, "containers")
         self.push(value)
 
     def push_tuple(self, count: int) -> None:
-        """Put the topmost values on top as a tuple."""
+        """Replace the topmost values by a tuple of them."""
         self._require(count)
         items = tuple(self._stack[-count:])
         del self._stack[-count:]
@@ -180,7 +179,7 @@ class Machine:
         target.update(zip(self.checked_keys(items[::2]), items[1::2], strict=True))
 
     def checked_keys(self, keys: list[Any]) -> list[Any]:
-        """The same, if a dictionary finds them fast."""
+        """Return the keys if all can be hashed quickly; raises ValueError otherwise."""
         for key in keys:
             if not isinstance(key, (str, bytes)):
                 self._number_keys += 1
@@ -192,7 +191,7 @@ class Machine:
     # --- objects ------------------------------------------------------------------------------------------------------
 
     def call(self, name: object, arguments: object) -> None:
-        """Put on top what a call stands for."""
+        """Push the object that a call stands for."""
         if not isinstance(name, Name) or name.text not in CONTAINERS:
             self.push_container(self._arrays.called(name, arguments))
             return
@@ -208,7 +207,7 @@ class Machine:
             self.push_container(set(keys) if name.text == "builtins.set" else frozenset(keys))
 
     def call_top(self) -> None:
-        """REDUCE and NEWOBJ: the arguments lie on top, beneath them what is called."""
+        """REDUCE and NEWOBJ: the arguments are on top, the callee below."""
         arguments = self.pop()
         self.call(self.pop(), arguments)
 
@@ -219,12 +218,12 @@ class Machine:
         self.call_top()
 
     def call_above_mark(self) -> None:
-        """OBJ: what is called lies above the mark, then its arguments."""
+        """OBJ: above the mark are the callee and its arguments."""
         name, *arguments = self.above_mark()
         self.call(name, tuple(arguments))
 
     def call_line(self) -> None:
-        """INST: what is called stands in two lines, its arguments lie above the mark."""
+        """INST: the callee is in two lines of text, its arguments are above the mark."""
         name = self._arrays.named(self.word(), self.word())
         self.call(name, tuple(self.above_mark()))
 
@@ -238,7 +237,7 @@ class Machine:
         self.push(self._arrays.named(self.pop(), name))
 
     def build(self) -> None:
-        """BUILD: the state lies on top, beneath it whose state that is."""
+        """BUILD: the state is on top, its object below."""
         state = self.pop()
         self._arrays.build(self.top(), state)
 
@@ -249,15 +248,15 @@ class Machine:
 
 
 def require_tree(where: Path, found: object, more: int = 0) -> None:
-    """Check that whatever walks through what a file holds comes to an end soon.
+    """Check that walking through the contents of a file ends soon.
 
     Args:
         where: the file.
-        found: of containers and values.
+        found: containers and values.
         more: entries that are allowed beside the usual number.
 
     Raises:
-        DyngsError: with shared parts counted wherever they are, it has too many entries.
+        DyngsError: it has too many entries, shared ones counted at each occurrence.
         ValueError: it contains itself, or is nested too deeply.
     """
     weights: dict[int, int] = {}
@@ -269,7 +268,7 @@ def require_tree(where: Path, found: object, more: int = 0) -> None:
             value = waiting.pop()
             if id(value) in weights:
                 continue
-            inside = _inside(value)
+            inside = _items(value)
             if inside is None:
                 continue
             if id(value) in open_ids or len(path) > _DEEPEST:
@@ -280,14 +279,14 @@ def require_tree(where: Path, found: object, more: int = 0) -> None:
         path.pop()
         if path:
             open_ids.discard(id(owner))
-            weights[id(owner)] = 1 + sum(_weight(part, weights) for part in _inside(owner) or ())
+            weights[id(owner)] = 1 + sum(_weight(part, weights) for part in _items(owner) or ())
             require_at_most(
                 where, max(weights[id(owner)] - more, 0), _MOST_ENTRIES, "entries (shared ones counted again)"
             )
 
 
-def _inside(value: Any) -> list[Any] | None:
-    """What lies in a container; None for other values."""
+def _items(value: Any) -> list[Any] | None:
+    """Return the items of a container, None for other values."""
     if isinstance(value, dict):
         return [*value.keys(), *value.values()]
     if isinstance(value, (list, tuple, set, frozenset)):
@@ -315,7 +314,7 @@ def _integer(text: str) -> int | bool:
 
 
 def _old_text(raw: bytes) -> str:
-    """Of Python 2, as it prints it."""
+    """Decode a quoted string of Python 2."""
     if len(raw) < 2 or raw[:1] != raw[-1:] or raw[:1] not in b"'\"":
         raise ValueError("a text in it has no quotes")
     return codecs.escape_decode(raw[1:-1])[0].decode("latin-1")  # type: ignore[attr-defined]
@@ -331,42 +330,42 @@ def _little(raw: bytes) -> int:
     return int.from_bytes(raw, "little", signed=True)
 
 
-def _sized(layout: str, become: Callable[[bytes], object] = bytes) -> Callable[[Machine], None]:
-    """A step that puts on top what follows its length."""
-    return lambda machine: machine.push(become(machine.read(machine.number(layout))))
+def _sized(layout: str, become: Callable[[bytes], object] = bytes) -> Callable[[Unpickler], None]:
+    """Return a step that pushes bytes that follow their length."""
+    return lambda unpickler: unpickler.push(become(unpickler.read(unpickler.number(layout))))
 
 
-def _number(layout: str) -> Callable[[Machine], None]:
-    return lambda machine: machine.push(machine.number(layout))
+def _number(layout: str) -> Callable[[Unpickler], None]:
+    return lambda unpickler: unpickler.push(unpickler.number(layout))
 
 
-def _word(become: Callable[[str], object]) -> Callable[[Machine], None]:
-    return lambda machine: machine.push(become(machine.word()))
+def _word(become: Callable[[str], object]) -> Callable[[Unpickler], None]:
+    return lambda unpickler: unpickler.push(become(unpickler.word()))
 
 
-def _container(become: Callable[[list[Any]], object]) -> Callable[[Machine], None]:
-    return lambda machine: machine.push_container(become(machine.above_mark()))
+def _container(become: Callable[[list[Any]], object]) -> Callable[[Unpickler], None]:
+    return lambda unpickler: unpickler.push_container(become(unpickler.above_mark()))
 
 
-def _set_pairs(machine: Machine) -> None:
-    """DICT: a new dictionary of what lies above the mark."""
-    items = machine.above_mark()
-    machine.push_container({})
-    machine.set_items(items)
+def _set_pairs(unpickler: Unpickler) -> None:
+    """DICT: push a dictionary of the values above the mark."""
+    items = unpickler.above_mark()
+    unpickler.push_container({})
+    unpickler.set_items(items)
 
 
-def _frozen(machine: Machine) -> None:
+def _frozen(unpickler: Unpickler) -> None:
     """FROZENSET."""
-    machine.push_container(frozenset(machine.checked_keys(machine.above_mark())))
+    unpickler.push_container(frozenset(unpickler.checked_keys(unpickler.above_mark())))
 
 
-def _set_item(machine: Machine) -> None:
+def _set_item(unpickler: Unpickler) -> None:
     """SETITEM."""
-    value = machine.pop()
-    machine.set_items([machine.pop(), value])
+    value = unpickler.pop()
+    unpickler.set_items([unpickler.pop(), value])
 
 
-_STEPS: dict[bytes, Callable[[Machine], object]] = {
+_STEPS: dict[bytes, Callable[[Unpickler], object]] = {
     b"N": lambda m: m.push(None),
     b"\x88": lambda m: m.push(True),
     b"\x89": lambda m: m.push(False),
@@ -394,9 +393,9 @@ _STEPS: dict[bytes, Callable[[Machine], object]] = {
     b"}": lambda m: m.push_container({}),
     b")": lambda m: m.push(()),
     b"\x8f": lambda m: m.push_container(set()),
-    b"(": Machine.mark,
-    b"0": Machine.pop_or_unmark,
-    b"1": Machine.above_mark,
+    b"(": Unpickler.mark,
+    b"0": Unpickler.pop_or_unmark,
+    b"1": Unpickler.above_mark,
     b"2": lambda m: m.push(m.top()),
     b"t": _container(tuple),
     b"\x85": lambda m: m.push_tuple(1),
@@ -417,15 +416,15 @@ _STEPS: dict[bytes, Callable[[Machine], object]] = {
     b"g": lambda m: m.recall(int(m.word())),
     b"h": lambda m: m.recall(m.number("<B")),
     b"j": lambda m: m.recall(m.number("<I")),
-    b"c": Machine.name,
-    b"\x93": Machine.name_of_top,
-    b"i": Machine.call_line,
-    b"o": Machine.call_above_mark,
-    b"R": Machine.call_top,
-    b"\x81": Machine.call_top,
-    b"\x92": Machine.call_with_keywords,
-    b"b": Machine.build,
-    b"\x80": Machine.check_protocol,
+    b"c": Unpickler.name,
+    b"\x93": Unpickler.name_of_top,
+    b"i": Unpickler.call_line,
+    b"o": Unpickler.call_above_mark,
+    b"R": Unpickler.call_top,
+    b"\x81": Unpickler.call_top,
+    b"\x92": Unpickler.call_with_keywords,
+    b"b": Unpickler.build,
+    b"\x80": Unpickler.check_protocol,
     b"\x95": lambda m: m.read(8),
 }
-"""What each instruction does, by its byte."""
+"""The action of each opcode."""

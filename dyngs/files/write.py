@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, pictures among them."""
+"""Atomic writing of files, text and pictures: a file appears complete or not at all."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from dyngs.files.temporary import temporary_beside
 
 @contextmanager
 def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """A temporary path beside ``path`` that takes its place when the block ends well, and vanishes otherwise.
+    """Yield a temporary path beside ``path``; it replaces ``path`` if the block succeeds and is removed otherwise.
 
-    The folder is made where it is missing; the temporary name keeps the suffix, by which writers choose the format.
+    The folder is created if missing; the temporary name keeps the suffix, by which writers choose the format.
 
     Args:
-        path: of the file.
-        durable: also wait until the disk has it, so that a power cut leaves the old file or the new one, never a name
-            without its data.
+        path: file to write.
+        durable: also wait until it is on disk, so that a power cut leaves the old file or the new one, complete.
 
     Raises:
         DyngsError: the folder cannot be made or the file cannot be written.
@@ -47,7 +46,7 @@ def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 
 def _flush(path: Path, flags: int) -> None:
-    """Wait until the disk has a file, or the names in a folder."""
+    """Wait until a file, or the names in a folder, are on disk."""
     opened = os.open(path, flags)
     try:
         os.fsync(opened)
@@ -87,7 +86,7 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
     with atomic_file(path) as temporary:
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:
-            picture_error(oiio)  # fetched, or it would be printed when the program ends
+            picture_error(oiio)  # must be fetched, or it is printed when the program ends
             raise DyngsError(f"cannot write {path}: no format has the suffix '{path.suffix}' (use .png or .exr)")
         written = output.open(str(temporary), spec) and output.write_image(np.ascontiguousarray(pixels))
         problem = picture_error(output)
@@ -96,7 +95,7 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
 
 
 def to_uint8(pixels: np.ndarray) -> np.ndarray:
-    """The same picture as uint8; floats in [0, 1] are rounded, NaN becomes 0."""
+    """Return the picture as uint8; floats in [0, 1] are rounded, NaN becomes 0."""
     if pixels.dtype == np.uint8:
         return pixels
     clean = np.nan_to_num(pixels.astype(np.float32), nan=0.0)

@@ -1,4 +1,4 @@
-"""What a set of cameras looks at."""
+"""Focus point of a set of cameras: the point that they look at."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def focus_point(world_from_cam: np.ndarray) -> np.ndarray | None:
-    """(3,) point nearest to all optical axes in the least-squares sense, or None where they are all but parallel.
+    """Return the (3,) point nearest to all optical axes (least squares), None where the axes are nearly parallel.
 
     It may lie behind the cameras; see ``share_in_front``.
 
@@ -24,6 +24,6 @@ def focus_point(world_from_cam: np.ndarray) -> np.ndarray | None:
 
 
 def share_in_front(world_from_cam: np.ndarray, point: np.ndarray) -> float:
-    """Share of the cameras (V, 4, 4) that have ``point`` (3,) before them."""
+    """Return the share in [0, 1] of the cameras (V, 4, 4) that have ``point`` (3,) in front of them."""
     depth = np.einsum("vi,vi->v", point - world_from_cam[:, :3, 3], world_from_cam[:, :3, 2])
     return float((depth > 0).mean())

@@ -1,4 +1,4 @@
-"""Pinhole matrices of stored pictures and how they follow the picture's size."""
+"""Pinhole camera matrices of stored pictures, and their scaling with the picture."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ import numpy as np
 from dyngs.errors import DyngsError
 
 MAX_SIDE = 2**20
-"""Pixels of a side of a picture; more is taken for a mistake."""
+"""Largest side of a picture in pixels; more is taken for a mistake."""
 FOCAL_RANGE = (1e-4, 1e6)
-"""Focal lengths in longer sides of the picture; others are taken for mistakes: 179.99 degrees, and 0.00006 degrees."""
+"""Plausible focal lengths, in units of the picture's longer side: fields of view from 0.00006 to 179.99 degrees."""
 
 
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """(3, 3) float64 camera matrix, pixels."""
+    """Return the (3, 3) float64 camera matrix, in pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def scaled_intrinsics(intrinsics: np.ndarray, scale_x: float, scale_y: float) -> np.ndarray:
-    """(3, 3) matrix for the picture stretched by the two factors; exact, as pixel centres lie at (0.5, 0.5)."""
+    """Return the (3, 3) matrix for the picture scaled by the two factors; exact, as pixel centres are at (0.5, 0.5)."""
     return np.diag([scale_x, scale_y, 1.0]) @ intrinsics
 
 
 def match_size(
     intrinsics: np.ndarray, described: tuple[int, int], stored: tuple[int, int] | None, where: str
 ) -> tuple[np.ndarray, tuple[int, int], bool]:
-    """The intrinsics for the picture as it is stored, its (width, height), and whether they had to be rescaled.
+    """Return the intrinsics for the stored picture, its (width, height), and whether they were rescaled.
 
     Args:
         intrinsics: (3, 3) for a picture of ``described`` (width, height).
@@ -33,8 +33,7 @@ def match_size(
         where: the picture, for messages.
 
     Raises:
-        DyngsError: the picture's aspect is another one, so that no rescaling is right; a focal length or a principal
-            point that no camera has.
+        DyngsError: another aspect ratio, so that no rescaling is right; an implausible focal length or principal point.
     """
     _check_plausible(intrinsics, described, where)
     if stored is None or stored == described:
@@ -65,7 +64,7 @@ def _check_plausible(intrinsics: np.ndarray, described: tuple[int, int], where: 
 
 
 def rescale_warning(where: list[str]) -> list[str]:
-    """One line on pictures whose intrinsics were rescaled, or nothing."""
+    """Return one line about the pictures whose intrinsics were rescaled, none if there are none."""
     if not where:
         return []
     return [f"{len(where)} pictures have another size than their intrinsics, which were rescaled; first {where[0]}"]

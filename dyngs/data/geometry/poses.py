@@ -1,4 +1,4 @@
-"""Camera poses: checked, repaired where harmless, converted to OpenCV ``cam_from_world``."""
+"""Camera poses: checks, repair of rounding errors, conversion between OpenGL and OpenCV axes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from dyngs.errors import DyngsError
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 LARGEST = 1e12
-"""Largest entry of a pose: farther out, doubles do not tell places apart well enough to bring them to the origin."""
+"""Largest entry of a pose: beyond it float64 is too coarse to recentre the scene."""
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of ``R^T R - I`` that is taken for rounding and repaired."""
 
 
 def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
-    """The rigid (4, 4) float64 transform nearest to ``matrix``, and how far from rigid it was.
+    """Return the rigid (4, 4) float64 transform nearest to ``matrix``, and its deviation from rigid.
 
     Args:
         matrix: (4, 4) or (3, 4), either direction and any axis convention.
@@ -39,7 +39,7 @@ def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
     determinant = np.linalg.det(rotation)
     error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     if error > ROTATION_TOLERANCE or determinant <= 0:
-        raise DyngsError(f"{where}: {_what_is_wrong(rotation, determinant, error)}")
+        raise DyngsError(f"{where}: {_rotation_fault(rotation, determinant, error)}")
     u, _, vt = np.linalg.svd(rotation)
     pose = np.eye(4)
     pose[:3, :3] = u @ vt
@@ -48,7 +48,7 @@ def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
 
 
 def matrix_fault(matrix: np.ndarray, where: str) -> str | None:
-    """One line on why ``matrix`` is no rigid pose, None where it is one; ``where`` leads the line."""
+    """Return one line, beginning with ``where``, on why ``matrix`` is no rigid pose; None where it is."""
     try:
         checked_pose(matrix, where)
     except DyngsError as error:
@@ -57,22 +57,22 @@ def matrix_fault(matrix: np.ndarray, where: str) -> str | None:
 
 
 def pose_fault(view: View) -> str | None:
-    """What keeps the view's pose from being a rotation and a translation, None if nothing does."""
+    """Return one line on why the view's pose is not rigid, None where it is."""
     return matrix_fault(view.cam_from_world, f"'{view.name}'")
 
 
 def cam_from_opengl(world_from_cam: np.ndarray) -> np.ndarray:
-    """(4, 4) OpenCV ``cam_from_world`` of a rigid OpenGL camera-to-world pose (x right, y up, z backward)."""
+    """Return the OpenCV ``cam_from_world`` of a rigid (4, 4) OpenGL camera-to-world pose: y up, z backward."""
     return inverse_rigid(world_from_cam @ OPENGL_FROM_OPENCV)
 
 
 def opengl_from_cam(cam_from_world: np.ndarray) -> np.ndarray:
-    """(4, 4) OpenGL camera-to-world pose of a rigid OpenCV ``cam_from_world``; the inverse of ``cam_from_opengl``."""
+    """Return the (4, 4) OpenGL camera-to-world pose of a rigid OpenCV ``cam_from_world``."""
     return inverse_rigid(cam_from_world) @ OPENGL_FROM_OPENCV
 
 
 def inverse_rigid(pose: np.ndarray) -> np.ndarray:
-    """(4, 4) inverse of a rigid transform."""
+    """Return the (4, 4) inverse of a rigid transform."""
     inverse = np.eye(4)
     inverse[:3, :3] = pose[:3, :3].T
     inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
@@ -80,15 +80,15 @@ def inverse_rigid(pose: np.ndarray) -> np.ndarray:
 
 
 def camera_center(cam_from_world: np.ndarray) -> np.ndarray:
-    """(3,) position of the camera in the world."""
+    """Return the (3,) position of the camera in the world."""
     return -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
 
 
 def repair_warning(errors: dict[str, float]) -> list[str]:
-    """One line on the poses that were visibly not orthonormal, or nothing.
+    """Return one line about the rotations that were not orthonormal, none if all were.
 
     Args:
-        errors: where each pose came from, to the deviation that ``checked_pose`` returned.
+        errors: origin of each pose to its deviation as ``checked_pose`` returned it.
     """
     off = {where: error for where, error in errors.items() if error > 1e-5}
     if not off:
@@ -97,7 +97,7 @@ def repair_warning(errors: dict[str, float]) -> list[str]:
     return [f"{len(off)} rotations were not orthonormal and were repaired, the worst by {off[worst]:.1e} ({worst})"]
 
 
-def _what_is_wrong(rotation: np.ndarray, determinant: float, error: float) -> str:
+def _rotation_fault(rotation: np.ndarray, determinant: float, error: float) -> str:
     if determinant < 0:
         return "the pose is mirrored (its determinant is negative); flip one axis when exporting"
     if determinant > 0:

@@ -1,4 +1,4 @@
-"""Move a far-away scene to its origin in float64, before anything is rounded to float32."""
+"""Recentre a scene that lies far from its origin, in float64, before anything is rounded to float32."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from dyngs.data.geometry.poses import camera_center
 MAX_DISTANCE = 1e5
 MAX_DISTANCE_PER_SPREAD = 1e4
 HARMLESS_DISTANCE = 1e3
-"""Nearer scenes stay where they are, however close together their cameras (a fixed camera has no spread at all)."""
+"""Nearer scenes are not moved, however small the spread of their cameras (that of one static camera is 0)."""
 
 
 def recenter(capture: Capture) -> Capture:
-    """The capture with its median camera at the origin if it lies far out, else the capture itself.
+    """Return the capture with its median camera at the origin if that is far away, else the capture itself.
 
     Far: the median camera centre is more than 1e5 units from the origin, or more than 1e4 times the cameras' spread
-    (median distance from that centre). ``world_offset`` of the result is what was subtracted, on top of what the
-    capture already carried.
+    (median distance from that centre). What is subtracted is added to ``world_offset``.
     """
     centers = np.array([camera_center(view.cam_from_world) for view in all_views(capture.splits)])
     median = np.median(centers, axis=0)
@@ -32,7 +31,7 @@ def recenter(capture: Capture) -> Capture:
 
 
 def shifted(capture: Capture, offset: np.ndarray) -> Capture:
-    """The capture with ``offset`` (3,) subtracted from all positions and added to ``world_offset``."""
+    """Return the capture with ``offset`` (3,) subtracted from all positions and added to ``world_offset``."""
     splits = {name: tuple(_shifted_view(view, offset) for view in views) for name, views in capture.splits.items()}
     points = capture.points and PointCloud(capture.points.xyz - offset, capture.points.rgb)
     body = capture.body and {name: moved(body, offset) for name, body in capture.body.items()}

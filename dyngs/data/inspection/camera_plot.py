@@ -1,4 +1,4 @@
-"""A picture of a capture's cameras and sparse points, to see at a glance whether the poses make sense."""
+"""Plot of a capture's cameras and sparse points, which shows whether the poses make sense."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from dyngs.data.geometry.poses import inverse_rigid, pose_fault
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 
-PAPER = np.array([24, 26, 30], np.uint8)
+BACKGROUND = np.array([24, 26, 30], np.uint8)
 SPLIT_COLORS = {"train": (255, 170, 60), "val": (120, 230, 120), "test": (80, 190, 255), "pose": (80, 190, 255)}
 
 
 def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
-    """Write a picture, 2 ``size`` x ``size``: the scene from above and from the side, orthographic.
+    """Write a picture of 2 ``size`` x ``size`` pixels: the scene from above and from the side, orthographic.
 
     Frusta of training cameras are orange, of validation green, of test and new poses blue; points have their colours.
-    Up is the cameras' mean up. Points far beyond the cameras are left out; views whose pose is not rigid too.
+    Up is the mean of the cameras' up axes. Points far beyond the cameras, and views without a rigid pose, are left out.
 
     Raises:
         DyngsError: no view has a usable pose, or the file cannot be written.
@@ -41,18 +41,18 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
     for title, horizontal, vertical in (("from above", 0, 1), ("from the side", 0, 2)):
         shown = [horizontal, vertical]
         middle = 0.5 * (low + high)[shown]
-        sheet = _Sheet(np.tile(PAPER, (size, size, 1)), axes[shown], middle, extent)
-        _draw_points(sheet, xyz, rgb)
+        panel = _Panel(np.tile(BACKGROUND, (size, size, 1)), axes[shown], middle, extent)
+        _draw_points(panel, xyz, rgb)
         for (split, view), pose in zip(usable, poses, strict=True):
-            _draw_frustum(sheet, view, pose, depth, SPLIT_COLORS[split])
-        _write_title(sheet.pixels, title)
-        panels.append(sheet.pixels)
+            _draw_frustum(panel, view, pose, depth, SPLIT_COLORS[split])
+        _write_title(panel.pixels, title)
+        panels.append(panel.pixels)
     write_image(out, np.concatenate(panels, axis=1))
 
 
 @dataclass(frozen=True)
-class _Sheet:
-    """A square drawing: ``pixels`` (S, S, 3) show ``extent`` units around ``center`` (2,) along ``axes`` (2, 3)."""
+class _Panel:
+    """One square of the plot: ``pixels`` (S, S, 3) show ``extent`` units around ``center`` (2,), axes (2, 3)."""
 
     pixels: np.ndarray
     axes: np.ndarray
@@ -60,7 +60,7 @@ class _Sheet:
     extent: float
 
     def place(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns (P,) int of world points (P, 3); they may lie outside the sheet."""
+        """Rows and columns (P,) int of world points (P, 3); they may lie outside the panel."""
         size = len(self.pixels)
         flat = (points @ self.axes.T - self.center) / self.extent + 0.5
         inside = np.clip(flat, -10.0, 10.0)
@@ -78,7 +78,7 @@ def _drawing_axes(poses: np.ndarray) -> np.ndarray:
 
 
 def _near_points(capture: Capture, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Some 20,000 points (P, 3) at most, and colours: those within four camera spreads, or the nearer half."""
+    """Up to about 20,000 points (P, 3) and colours: those within four camera spreads, or the nearer half."""
     if capture.points is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     xyz, rgb = capture.points.xyz, capture.points.rgb
@@ -93,14 +93,14 @@ def _near_points(capture: Capture, centers: np.ndarray) -> tuple[np.ndarray, np.
     return xyz[near], rgb[near]
 
 
-def _draw_points(sheet: _Sheet, xyz: np.ndarray, rgb: np.ndarray) -> None:
-    rows, columns = sheet.place(xyz)
-    size = len(sheet.pixels)
+def _draw_points(panel: _Panel, xyz: np.ndarray, rgb: np.ndarray) -> None:
+    rows, columns = panel.place(xyz)
+    size = len(panel.pixels)
     inside = (rows >= 0) & (rows < size) & (columns >= 0) & (columns < size)
-    sheet.pixels[rows[inside], columns[inside]] = np.maximum(rgb[inside], 60)
+    panel.pixels[rows[inside], columns[inside]] = np.maximum(rgb[inside], 60)
 
 
-def _draw_frustum(sheet: _Sheet, view: View, pose: np.ndarray, depth: float, color: tuple[int, int, int]) -> None:
+def _draw_frustum(panel: _Panel, view: View, pose: np.ndarray, depth: float, color: tuple[int, int, int]) -> None:
     """Lines from the camera's centre to the corners of its picture, and the picture's border, ``depth`` away."""
     from skimage.draw import line_aa
 
@@ -108,17 +108,17 @@ def _draw_frustum(sheet: _Sheet, view: View, pose: np.ndarray, depth: float, col
     rays = corners @ np.linalg.inv(view.intrinsics).T
     rays *= depth / np.linalg.norm(rays, axis=1, keepdims=True)
     tips = np.concatenate([np.zeros((1, 3)), rays]) @ pose[:3, :3].T + pose[:3, 3]
-    rows, columns = sheet.place(tips)
-    size = len(sheet.pixels)
+    rows, columns = panel.place(tips)
+    size = len(panel.pixels)
     for a, b in ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)):
         r, c, weight = line_aa(rows[a], columns[a], rows[b], columns[b])
         inside = (r >= 0) & (r < size) & (c >= 0) & (c < size)
         r, c, weight = r[inside], c[inside], 0.8 * weight[inside, None]
-        sheet.pixels[r, c] = ((1 - weight) * sheet.pixels[r, c] + weight * np.array(color)).astype(np.uint8)
+        panel.pixels[r, c] = ((1 - weight) * panel.pixels[r, c] + weight * np.array(color)).astype(np.uint8)
 
 
 def _write_title(pixels: np.ndarray, text: str) -> None:
-    """Write ``text`` at the upper left in place; nothing where no font is installed."""
+    """Draw ``text`` at the upper left, in place; nothing where no font is installed."""
     import OpenImageIO as oiio
 
     canvas = oiio.ImageBuf(np.ascontiguousarray(pixels))

@@ -1,1 +1,1 @@
-"""Pictures and videos: decoding, lens distortion, the cache of video frames."""
+"""Pictures and videos: decoding, lens undistortion, silhouettes, the cache of video frames."""

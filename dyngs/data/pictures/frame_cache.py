@@ -1,8 +1,8 @@
-"""Frames of videos as picture files in the user's cache: decoded once, within a disk limit, found again by content.
+"""Cache of video frames as picture files: decoded once, within a disk limit, found again by the video's content.
 
 The frames of a video lie in ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json`` beside them holds
-what the video says about itself and marks the folder as ours. Nothing is ever written to a capture, and nothing is
-removed but files that are named like ours in folders with that mark, never through a link.
+the video's size and frame rate and marks the folder as ours. Nothing is ever written to a capture. Only files named
+like ours in folders with that mark are removed, never through a link.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ except ImportError:  # Windows, where a folder with an open file in it cannot be
 
 CACHE_VARIABLE = "DYNGS_CACHE_DIR"
 WHOLE_BYTES = 2**30
-"""Of larger videos only samples, and the time of change, decide whether they are the same."""
+"""Larger videos are compared by samples and modification time only."""
 _MARK_NAME = "video.json"
 _MARK = "frames that dyngs decoded from a video; the folder may be removed"
 _NUM_SAMPLES, _SAMPLE_BYTES = 256, 2**20
 _OUR_FILES = re.compile(r"\.?(frame_\d{6,}|video)(\.\d+-[0-9a-f]{6}\.dyngs)?\.(png|json)")
-_MAX_HELD = 256
-_held: dict[Path, BinaryIO] = {}
-"""Marks that this process keeps open and locked, so that no other one removes frames that it reads."""
+_MAX_LOCKED = 256
+_locked: dict[Path, BinaryIO] = {}
+"""Marks that this process keeps open and locked, so that no other process removes frames that it reads."""
 
 
 @dataclass(frozen=True)
 class VideoFrames:
-    """Where the frames of a video lie or will lie.
+    """Frames of a video in the cache, decoded or not.
 
     Attributes:
-        info: what the video says about itself.
+        info: size, length and frame rate of the video.
         source: the video.
-        paths: one picture file per frame, in order; ``decode_frames`` makes those that are missing.
+        paths: one picture file per frame, in order; ``decode_frames`` writes those that are missing.
     """
 
     info: VideoInfo
@@ -60,7 +60,7 @@ class VideoFrames:
 
 
 def cache_folder() -> Path:
-    """The folder of frames: in ``$DYNGS_CACHE_DIR``, else where this system keeps what can be made again."""
+    """Return the folder of cached frames: in ``$DYNGS_CACHE_DIR``, else in the system's cache folder of the user."""
     chosen = os.environ.get(CACHE_VARIABLE, "")
     if chosen:
         return Path(chosen).expanduser().absolute() / "frames"
@@ -70,7 +70,7 @@ def cache_folder() -> Path:
 
 
 def planned_frames(video: Path) -> VideoFrames:
-    """The frames of ``video``; nothing is written.
+    """Return the frames of ``video`` and where they are cached; nothing is written.
 
     Raises:
         DyngsError: the video cannot be opened.
@@ -90,22 +90,22 @@ def planned_frames(video: Path) -> VideoFrames:
 
 
 def decode_frames(root: Path, frames: Mapping[Path, VideoFrame], limit_mb: float) -> None:
-    """Decode those of ``frames`` whose picture is missing; each file appears whole.
+    """Decode the frames whose picture is missing; every file is written atomically.
 
-    The need is estimated from the frames written so far, from the first one on, so that too much is refused early.
-    What was decoded for other captures and not used for longest makes room, unless a running process uses it.
+    The total size is estimated from the frames written so far, from the first on, so that too much is refused early.
+    The least recently used frames of other captures are removed to make room, unless a running process uses them.
 
     Args:
         root: the capture, for messages.
         frames: picture file, as ``planned_frames`` named it, to the frame of a video that it holds.
-        limit_mb: all frames in the cache together may take so many 1e6 bytes on disk.
+        limit_mb: 1e6 bytes on disk that all cached frames together may take.
 
     Raises:
         DyngsError: a damaged video (names it and the frame), more than the limit or than the disk has (says how much).
     """
     wanted = {path.parent: frame.video for path, frame in frames.items()}
     for folder in wanted:
-        _hold(folder)
+        _lock(folder)
     missing: dict[Path, list[int]] = {}
     for path in sorted(frames):
         if not path.is_file():
@@ -113,18 +113,18 @@ def decode_frames(root: Path, frames: Mapping[Path, VideoFrame], limit_mb: float
     if not missing:
         return
     need, count, written = sum(map(len, missing.values())), 0, 0
-    room = _Room(root, frozenset(wanted), limit_mb)
+    space = _DiskSpace(root, frozenset(wanted), limit_mb)
     for folder, numbers in missing.items():
         _make(folder, wanted[folder])
         for number, rgb in read_numbered_frames(wanted[folder], numbers):
             path = folder / f"frame_{number:06d}.png"
             _write_png(path, rgb)
             count, written = count + 1, written + path.stat().st_size
-            room.check(written, written * need / count)
+            space.check(written, written * need / count)
 
 
 def _make(folder: Path, video: Path) -> None:
-    """Make the folder with its mark, before anything else is in it."""
+    """Create the folder with its mark before anything else is in it."""
     if not _stored_info(folder):
         text = json.dumps({"what": _MARK, **asdict(probe_video(video))})
         try:
@@ -136,7 +136,7 @@ def _make(folder: Path, video: Path) -> None:
                 f"{folder}: the frames of a video cannot be kept there ({error}); set {CACHE_VARIABLE} to a folder "
                 "that can be written"
             ) from error
-    _hold(folder)
+    _lock(folder)
 
 
 def _write_png(path: Path, rgb: np.ndarray) -> None:
@@ -155,9 +155,9 @@ def _write_png(path: Path, rgb: np.ndarray) -> None:
 
 @lru_cache(maxsize=4096)
 def _digest(video: Path, size: int, changed_ns: int) -> bytes:
-    """SHA-256 of size and bytes; of huge files, whose bytes take long to read, of samples and the time of change.
+    """SHA-256 of size and bytes; for huge files of size, samples and modification time.
 
-    The time is in it because a copy that was cut off and then completed may agree in all samples.
+    The time is included because a copy that was cut off and then completed may agree in all samples.
     """
     digest = hashlib.sha256(str(size).encode())
     with video.open("rb") as file:
@@ -173,7 +173,7 @@ def _digest(video: Path, size: int, changed_ns: int) -> bytes:
 
 
 def _stored_info(folder: Path) -> VideoInfo | None:
-    """What the mark of ``folder`` says, None where it has none of ours."""
+    """Return what the mark of ``folder`` says about the video, None without a mark of ours."""
     mark = folder / _MARK_NAME
     if folder.is_symlink() or mark.is_symlink():
         return None
@@ -185,25 +185,25 @@ def _stored_info(folder: Path) -> VideoInfo | None:
         return None
 
 
-def _hold(folder: Path) -> None:
-    """Keep the folder, if it is there, from being removed by other processes while this one lives; it is used now."""
+def _lock(folder: Path) -> None:
+    """Protect the folder, if it exists, from removal by other processes while this one lives, and note its use."""
     mark = folder / _MARK_NAME
     if _stored_info(folder) is None:
         return
     try:
         os.utime(mark)
-        if folder in _held and os.path.samestat(os.fstat(_held[folder].fileno()), mark.stat()):
+        if folder in _locked and os.path.samestat(os.fstat(_locked[folder].fileno()), mark.stat()):
             return
-        if len(_held) < _MAX_HELD:
-            _held[folder] = mark.open("rb")
+        if len(_locked) < _MAX_LOCKED:
+            _locked[folder] = mark.open("rb")
             if fcntl is not None:
-                fcntl.flock(_held[folder], fcntl.LOCK_SH | fcntl.LOCK_NB)
+                fcntl.flock(_locked[folder], fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:
-        pass  # a cache that can only be read, or another process that is removing: what lacks then is decoded again
+        pass  # a read-only cache, or another process is removing it: what is missing then is decoded again
 
 
-class _Room:
-    """The room for the frames of one capture, made by removing those of others as the need turns out."""
+class _DiskSpace:
+    """Disk space for the frames of one capture; frames of others are removed as needed."""
 
     def __init__(self, root: Path, kept: frozenset[Path], limit_mb: float) -> None:
         self._root, self._kept, self._limit_mb = root, kept, limit_mb
@@ -211,7 +211,7 @@ class _Room:
         self._elsewhere = sum(_num_bytes(folder) for folder in _our_folders() if folder not in kept)
 
     def check(self, now: int, end: float) -> None:
-        """Make room for ``end`` bytes, of which ``now`` are written already.
+        """Free space for ``end`` bytes, of which ``now`` are written already.
 
         Raises:
             DyngsError: it is more than the limit, or than other processes or the disk leave.
@@ -240,11 +240,11 @@ class _Room:
 
 
 def _removed(kept: frozenset[Path], too_much: float) -> int:
-    """Remove what was not used for longest, but for ``kept``, until ``too_much`` bytes are gone; how many are."""
+    """Remove the least recently used frames, except in ``kept``, until ``too_much`` bytes are freed; return these."""
     gone = 0
     if too_much <= 0:
         return gone
-    others = [folder for folder in _our_folders() if folder not in kept and folder not in _held]
+    others = [folder for folder in _our_folders() if folder not in kept and folder not in _locked]
     for folder in sorted(others, key=lambda folder: (folder / _MARK_NAME).stat().st_mtime_ns):
         if gone >= too_much:
             break
@@ -253,13 +253,13 @@ def _removed(kept: frozenset[Path], too_much: float) -> int:
 
 
 def _our_folders() -> list[Path]:
-    """Folders of the cache that are no links and carry our mark."""
+    """Folders of the cache that carry our mark and are no links."""
     cache = cache_folder()
     return [folder for folder in cache.iterdir() if _stored_info(folder)] if cache.is_dir() else []
 
 
 def _remove(folder: Path) -> int:
-    """Remove our files from a folder, and the folder where nothing else is in it; the bytes of what went."""
+    """Remove our files from a folder, and the folder if nothing else is in it; return the bytes freed."""
     freed = 0
     try:
         if fcntl is None:
@@ -280,7 +280,7 @@ def _remove(folder: Path) -> int:
 
 
 def _own_files(folder: Path) -> Iterator[Path]:
-    """Regular files of a folder that are named like ours."""
+    """Yield the regular files of a folder that are named like ours."""
     with os.scandir(folder) as entries:
         for found in entries:
             if found.is_file(follow_symlinks=False) and _OUR_FILES.fullmatch(found.name):

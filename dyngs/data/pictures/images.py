@@ -1,4 +1,4 @@
-"""Picture files: size without decoding, decoding to 8-bit straight-alpha sRGB, exact area downscaling."""
+"""Picture files: headers, decoding to 8-bit sRGB with straight alpha, exact area downscaling."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _END_MARKERS = {".png": _PNG_END, ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 @dataclass(frozen=True)
 class PictureHeader:
-    """What a file says about its picture before it is decoded.
+    """Header of a picture file.
 
     Attributes:
         width, height: pixels.
-        channels: stored channels.
-        has_alpha: one of them is alpha.
+        channels: number of stored channels.
+        has_alpha: whether one of them is alpha.
     """
 
     width: int
@@ -42,7 +42,7 @@ class PictureHeader:
 
 
 def read_header(path: Path) -> PictureHeader:
-    """Size and channels of the picture, without decoding it.
+    """Read size and channels of a picture without decoding it.
 
     Raises:
         DyngsError: the file is missing or is no picture.
@@ -55,7 +55,7 @@ def read_header(path: Path) -> PictureHeader:
 
 
 def header_if_readable(path: Path) -> PictureHeader | None:
-    """Size and channels of a capture's picture; None where it is missing or damaged, which the loader reports.
+    """Read the header of a capture's picture; None where it is missing or damaged, which the loader reports.
 
     Raises:
         DyngsError: the picture lies outside the capture, or is larger than ``data.max_megapixels``.
@@ -70,9 +70,9 @@ def header_if_readable(path: Path) -> PictureHeader | None:
 
 
 def read_picture(path: Path) -> Tensor:
-    """(H, W, 3) or, with alpha, (H, W, 4) uint8 picture: sRGB, straight alpha.
+    """Read a picture as (H, W, 3) or, with alpha, (H, W, 4) uint8: sRGB, straight alpha.
 
-    8-bit files come out bit for bit. 16-bit ones are rounded. Floating-point files (EXR) are linear with premultiplied
+    8-bit files are returned bit for bit, 16-bit ones rounded. Floating-point files (EXR) are linear with premultiplied
     alpha: they are clamped to [0, 1] and encoded as sRGB. Grey becomes RGB.
 
     Raises:
@@ -113,7 +113,7 @@ def _decoded(path: Path) -> Tensor:
 
 
 def read_mask(path: Path) -> Tensor:
-    """(H, W) bool mask, true = keep: the mean of the colour channels is at least one half.
+    """Read a mask as (H, W) bool, true = keep: the mean of the colour channels is at least one half.
 
     Raises:
         DyngsError: as ``read_picture``.
@@ -122,7 +122,7 @@ def read_mask(path: Path) -> Tensor:
 
 
 def check_picture(path: Path) -> PictureHeader:
-    """Header of a picture that is very likely complete; a JPEG without its end marker is decoded to find out.
+    """Read the header and check that the file is very likely complete; a JPEG without end marker is decoded for that.
 
     Raises:
         DyngsError: the file is missing, truncated or no picture.
@@ -134,7 +134,7 @@ def check_picture(path: Path) -> PictureHeader:
         with _reading(path), path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
             complete = marker in file.read()
-        if not complete and marker == _PNG_END:  # not decoded: libpng would add lines of its own to the error
+        if not complete and marker == _PNG_END:  # not decoded: libpng would print lines of its own
             raise DyngsError(f"{path}: the picture is truncated or damaged (its end is missing); copy it again")
         if not complete:
             read_picture(path)
@@ -142,7 +142,7 @@ def check_picture(path: Path) -> PictureHeader:
 
 
 def target_size(width: int, height: int, downscale: float = 1.0, longest_side: int | None = None) -> tuple[int, int]:
-    """(width, height) after dividing by ``downscale`` and shrinking to at most ``longest_side``; never enlarged."""
+    """Return (width, height) divided by ``downscale`` and shrunk to at most ``longest_side``; never enlarged."""
     factor = max(1.0, downscale)
     if longest_side is not None:
         factor = max(factor, max(width, height) / longest_side)
@@ -150,15 +150,15 @@ def target_size(width: int, height: int, downscale: float = 1.0, longest_side: i
 
 
 def area_downscale(pixels: Tensor, width: int, height: int) -> Tensor:
-    """(height, width, D) picture, each pixel the exact mean of the rectangle of ``pixels`` (H, W, D) that it covers.
+    """Return a (height, width, D) picture; each pixel is the exact mean of the area of ``pixels`` (H, W, D) it covers.
 
-    Floating point; colours must be premultiplied. Non-integer factors weigh the border pixels by their covered share.
+    Floating point; colours must be premultiplied. Non-integer factors weight border pixels by the covered share.
     """
     return _shrink_axis(_shrink_axis(pixels, 0, height), 1, width)
 
 
 def premultiplied(pixels: Tensor) -> Tensor:
-    """(H, W, 3 or 4) float32 in [0, 1] with the colours multiplied by alpha, from uint8 straight alpha."""
+    """Return (H, W, 3 or 4) float32 in [0, 1] with colours multiplied by alpha, from uint8 straight alpha."""
     scaled = pixels.float() / 255
     if scaled.shape[-1] == 4:
         scaled[..., :3] *= scaled[..., 3:]
@@ -166,7 +166,7 @@ def premultiplied(pixels: Tensor) -> Tensor:
 
 
 def straight_uint8(pixels: Tensor) -> Tensor:
-    """(H, W, 3 or 4) uint8 with straight alpha, from premultiplied float; the inverse of ``premultiplied``."""
+    """Return (H, W, 3 or 4) uint8 with straight alpha from premultiplied floats; inverse of ``premultiplied``."""
     if pixels.shape[-1] == 4:
         alpha = pixels[..., 3:].clamp(0, 1)
         rgb = torch.where(alpha > 0, pixels[..., :3] / alpha.clamp(min=1e-6), 0)
@@ -179,7 +179,7 @@ def _open(path: Path) -> OpenImageIO.ImageInput:
 
     if not path.is_file():
         raise DyngsError(f"{path}: no such picture; restore it or remove it from the capture")
-    # Some of its readers allocate the picture when they open the file.
+    # Some readers of OpenImageIO allocate the picture when they open the file.
     oiio.attribute("limits:imagesize_MB", max_decoded_mb())
     config = oiio.ImageSpec()
     config["oiio:UnassociatedAlpha"] = 1

@@ -1,4 +1,4 @@
-"""Lens distortion removed by resampling: from the stored picture to a pinhole one with the same camera matrix."""
+"""Lens undistortion by resampling: from the stored picture to a pinhole picture with the same camera matrix."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ROWS_PER_CHUNK = 256
 
 @dataclass(frozen=True)
 class LensMap:
-    """Where each pixel of the pinhole picture is found in the stored one.
+    """Positions of the pinhole picture's pixels in the stored, distorted picture; on the CPU.
 
     Attributes:
         grid: (H, W, 2) float32 positions (x, y) in [-1, 1] from outer edge to outer edge of the stored picture.
@@ -32,7 +32,7 @@ def is_pinhole(lens: Lens) -> bool:
 
 
 def distort(lens: Lens, points: Tensor) -> Tensor:
-    """(..., 2) positions at which the lens images ``points``, both on the plane z = 1.
+    """Return the (..., 2) distorted positions of ``points`` (..., 2), both on the plane z = 1.
 
     "opencv": Brown-Conrady, ``x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)`` plus the tangential
     terms. "fisheye": ``theta (1 + k1 theta^2 + .. + k4 theta^8)`` along the direction of the point, theta = atan(r).
@@ -49,10 +49,13 @@ def distort(lens: Lens, points: Tensor) -> Tensor:
 
 
 def undistort_map(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> LensMap:
-    """The resampling map of a picture of that size; the pinhole picture has the same size and ``intrinsics`` (3, 3).
+    """Return the map that undistorts pictures of this size; the pinhole picture has the same size and intrinsics.
 
-    Computed in float64. Where the polynomial of the lens turns back (far outside its field of view) nothing is valid:
+    Computed in float64. Where the distortion is no longer monotonic (far outside the field of view), nothing is valid:
     otherwise the inside of the picture would appear there a second time.
+
+    Args:
+        intrinsics: (3, 3) camera matrix in pixels.
     """
     fx, fy, cx, cy = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     center, focal, size = torch.tensor([(cx, cy), (fx, fy), (width, height)], dtype=torch.float64, device="cpu")
@@ -72,7 +75,7 @@ def undistort_map(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -
 
 
 def undistort(pixels: Tensor, lens_map: LensMap) -> Tensor:
-    """(H, W, D) float pinhole picture in [0, 1], bicubic; zero where ``lens_map`` is not valid.
+    """Return the (H, W, D) float pinhole picture in [0, 1], bicubic; zero where ``lens_map`` is not valid.
 
     Args:
         pixels: (H, W, D) float in [0, 1], colours premultiplied.
@@ -84,7 +87,7 @@ def undistort(pixels: Tensor, lens_map: LensMap) -> Tensor:
 
 
 def _padded(params: tuple[float, ...]) -> tuple[float, ...]:
-    """The coefficients padded with zeros to a length that OpenCV's order knows (4, 5 or 8)."""
+    """Pad the coefficients with zeros to 4, 5 or 8, as OpenCV orders them."""
     size = next(n for n in (4, 5, 8) if n >= len(params))
     return params + (0.0,) * (size - len(params))
 
@@ -103,7 +106,7 @@ def _fisheye_radius(lens: Lens, angle: Tensor) -> Tensor:
 
 
 def _radius_limit(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> float:
-    """Radius on z = 1 up to which the distorted radius grows, looked for within the picture's corners."""
+    """Radius on z = 1 up to which the distortion is monotonic, searched up to the picture's corners."""
     corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], dtype=np.float64)
     corners = (corners - intrinsics[:2, 2]) / np.diag(intrinsics)[:2]
     farthest = float(np.linalg.norm(corners, axis=1).max())

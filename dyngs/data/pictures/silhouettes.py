@@ -12,16 +12,16 @@ from dyngs.errors import DyngsError
 from dyngs.files.hdf5 import read_hdf5
 
 MASKS = "masks"
-"""Name of the data set of silhouettes in an HDF5 file."""
+"""Name of the data set of masks in an HDF5 file."""
 
 
 def cut_out(pixels: Tensor, silhouette: Silhouette) -> Tensor:
-    """(H, W, 4) uint8 straight-alpha picture of the person alone, from a picture (H, W, 3 or 4) uint8.
+    """Return the (H, W, 4) uint8 picture of the person alone, straight alpha, from ``pixels`` (H, W, 3 or 4) uint8.
 
     Raises:
         DyngsError: the silhouette is missing, damaged or of another size.
     """
-    alpha = _levels(silhouette)
+    alpha = _read_alpha(silhouette)
     if alpha.shape != pixels.shape[:2]:
         raise DyngsError(
             f"{silhouette.path}: the mask is {alpha.shape[1]}x{alpha.shape[0]} but its picture is {pixels.shape[1]}x"
@@ -32,8 +32,8 @@ def cut_out(pixels: Tensor, silhouette: Silhouette) -> Tensor:
     return torch.cat([pixels[..., :3], alpha[..., None]], dim=-1)
 
 
-def _levels(silhouette: Silhouette) -> Tensor:
-    """(H, W) uint8, 255 where the person is."""
+def _read_alpha(silhouette: Silhouette) -> Tensor:
+    """Read the silhouette as (H, W) uint8 alpha, 255 where the person is."""
     if silhouette.row is None:
         levels = read_picture(silhouette.path)[..., :3]
         levels = levels.amax(-1) if silhouette.person == "nonzero" else levels.float().mean(-1).round().to(torch.uint8)

@@ -1,4 +1,4 @@
-"""Pictures out of video files, through PyAV."""
+"""Decoding of video files, through PyAV."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 MAX_FRAMES = 1_000_000
-"""Of one video: ten hours."""
+"""Limit on the frames of one video: ten hours."""
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,m4v,flv,ogg,asf,dv,mxf,h264,hevc"
 """FFmpeg's names for files that hold pictures themselves, whatever their suffix says."""
 
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video file says about itself.
+    """Size, length and frame rate of a video.
 
     Attributes:
         width, height: pixels of a picture, turned as the rotation tag says.
@@ -42,7 +42,7 @@ class VideoInfo:
 
 
 def read_frames(path: Path) -> Iterator[np.ndarray]:
-    """The pictures of a video file in order, (H, W, 3) uint8, turned as its rotation tag says.
+    """Yield the frames of a video in order, (H, W, 3) uint8, rotated as its rotation tag says.
 
     Raises:
         DyngsError: no such file, no video in it, or damage (at the damaged place).
@@ -52,7 +52,7 @@ def read_frames(path: Path) -> Iterator[np.ndarray]:
 
 
 def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
-    """The pictures of these ``numbers`` (0 is the first of the file) in rising order, as ``read_frames`` gives them.
+    """Yield the frames of these ``numbers``, counted from 0, in ascending order, as ``read_frames`` does.
 
     One picture is in memory at a time. Nothing behind the last wanted one is decoded; unwanted ones before it are (each
     picture builds on others), but not converted.
@@ -77,7 +77,7 @@ def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple
 
 
 def probe_video(path: Path) -> VideoInfo:
-    """Size, length and rate of a video file; the first picture is decoded, and the packets are counted.
+    """Read size, length and frame rate of a video; the first frame is decoded, and the packets are counted.
 
     Raises:
         DyngsError: no such file, no video in it, or damage at its beginning.
@@ -105,7 +105,7 @@ def probe_video(path: Path) -> VideoInfo:
 
 
 def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterator[tuple[int, av.VideoFrame]]:
-    """Number and frame, in order; damage ends it with an error that names the number reached.
+    """Yield number and frame, in order; damage is an error that names the frame.
 
     With "AUTO", which is faster, several frames are decoded at once, and damage takes those before it along.
     """
@@ -132,7 +132,7 @@ def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterato
 
 @contextmanager
 def _opened(path: Path) -> Iterator[InputContainer]:
-    """The file, which must be of a kind that holds pictures itself: playlists, which name other files, are refused.
+    """Open the file, which must contain the video itself: playlists, which name other files, are refused.
 
     Raises:
         DyngsError: no video in it, or one larger than ``data.max_megapixels``.

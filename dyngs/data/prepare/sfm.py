@@ -27,7 +27,7 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 
 @dataclass(frozen=True)
 class SfmOptions:
-    """How poses are estimated.
+    """Options of pose estimation.
 
     Attributes:
         camera_model: COLMAP's name of the lens model to fit.
@@ -61,7 +61,7 @@ class SfmOptions:
 
 @dataclass(frozen=True)
 class SfmResult:
-    """What was estimated.
+    """Result of pose estimation.
 
     Attributes:
         root: the capture folder in COLMAP's layout, to be trained on.
@@ -80,7 +80,7 @@ class SfmResult:
     mean_error_px: float
 
     def summary(self) -> str:
-        """One or two lines for people."""
+        """The result as one or two lines of text."""
         line = (
             f"{self.num_registered} of {self.num_images} pictures registered, {self.num_points} points, "
             f"mean error {self.mean_error_px:.2f} px: {self.root}"
@@ -92,7 +92,7 @@ class SfmResult:
 
 
 def estimate_poses(source: Path, out: Path, options: SfmOptions = SfmOptions()) -> SfmResult:
-    """Poses of the pictures in ``source``, written as a COLMAP capture (``out/images``, ``out/sparse/0``).
+    """Estimate poses of the pictures in ``source`` and write a COLMAP capture (``out/images``, ``out/sparse/0``).
 
     All work is done in a folder beside ``out`` which is renamed at the end, so ``out`` is whole or absent. SIFT
     features, matches, incremental mapping; of several models the one with most pictures is kept.
@@ -125,7 +125,7 @@ def estimate_poses(source: Path, out: Path, options: SfmOptions = SfmOptions()) 
 
 
 def _posed_in(work: Path, source: Path, options: SfmOptions, out: Path) -> SfmResult:
-    """What will be at ``out``, in ``work``."""
+    """Write the capture for ``out`` in the folder ``work`` and return the result."""
     images, is_video = work / "images", source.is_file()
     names = _extract_frames(source, images, options) if is_video else _gather_photos(source, images, out)
     if len(names) < 3:
@@ -134,7 +134,7 @@ def _posed_in(work: Path, source: Path, options: SfmOptions, out: Path) -> SfmRe
 
 
 def _run_colmap(work: Path, names: list[str], is_video: bool, options: SfmOptions, out: Path) -> SfmResult:
-    """Features, matches and mapping in ``work``; writes ``work/sparse/0`` and returns what will be at ``out``."""
+    """Extract features, match and map in ``work``; write ``work/sparse/0`` and return the result."""
     import pycolmap
 
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
@@ -222,7 +222,7 @@ def _mapping_options(options: SfmOptions) -> pycolmap.IncrementalPipelineOptions
 
 
 def _gather_photos(source: Path, images: Path, out: Path) -> list[str]:
-    """Copies (hard links where possible) of all photos below ``source``; their names below ``images``, sorted."""
+    """Copy (hard-link where possible) all photos below ``source``; return their names below ``images``, sorted."""
     result = out.resolve()
     photos = sorted(
         path for path in source.rglob("*")
@@ -261,7 +261,7 @@ def _extract_frames(video: Path, images: Path, options: SfmOptions) -> list[str]
 
 
 def _same_camera(photos: list[Path]) -> bool:
-    """Whether all photos agree in size and in what EXIF says of camera and focal length."""
+    """Whether all photos have the same size, and the same camera and focal length in their EXIF tags."""
     import OpenImageIO as oiio
 
     kinds = set()

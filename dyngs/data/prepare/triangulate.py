@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     import pycolmap
 
 MIN_PICTURES = 3
-"""Two agree by accident too often."""
+"""Pictures that must see a point; two agree by accident too often."""
 MIN_POINTS = 30
-"""Fewer say less of a scene than random ones."""
+"""With fewer points random ones are the better start."""
 LONGEST_SIDE = 1000
 MAX_FEATURES = 2048
 """SIFT features per picture."""
@@ -33,7 +33,7 @@ GREY = 0.5
 
 
 def views_of_a_moment(views: Sequence[View], limit: int) -> list[View]:
-    """At most ``limit`` of ``views``, evenly chosen, of one moment: that which most show, of several the middle one.
+    """Return at most ``limit`` views of one moment, evenly spaced; of the moments with most views, the middle one.
 
     Without times all views show the same moment.
     """
@@ -45,7 +45,7 @@ def views_of_a_moment(views: Sequence[View], limit: int) -> list[View]:
 
 
 def triangulated_points(views: Sequence[View], options: DataConfig) -> PointCloud | None:
-    """Points that several of the views see, in order of their coordinates; None where there are hardly any.
+    """Return points that several views see, in order of their coordinates; None where there are hardly any.
 
     SIFT features in pictures of at most ``LONGEST_SIDE`` px, matched between all pairs, triangulated from the given
     poses. One thread, so that the same pictures give the same points.
@@ -100,7 +100,7 @@ def _triangulated(folder: Path, pictures: Sequence[Picture]) -> PointCloud | Non
 
 
 def _find_and_match(database: Path, images: Path, names: list[str]) -> None:
-    """Features of all pictures and matches of all pairs, into ``database``."""
+    """Write features of all pictures and matches of all pairs to ``database``."""
     import pycolmap
 
     extraction = pycolmap.FeatureExtractionOptions()
@@ -120,7 +120,7 @@ def _find_and_match(database: Path, images: Path, names: list[str]) -> None:
 
 
 def _posed(path: Path, pictures: dict[str, Picture]) -> pycolmap.Reconstruction:
-    """A model without points, in which every picture of the database has its camera and its pose."""
+    """Return a model without points in which every picture of the database has its camera and pose."""
     import pycolmap
 
     model = pycolmap.Reconstruction()

@@ -15,7 +15,7 @@ def is_blender(root: Path) -> bool:
 
 
 def read_blender(root: Path) -> Capture:
-    """The capture of ``transforms_{train,val,test}.json``, with OpenGL camera-to-world poses; val and test may lack.
+    """Read ``transforms_{train,val,test}.json`` with OpenGL camera-to-world poses; val and test are optional.
 
     Intrinsics: ``camera_angle_x``, or ``w, h, fl_x, fl_y, cx, cy`` of the file or the frame.
 

@@ -23,12 +23,12 @@ def is_body_json(root: Path) -> bool:
 
 
 def read_body_json(root: Path) -> Capture:
-    """The capture of ``transforms_{train,val,test,pose}.json``; all but the first may lack.
+    """Read ``transforms_{train,val,test,pose}.json`` with body parameters; all but the first file are optional.
 
     Each split has the parameters of its ``body_SPLIT.npz``: poses (T, 72, 156 or 165), trans (T, 3), betas and, if
     there, scale; row n is for the frame whose ``frame`` is n. Without such a file, val and test show the frames of
     train. ``pose`` is another clip, with frame numbers, times and parameters of its own. Parameters and cameras share
-    one world (unlike in AMASS files nothing is turned to make it y up).
+    one world; unlike with AMASS files nothing is rotated to make it y up.
 
     Raises:
         DyngsError: missing or bad parameters, and see ``dyngs.data.readers.shared.transforms.read_views``.

@@ -1,4 +1,4 @@
-"""Reader for videos from several cameras at rest: a folder or a video file per camera, and ``cameras.json``."""
+"""Reader for sequences of several static cameras: a folder or a video file per camera, and ``cameras.json``."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def is_camera_folders(root: Path) -> bool:
 
 
 def read_camera_folders(root: Path) -> Capture:
-    """The capture of ``cameras.json`` and the folders or videos named like the cameras in it.
+    """Read ``cameras.json`` and the folders or videos named like its cameras.
 
     The file holds ``{"cameras": {NAME: {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", .., "transform_matrix" (OpenGL
     camera-to-world) or "cam_from_world" (OpenCV)}}, "fps": .., "test": [NAME, ..]}``. Without ``test`` the first camera
@@ -82,7 +82,7 @@ def _read_calibration(path: Path) -> _CalibrationFile:
 
 
 def _calibration(value: object, where: str) -> dict[str, object]:
-    """The fields of a frame, with the pose as ``transform_matrix``."""
+    """Return the fields of a frame in a transforms file, with the pose as ``transform_matrix``."""
     if not isinstance(value, dict):
         raise DyngsError(f"{where}: must be an object with fl_x and transform_matrix or cam_from_world")
     own = {str(key): field for key, field in value.items()}
@@ -99,7 +99,7 @@ def _calibration(value: object, where: str) -> dict[str, object]:
 
 
 def _splits(path: Path, test: object, views: dict[str, tuple[View, ...]]) -> tuple[Splits, list[str]]:
-    """Test cameras by ``test``, else the first one if there are enough; no test split if there are not."""
+    """Hold out the cameras that ``test`` lists, else the first one if there are enough; return splits and warnings."""
     notes = []
     if test is None:
         if len(views) < MIN_CAMERAS_TO_HOLD_OUT:

@@ -39,7 +39,7 @@ _LENSES: dict[str, tuple[int, Literal["none", "opencv", "fisheye"]]] = {
 
 
 def find_model(root: Path) -> Path | None:
-    """The folder below ``root`` that holds ``cameras.bin`` or ``cameras.txt``, or None."""
+    """Return the folder below ``root`` that holds ``cameras.bin`` or ``cameras.txt``, or None."""
     for name in MODEL_FOLDERS:
         if any((root / name / f"cameras{extension}").is_file() for extension in _EXTENSIONS):
             return root / name
@@ -52,13 +52,13 @@ def is_colmap(root: Path) -> bool:
 
 
 def read_colmap(root: Path) -> Capture:
-    """The capture of a COLMAP model with pictures below ``images/`` and, if there, masks below ``masks/``.
+    """Read a COLMAP model with pictures below ``images/`` and, if there are any, masks below ``masks/``.
 
     All registered images become training views; distorted camera models are kept as ``View.lens``.
 
     Raises:
         DyngsError: incomplete or inconsistent model files, no ``images`` folder, an unsupported camera model, pictures
-            whose aspect is not their camera's.
+            whose aspect ratio is not their camera's.
     """
     folder = find_model(root)
     if folder is None:
@@ -90,7 +90,7 @@ def read_colmap(root: Path) -> Capture:
 
 
 def pinhole_and_lens(camera: pycolmap.Camera, where: str) -> tuple[np.ndarray, Lens]:
-    """The (3, 3) matrix and the distortion of a COLMAP camera.
+    """Return the (3, 3) matrix and the lens distortion of a COLMAP camera.
 
     Args:
         where: the image, for messages.
@@ -129,7 +129,7 @@ def _load_model(folder: Path) -> pycolmap.Reconstruction:
 
 
 def _find_masks(folder: Path) -> dict[str, Path]:
-    """Masks by their path below ``folder``, both with and without the last extension."""
+    """Map paths below ``folder``, with and without the last extension, to masks."""
     found: dict[str, Path] = {}
     for path in sorted(inside(folder).rglob("*")) if folder.is_dir() else ():
         if path.suffix.lower() in SUFFIXES:
@@ -140,13 +140,13 @@ def _find_masks(folder: Path) -> dict[str, Path]:
 
 
 def _mask_of(image_name: str, masks: dict[str, Path]) -> Path | None:
-    """Mask of ``a/b.jpg``: ``a/b.jpg.png``, else ``a/b.jpg``, else ``a/b`` with any picture extension."""
+    """Find the mask of ``a/b.jpg``: ``a/b.jpg.png``, else ``a/b.jpg``, else ``a/b`` with any picture extension."""
     stem = image_name.rpartition(".")[0]
     return masks.get(f"{image_name}.png") or masks.get(image_name) or masks.get(stem)
 
 
 def _points(model: pycolmap.Reconstruction) -> PointCloud | None:
-    """The points in the order of their ids, None where there are none."""
+    """Points in the order of their ids, None where there are none."""
     points = [model.points3D[point_id] for point_id in sorted(model.points3D)]
     if not points:
         return None

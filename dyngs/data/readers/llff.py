@@ -1,4 +1,4 @@
-"""Reader for video sets of several cameras with LLFF's ``poses_bounds.npy``, as Neural 3D Video (N3V) has them."""
+"""Reader for videos of several cameras with LLFF's ``poses_bounds.npy``, as in Neural 3D Video (N3V)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def is_llff(root: Path) -> bool:
 
 
 def read_llff(root: Path) -> Capture:
-    """The capture of ``poses_bounds.npy`` and one video ``camNN.mp4`` or folder ``camNN`` per camera, sorted by name.
+    """Read ``poses_bounds.npy`` and one video ``camNN.mp4`` or folder ``camNN`` per camera, sorted by name.
 
     Each row holds a 3x5 matrix, row by row, and the near and far bounds (not used). Its columns: the camera's down,
     right and backward axes and its position in the world, then height, width and focal length of the full picture in
@@ -40,7 +40,7 @@ def read_llff(root: Path) -> Capture:
     path = root / POSES
     rows = _read_rows(path)
     found = find_cameras(root)
-    # Folders of other programs may lie beside the cameras'.
+    # There may be folders of other programs, too.
     found = {name: at for name, at in found.items() if re.fullmatch(r"cam[-_]?\d+", name, re.IGNORECASE)} or found
     names = list(found)
     if len(names) != len(rows):
@@ -59,7 +59,7 @@ def read_llff(root: Path) -> Capture:
 
 
 def _read_rows(path: Path) -> np.ndarray:
-    """(V, 17) float64."""
+    """Read the (V, 17) float64 rows of ``poses_bounds.npy``."""
     rows = read_npy(path)
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         raise DyngsError(f"{path}: must have 17 columns, one row per camera; got shape {rows.shape}")
@@ -84,7 +84,7 @@ def _calibration(row: np.ndarray) -> dict[str, object]:
 
 
 def _splits(views: dict[str, tuple[View, ...]], names: list[str]) -> Splits:
-    """The first camera for testing if there is another one to train on."""
+    """Hold out the first camera for testing if there is another one to train on."""
     test = names[:1] if len(names) > 1 else []
     return {
         "train": tuple(view for name in names[len(test) :] for view in views[name]),
@@ -97,7 +97,7 @@ def _ends(names: list[str]) -> str:
 
 
 def _gaps(names: list[str]) -> str:
-    """Which numbers are missing between the first and the last name."""
+    """Say which numbers are missing between the first and the last name."""
     numbers = {int(digits) for name in names for digits in re.findall(r"\d+$", name)}
     missing = sorted(set(range(min(numbers), max(numbers))) - numbers) if numbers else []
     return f", without number {', '.join(map(str, missing[:5]))}" if 0 < len(missing) < len(numbers) else ""

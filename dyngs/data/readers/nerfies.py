@@ -21,7 +21,7 @@ from dyngs.files.numpy_files import read_npy
 
 @dataclass(frozen=True)
 class _Scene:
-    """The frame in which the scene has about unit size: ``(x - center) * scale``."""
+    """Normalisation of the world to about unit size: ``(x - center) * scale``."""
 
     center: np.ndarray = field(default_factory=lambda: np.zeros(3))
     scale: float = 1.0
@@ -32,7 +32,7 @@ class _Scene:
 
 @dataclass(frozen=True)
 class _Pictures:
-    """The pictures of one resolution: their folder and by how much they are smaller than their cameras say."""
+    """Pictures of one resolution: their folder, and the factor by which they are smaller than their cameras say."""
 
     folder: Path
     factor: int
@@ -45,9 +45,9 @@ def is_nerfies(root: Path) -> bool:
 
 
 def read_nerfies(root: Path) -> Capture:
-    """The capture in the scaled frame of ``scene.json``, in the largest pictures that are there.
+    """Read the capture, in the world scaled as ``scene.json`` says, with the largest pictures that exist.
 
-    Training and test views are ``train_ids`` and ``val_ids`` (without any of those, the usual hold-out); the time is
+    Training and test views are ``train_ids`` and ``val_ids`` (without ``val_ids`` every n-th picture); the time is
     ``warp_id`` (or ``time_id``) over the largest one; ``points.npy`` (P, 3), if present, are the sparse points, grey.
     Cameras (Park et al. 2021): ``orientation`` has the camera's OpenCV axes as rows, ``position`` is its centre.
 
@@ -93,7 +93,7 @@ def _ids(root: Path, dataset: dict[str, object], key: str) -> list[str]:
 
 
 def _is_plain(name: str) -> bool:
-    """Whether it names a file rather than a way to one."""
+    """Whether it is the name of a file, without folders."""
     return bool(name) and not set(name) & {"/", "\\"} and name not in (".", "..")
 
 
@@ -110,7 +110,7 @@ def _metadata(root: Path, names: list[str]) -> dict[str, dict[str, object]]:
 
 
 def _times(root: Path, metadata: dict[str, dict[str, object]]) -> dict[str, float]:
-    """Time of each picture that has one: its number over the largest number."""
+    """Time of each picture that has one: its number divided by the largest number."""
     numbers: dict[str, int] = {}
     for name, own in metadata.items():
         value = own.get("warp_id", own.get("time_id"))
@@ -131,7 +131,7 @@ def _frame(own: dict[str, object]) -> int | None:
 
 
 def _numbers(path: Path, fields: dict[str, object], key: str, shape: tuple[int, ...]) -> np.ndarray:
-    """The finite float64 numbers at ``key`` in the given shape."""
+    """Return the finite float64 numbers at ``key`` of exactly the given shape."""
     try:
         value = np.array(fields[key], dtype=np.float64)
     except KeyError:
@@ -155,7 +155,7 @@ def _scene(path: Path) -> _Scene:
 
 
 def _find_pictures(root: Path) -> _Pictures:
-    """The largest pictures: ``rgb/1x`` if it holds any, else ``rgb/2x`` and so on."""
+    """Find the largest pictures: ``rgb/1x`` if it holds any, else ``rgb/2x`` and so on."""
     folders = {}
     for path in (root / "rgb").iterdir() if (root / "rgb").is_dir() else ():
         match = re.fullmatch(r"(\d+)x", path.name)
@@ -169,7 +169,7 @@ def _find_pictures(root: Path) -> _Pictures:
 
 
 def _camera(path: Path, scene: _Scene, pictures: _Pictures, name: str, skewed: list[str]) -> dict[str, object]:
-    """The camera as a frame of a transforms file, for pictures that are smaller by the factor of their folder."""
+    """Return the camera as a frame of a transforms file, for pictures smaller by the factor of their folder."""
     if not path.is_file():
         raise DyngsError(f"{path}: no such camera file, although dataset.json lists it; restore it")
     fields = read_json_object(path)
@@ -183,7 +183,7 @@ def _camera(path: Path, scene: _Scene, pictures: _Pictures, name: str, skewed: l
     picture = pictures.files.get(name, pictures.folder / f"{name}.png")
     width, height = _scaled_size(full, pictures.factor, picture)
     scale_x, scale_y = width / full[0], height / full[1]
-    # "tangential" is what Nerfies' older files say.
+    # Older Nerfies files have "tangential".
     tangential = "tangential_distortion" if "tangential_distortion" in fields else "tangential"
     k1, k2, k3 = _numbers(path, fields, "radial_distortion", (3,)) if "radial_distortion" in fields else np.zeros(3)
     p1, p2 = _numbers(path, fields, tangential, (2,)) if tangential in fields else np.zeros(2)
@@ -200,7 +200,7 @@ def _camera(path: Path, scene: _Scene, pictures: _Pictures, name: str, skewed: l
 
 
 def _scaled_size(full: np.ndarray, factor: int, picture: Path) -> tuple[int, int]:
-    """(width, height) of the picture; as it is stored if that is a rounding of ``full / factor``."""
+    """(width, height) of the picture: the stored size if that is ``full / factor`` rounded, else the rounded one."""
     nominal = round(float(full[0]) / factor), round(float(full[1]) / factor)
     header = header_if_readable(picture)
     if header is None:

@@ -20,10 +20,10 @@ def is_nerfstudio(root: Path) -> bool:
 
 
 def read_nerfstudio(root: Path) -> Capture:
-    """The capture of ``transforms.json``, with OpenGL camera-to-world poses and, if named, a ``.ply`` of points.
+    """Read ``transforms.json`` with OpenGL camera-to-world poses and, if named there, a ``.ply`` file of points.
 
     The lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` decide the splits; a val list without a test
-    list is the test set, as that is what is held out. Points and poses are read as they stand: ``applied_transform``
+    list is used for testing. Points and poses are read as they stand: ``applied_transform``
     has been applied to both.
 
     Raises:
@@ -38,7 +38,7 @@ def read_nerfstudio(root: Path) -> Capture:
 
 
 def read_points(path: Path) -> PointCloud:
-    """Points of a ``.ply`` file (through trimesh), grey where it has no colours.
+    """Read the points of a ``.ply`` file (through trimesh), grey where it has no colours.
 
     Raises:
         DyngsError: missing or unreadable.
@@ -47,7 +47,7 @@ def read_points(path: Path) -> PointCloud:
 
     if not path.is_file():
         raise DyngsError(f"{path}: no such point file; restore it or remove ply_file_path")
-    # Out of an open file, because textures that it names would be looked for beside one with a path.
+    # From an open file: given a path, trimesh would look for textures beside it.
     with reading(path, "it must be a .ply file of points; export it again"), path.open("rb") as file:
         loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
         xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
@@ -60,7 +60,7 @@ def read_points(path: Path) -> PointCloud:
 
 
 def _splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits, list[str]]:
-    """Splits by the file's lists; all views as train where it has none."""
+    """Splits by the lists in the file, all views for training where it has none; and warnings."""
     names: tuple[Split, ...] = ("train", "val", "test")
     listed = {name: file.fields.get(f"{name}_filenames") for name in names}
     if all(value is None for value in listed.values()):

@@ -31,7 +31,7 @@ def is_neuman(root: Path) -> bool:
 
 
 def read_neuman(root: Path) -> Capture:
-    """The capture of one moving camera, posed by COLMAP (Jiang et al. 2022), in the model's world and unit.
+    """Read the capture of one moving camera, posed by COLMAP (Jiang et al. 2022), in the model's world and unit.
 
     Body parameters, one row per posed picture in order of their names: ``4d_humans/smpl_optimized_aligned_scale.npz``
     (global_orient, body_pose, betas, transl, scale), else ``smpl_output_optimized.pkl`` or ``smpl_output_romp.pkl``
@@ -78,7 +78,7 @@ def _aligned(root: Path, numbers: list[int]) -> BodyFrames:
 
 
 def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
-    """SMPL as estimated in its own frame, brought to the world by each picture's similarity."""
+    """SMPL fitted in a frame of its own, mapped to the world by the similarity transform of each picture."""
     path = next((root / name for name in FITS if (root / name).is_file()), root / FITS[0])
     fits = read_pickle(inside(path))
     if not isinstance(fits, dict) or len(fits) != 1:
@@ -106,7 +106,7 @@ def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
 
 
 def _per_picture(path: Path, key: str, value: object, count: int) -> np.ndarray:
-    """(count, width)."""
+    """Return ``value`` as (count, width), one row per posed picture."""
     rows = len(value) if isinstance(value, np.ndarray) and value.ndim else 0
     if rows != count or not isinstance(value, np.ndarray):
         raise DyngsError(
@@ -123,7 +123,7 @@ def _number(root: Path, name: str) -> int:
 
 
 def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
-    """As the lists of names say; all for training where there are none."""
+    """Splits by the lists of names, all views for training where there are none; and warnings."""
     splits: Splits = {}
     unposed: list[str] = []
     names: tuple[Split, ...] = ("train", "val", "test")

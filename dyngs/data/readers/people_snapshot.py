@@ -1,4 +1,4 @@
-"""Reader for PeopleSnapshot folders: a video of a person who turns, ``camera.pkl``, masks and poses in HDF5 files."""
+"""Reader for PeopleSnapshot folders: a video of a turning person, ``camera.pkl``, masks and poses in HDF5 files."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def is_people_snapshot(root: Path) -> bool:
 
 
 def read_people_snapshot(root: Path) -> Capture:
-    """The capture of one camera at rest (Alldieck et al. 2018): frame n of the video is row n of masks and poses.
+    """Read the capture of one static camera (Alldieck et al. 2018): frame n of the video is row n of masks and poses.
 
     ``camera.pkl``: camera_f, camera_c (2,) px, camera_k (5,) OpenCV, camera_rt axis-angle and camera_t of
     cam_from_world, width, height. ``masks.hdf5``: masks (F, H, W), 0 is background. ``reconstructed_poses.hdf5``: SMPL
@@ -69,7 +69,7 @@ def _read(root: Path) -> Capture:
 
 
 def _video(root: Path) -> Path:
-    """The folder's only video, or the one named like the folder."""
+    """Find the only video of the folder, or the one named like the folder."""
     found = sorted(p for p in root.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES and not p.name.startswith("."))
     named = [path for path in found if path.stem == root.resolve().name] or found
     if len(named) != 1:
@@ -79,7 +79,7 @@ def _video(root: Path) -> Path:
 
 
 def _calibration(path: Path) -> dict[str, object]:
-    """The fields of a frame in a transforms file."""
+    """Return the camera as the fields of a frame in a transforms file."""
     fields = read_pickle(inside(path))
     fx, fy = numbers_of(f"{path}: 'camera_f'", entry(path, fields, "camera_f"), (2,)).tolist()
     cx, cy = numbers_of(f"{path}: 'camera_c'", entry(path, fields, "camera_c"), (2,)).tolist()
@@ -104,7 +104,7 @@ def _calibration(path: Path) -> dict[str, object]:
 
 
 def _body(path: Path) -> BodyFrames:
-    """The parameters of the frames that have some: rows that were never fitted are 0 throughout."""
+    """Body parameters of the fitted frames; rows that are all zero were not fitted."""
     poses, trans, betas = (read_hdf5(path, key) for key in ("pose", "trans", "betas"))
     if len(poses) != len(trans):
         raise DyngsError(f"{path}: 'pose' has {len(poses)} rows but 'trans' {len(trans)}; export it again")

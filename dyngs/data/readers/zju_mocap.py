@@ -30,14 +30,14 @@ _NUM_JOINTS = 24
 
 @dataclass(frozen=True)
 class _Shot:
-    """One picture.
+    """One picture of one camera.
 
     Attributes:
-        file: below the capture's folder, with or without extension.
-        camera: index.
-        frame: number.
+        file: path below the capture's folder, with or without extension.
+        camera: camera index.
+        frame: frame number.
         calibration: fields of a frame in a transforms file.
-        where: what calibrates it, for messages.
+        where: file and entry of the calibration, for messages.
     """
 
     file: str
@@ -53,7 +53,7 @@ def is_zju_mocap(root: Path) -> bool:
 
 
 def read_zju_mocap(root: Path) -> Capture:
-    """The capture of a person in metres, seen by several calibrated cameras at rest or by one.
+    """Read the capture of a person by several calibrated static cameras or by one; units are metres.
 
     ``annots.npy`` (Peng et al. 2021) holds ``cams`` (K, D, R, T in mm, per camera) and ``ims`` (pictures of all cameras
     per frame); SMPL parameters lie in ``new_params/N.npy`` or ``params/N.npy``, N being the number in the picture's
@@ -62,7 +62,7 @@ def read_zju_mocap(root: Path) -> Capture:
     the same per picture of ``images/``, in metres; masks (white) lie in ``masks/``.
 
     Parameters: v = Rh LBS(x; poses) + Th, about the template's origin: kept as ``BodyFrames.turns``. OpenCV calibrated
-    these cameras, so that pixel centres lie at whole numbers: half a pixel is added to the principal point.
+    these cameras, with pixel centres at whole numbers: half a pixel is added to the principal point.
 
     Raises:
         DyngsError: anything missing, broken or inconsistent; names the file.
@@ -137,7 +137,7 @@ def _single_shots(path: Path) -> list[_Shot]:
 
 
 def _params_per_file(root: Path, frames: Iterable[int]) -> tuple[Path, BodyFrames]:
-    """The folder of parameters, and what its file of each frame holds."""
+    """Return the folder of parameters and the parameters, read from one file per frame."""
     folder = next((root / name for name in ("new_params", "params") if (root / name).is_dir()), root / "new_params")
     numbers = sorted(frames)
     missing = [f"{number}.npy" for number in numbers if not (folder / f"{number}.npy").is_file()]
@@ -153,7 +153,7 @@ def _params_per_file(root: Path, frames: Iterable[int]) -> tuple[Path, BodyFrame
 
 
 def _mesh_infos(path: Path) -> BodyFrames:
-    """Shape coefficients where the file has them, and the pelvis of the body that was fitted."""
+    """Body parameters of ``mesh_infos.pkl``: shape coefficients if it has any, and the fitted body's pelvis."""
     by_name = _by_name(path)
     infos = [(f"{path}, {name}", own) for name, own in by_name.items()]
     key = next((key for key in ("betas", "shapes") if all(key in own for _, own in infos)), None)
@@ -165,7 +165,7 @@ def _mesh_infos(path: Path) -> BodyFrames:
 
 
 def _column(rows: Iterable[tuple[str, object]], key: str, width: int | None = None) -> list[np.ndarray]:
-    """What each of the named dictionaries holds at ``key``, finite numbers, as many as ``width`` says."""
+    """Finite numbers at ``key`` of each of the named dictionaries, ``width`` of them if given."""
     shape = None if width is None else (width,)
     return [numbers_of(f"{where}: '{key}'", entry(where, own, key), shape) for where, own in rows]
 
@@ -190,7 +190,7 @@ def _calibration(where: str, intrinsics: object, lens: object, cam_from_world: n
 
 
 def _views(path: Path, shots: Sequence[_Shot]) -> tuple[list[View], list[str]]:
-    """One view per shot, and warnings; times run from 0 at the lowest frame number to 1 at the highest one."""
+    """One view per picture, and warnings; times run from 0 at the lowest frame number to 1 at the highest one."""
     first, last = min(shot.frame for shot in shots), max(shot.frame for shot in shots)
     frames = []
     for shot in shots:
@@ -212,7 +212,7 @@ def _splits(views: Sequence[View]) -> tuple[Splits, list[str]]:
 
 
 def _mask(root: Path, file: str, folders: Sequence[str]) -> Path | None:
-    """``FOLDER/a/b.png`` of the picture ``a/b.jpg`` or ``images/a/b.jpg``, in the first folder that has it."""
+    """Find the mask ``FOLDER/a/b.png`` of ``a/b.jpg`` or ``images/a/b.jpg``, in the first folder that has it."""
     picture = PurePosixPath(file.replace("\\", "/"))
     name = picture.name if not picture.suffix else picture.with_suffix("").name
     below = [picture.parent / f"{name}.png"]
@@ -223,7 +223,7 @@ def _mask(root: Path, file: str, folders: Sequence[str]) -> Path | None:
 
 
 def _frame_number(path: Path, name: str) -> int:
-    """The number in a picture's name: ``000123.jpg``, ``frame_000123`` or ``Camera (1)_0123_2019-08-23_16.592.jpg``."""
+    """Frame number of ``000123.jpg``, ``frame_000123`` or ``Camera (1)_0123_2019-08-23_16.592.jpg``."""
     stem = PurePosixPath(name.replace("\\", "/")).name
     found = re.search(r"\)_(\d{1,15})(?!\d)", stem) or re.search(r"(?<!\d)(\d{1,15})(?:\.\w+)?$", stem)
     if not found:
@@ -232,7 +232,7 @@ def _frame_number(path: Path, name: str) -> int:
 
 
 def _by_name(path: Path) -> dict[str, dict[str, object]]:
-    """Picture name to what the file says about it."""
+    """Read a pickle of a dictionary from picture names to dictionaries."""
     fields = read_pickle(inside(path))
     if not isinstance(fields, dict) or not fields or not all(isinstance(own, dict) for own in fields.values()):
         raise DyngsError(f"{path}: must be a dictionary from picture names to parameters; export it again")

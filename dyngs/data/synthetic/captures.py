@@ -17,7 +17,7 @@ from dyngs.files.write import write_image, write_text
 
 @dataclass(frozen=True)
 class PictureOptions:
-    """How pictures are taken.
+    """Options of rendered pictures.
 
     Attributes:
         size: width and height in pixels.
@@ -37,7 +37,7 @@ class PictureOptions:
 
 @dataclass(frozen=True)
 class StillOptions(PictureOptions):
-    """How the still scene is taken.
+    """Options of a capture of the still scene.
 
     Attributes:
         num_train: training pictures.
@@ -48,7 +48,7 @@ class StillOptions(PictureOptions):
 
 @dataclass(frozen=True)
 class DynamicOptions(PictureOptions):
-    """How a moving scene is taken. The seed also chooses which camera takes which time.
+    """Options of a capture of a moving scene. The seed also assigns times to cameras.
 
     Test pictures lie at times between the training times, those of ``num_val`` are of one fixed camera; in ``room``
     both numbers only say whether there is a camera of that kind, which is never trained on.
@@ -66,7 +66,7 @@ class DynamicOptions(PictureOptions):
 
 @dataclass(frozen=True)
 class _Shot:
-    """One picture to take: where it goes, below the root and without suffix, the (4, 4) OpenGL pose, and when."""
+    """One picture to render: its path below the root without suffix, the (4, 4) OpenGL pose, and the time."""
 
     name: str
     world_from_cam: np.ndarray
@@ -116,7 +116,7 @@ def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = 
 
 
 def require_new_folder(out: Path) -> None:
-    """Nothing, if ``out`` does not exist or is an empty folder.
+    """Check that ``out`` does not exist or is an empty folder.
 
     Raises:
         DyngsError: it holds something or is a file.
@@ -132,7 +132,7 @@ def _write_split(
     scene_of: Callable[[_Shot], Scene],
     options: StillOptions | DynamicOptions,
 ) -> None:
-    """The pictures of one split, then its JSON; nothing where it has no pictures."""
+    """Write the pictures of one split, then its JSON; nothing where it has no pictures."""
     if not shots:
         return
     frames = []
@@ -150,7 +150,7 @@ def _write_split(
 
 
 def _teleporting_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
-    """Training cameras all over the hemisphere in random order, test cameras on an orbit, val from one place."""
+    """Training cameras on the hemisphere in random order, test cameras on an orbit, one static validation camera."""
     train = hemisphere_cameras(options.num_times, options.distance, options.seed)
     train = np.random.default_rng(options.seed).permutation(train)  # the spiral climbs: time would tell the height
     test = orbit_cameras(options.num_test, options.distance, elevation_deg=28.0, start_deg=-60.0)
@@ -171,7 +171,7 @@ def _teleporting_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
 
 
 def _room_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
-    """Fixed cameras on an arc before the corner, low and high in turn; the test camera in the middle of the arc."""
+    """Static cameras on an arc before the corner, low and high in turn; the test camera in the middle of the arc."""
     count = options.num_cameras
     shift = np.random.default_rng(options.seed).uniform(-2.0, 2.0)
     azimuths_deg = -45.0 + shift + 64.0 * ((np.arange(count) + 0.5) / count - 0.5)
@@ -196,12 +196,12 @@ def _room_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
 
 
 def _even_times(count: int) -> list[float]:
-    """``count`` times from 0 to 1, both included; a single one is 0."""
+    """Return ``count`` times from 0 to 1, both included; a single one is 0."""
     return [i / max(count - 1, 1) for i in range(count)]
 
 
 def _times_between(num_times: int, count: int) -> list[float]:
-    """``count`` times spread over [0, 1], each midway between two neighbours of ``_even_times(num_times)``."""
+    """Return ``count`` times spread over [0, 1], each midway between two neighbours of ``_even_times(num_times)``."""
     gaps = max(num_times - 1, 1)
     return [(int((i + 0.5) * gaps / count) + 0.5) / gaps for i in range(count)]
 

@@ -1,4 +1,4 @@
-"""A small ray tracer in numpy: painted balls, boxes and waving sheets under a soft lamp and the sky.
+"""A small ray tracer in NumPy: painted balls, boxes and waving sheets under a soft lamp and the sky.
 
 It shares no formula with the rasterizer, so that its pictures are an independent ground truth. A scene is a tuple of
 primitives; a scene that moves is a function from time to such a tuple.
@@ -255,7 +255,7 @@ def render_scene(scene: Scene, world_from_cam: np.ndarray, size: int, samples: i
 
 
 def _trace(scene: Scene, origin: np.ndarray, directions: np.ndarray, lamp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the rays that hit something, and what they see there: (R_hit,), sRGB (R_hit, 3)."""
+    """Return indices of the rays that hit something (R_hit,), and the colours there: sRGB (R_hit, 3)."""
     distances = np.stack([p.intersect(origin[None], directions) for p in scene.primitives])
     nearest = distances.argmin(axis=0)
     distance = distances.min(axis=0)
@@ -273,7 +273,7 @@ def _trace(scene: Scene, origin: np.ndarray, directions: np.ndarray, lamp: np.nd
 def _shade(
     scene: Scene, primitive: Primitive, points: np.ndarray, directions: np.ndarray, lamp: np.ndarray
 ) -> np.ndarray:
-    """(R, 3) linear radiance: sky light less what neighbours hide, Lambert and Blinn-Phong light of the lamp."""
+    """(R, 3) linear radiance: sky light less what neighbours occlude, Lambert and Blinn-Phong light of the lamp."""
     normals = primitive.normals(points)
     if isinstance(primitive, Sheet):  # its upper side, whichever is seen
         normals = np.where(_dot(normals, directions)[:, None] > 0, -normals, normals)
@@ -300,7 +300,7 @@ def _shade(
 
 
 def _pixel_rays(world_from_cam: np.ndarray, size: int, sub_x: float, sub_y: float) -> np.ndarray:
-    """(size * size, 3) float32 unit directions in the world through one place of every pixel, row by row."""
+    """(size * size, 3) float32 unit directions in the world through one subpixel of every pixel, row by row."""
     focal = 0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X)
     x = (np.arange(size) + sub_x - 0.5 * size) / focal
     y = (np.arange(size) + sub_y - 0.5 * size) / focal
@@ -333,6 +333,6 @@ def _unit(a: np.ndarray) -> np.ndarray:
 
 
 def _srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear light to display values in [0, 1] (IEC 61966-2-1)."""
+    """Convert linear light to sRGB in [0, 1] (IEC 61966-2-1)."""
     x = np.clip(linear, 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-6), 1 / 2.4) - 0.055)

@@ -1,7 +1,7 @@
-"""The embedded scenes: a still life, and four that move - rigidly, by bending, by appearing and merging, in a room.
+"""Synthetic scenes: a still life, and four with rigid motion, a waving cloth, appearing and merging balls, and a room.
 
-A moving scene is a function from time in [0, 1] to a ``Scene``; its still primitives come first. Whatever moves carries
-a texture, and so moves visibly. Units: world units, radians.
+A moving scene is a function from time in [0, 1] to a ``Scene``; its still primitives come first. Everything that moves
+is textured, so that its motion is visible. Units: world units, radians.
 
 Local letters: R points on surfaces.
 """
@@ -22,7 +22,7 @@ SceneName = Literal["spin", "wave", "merge", "room"]
 Rgb = tuple[float, float, float]
 
 _FAINT = 0.05
-"""``Scene.faint`` of the moving scenes: a ball darkens what is nearer than some four radii."""
+"""``Scene.faint`` of the moving scenes: a ball occludes the sky for what is nearer than about four radii."""
 
 _PLATE_TOP = -0.34
 _ROOM_FLOOR = -0.50
@@ -44,7 +44,7 @@ def still_life() -> Scene:
 
 
 def scene_at(name: SceneName, time: float) -> Scene:
-    """The scene ``name`` at ``time`` in [0, 1].
+    """Return the scene ``name`` at ``time`` in [0, 1].
 
     - ``spin``: a die turns by 100 degrees on a plate and a ball rolls about it along 130 degrees of a circle.
     - ``wave``: a cloth ripples over a plate with three still things; after time 1 it is as at time 0.
@@ -150,7 +150,7 @@ def _room(time: float) -> Scene:
 
 
 def _plate(light: Rgb, dark: Rgb) -> Box:
-    """The checkered plate on which things stand, its top at ``_PLATE_TOP``."""
+    """The checkered plate under the other things, its top at ``_PLATE_TOP``."""
     return Box((0.0, 0.0, -0.40), (0.98, 0.98, 0.06), _checkers(6, light, dark), gloss=0.05)
 
 
@@ -165,7 +165,7 @@ def _rotation(axis: Literal["x", "y", "z"], angle: float) -> np.ndarray:
 
 
 def _ease(share: float) -> float:
-    """0 below 0, 1 above 1, smooth between."""
+    """Smoothstep: 0 below 0, 1 above 1."""
     x = min(max(share, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)
 

@@ -51,9 +51,9 @@ def files(folder: Path) -> list[str]:
 
 def forget() -> None:
     """As if another process had decoded what is in the cache."""
-    for mark in frame_cache._held.values():
+    for mark in frame_cache._locked.values():
         mark.close()
-    frame_cache._held.clear()
+    frame_cache._locked.clear()
 
 
 def test_planning_writes_nothing(root: Path) -> None:

@@ -1,1 +1,1 @@
-"""Code that several readers share; the readers themselves are the modules one folder up."""
+"""Parts of readers: what several formats share, and checks that a reader does not hold itself."""

@@ -17,7 +17,7 @@ from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
 
 MIN_CAMERAS_TO_HOLD_OUT = 3
-"""With so many cameras the first one is for testing where the capture names none."""
+"""From this number on, the first camera is for testing where the capture names none."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class CameraSource:
     """The pictures of one camera.
 
     Attributes:
-        name: of its folder, or of its video without the suffix.
-        pictures: frame number to file; the files of a video may have to be decoded first.
-        video: its frames, None for a folder.
+        name: name of its folder, or of its video without the suffix.
+        pictures: frame number to file; frames of a video may have to be decoded first.
+        video: frames of the video, None for a folder.
     """
 
     name: str
@@ -36,7 +36,7 @@ class CameraSource:
 
 
 def find_cameras(root: Path) -> dict[str, Path]:
-    """Camera name to its folder of pictures, or to its video file where it has no such folder; sorted by name.
+    """Map camera names, sorted, to folders of pictures, or to video files where there is no such folder.
 
     Pictures lie in the folder itself or in ``images`` below it.
 
@@ -58,7 +58,7 @@ def find_cameras(root: Path) -> dict[str, Path]:
 
 
 def open_camera(name: str, path: Path) -> CameraSource:
-    """The pictures of the camera that ``find_cameras`` found at ``path``.
+    """List the pictures of the camera that ``find_cameras`` found at ``path``.
 
     Raises:
         DyngsError: a picture without a number, two with the same one, or a video that cannot be opened.
@@ -80,7 +80,7 @@ def open_camera(name: str, path: Path) -> CameraSource:
 def sequence_views(
     path: Path, cameras: Sequence[CameraSource], calibrations: Mapping[str, dict[str, object]]
 ) -> tuple[dict[str, tuple[View, ...]], list[str]]:
-    """The views of each camera, and warnings; times run from 0 at the lowest frame number to 1 at the highest one.
+    """Return the views of each camera, and warnings; times run from 0 at the lowest frame number to 1 at the highest.
 
     Args:
         path: the calibration file in the capture's folder.
@@ -114,7 +114,7 @@ def sequence_views(
 
 
 def video_fps(cameras: Sequence[CameraSource]) -> float | None:
-    """Frames per second of the first video that says so, None without one."""
+    """Return the frame rate of the first video that has one, None if none has."""
     rates = (camera.video.info.fps for camera in cameras if camera.video is not None)
     return next((fps for fps in rates if fps > 0), None)
 
@@ -122,7 +122,7 @@ def video_fps(cameras: Sequence[CameraSource]) -> float | None:
 def _at_video_size(
     name: str, video: VideoInfo, views: tuple[View, ...], where: str
 ) -> tuple[tuple[View, ...], list[str]]:
-    """The views with names after the video, and of its size even where the frame has not been decoded yet."""
+    """Return the views named after the video and with its size: its frames may not be decoded yet."""
     sized, rescaled = [], []
     for view in views:
         described = (view.width, view.height)

@@ -1,4 +1,4 @@
-"""The declaration of a capture format, one per reader module."""
+"""Declaration of a capture format, one per reader module."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class CaptureFormat:
         name: as in ``data.format`` and ``Capture.format``; also the name of the reader module.
         files: the files by which it is recognised, for messages.
         recognise: whether a folder holds these files; opens none of them.
-        read: read the folder; names in ``splits`` and times are finished by ``dyngs.data.read``.
+        read: reads the folder; ``dyngs.data.read`` then finishes splits and times.
         extends: name of the format of which this one is a special case: its folders are recognised as that one, too.
     """
 

@@ -1,6 +1,6 @@
-"""Structure checks of COLMAP model files, made before pycolmap sees them.
+"""Checks of the structure of COLMAP model files before pycolmap reads them.
 
-pycolmap trusts the counts in binary files: a truncated one can hang or abort the whole process.
+pycolmap trusts the counts in binary files: a truncated file can hang or abort the process.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _TEXT_FIELDS = {"cameras": 5, "images": 10, "points3D": 8}
 
 
 class _Bytes:
-    """A cursor over a file's bytes that names the file when they run out."""
+    """Bytes of a file with a read position; running out of bytes is an error that names the file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -46,7 +46,7 @@ class _Bytes:
 
 
 def check_model_file(path: Path) -> None:
-    """Nothing, for a file (``cameras|images|points3D|rigs|frames``, ``.bin`` or ``.txt``) that is complete.
+    """Check that a model file (``cameras|images|points3D|rigs|frames``, ``.bin`` or ``.txt``) is complete.
 
     Raises:
         DyngsError: missing, truncated, trailing bytes, or text lines with too few fields.
@@ -109,7 +109,7 @@ def _frames(source: _Bytes) -> None:
 
 
 def _check_text(path: Path) -> None:
-    """The header's count, where there is one, equals the number of entries, and each has all its fields."""
+    """Check that there are as many entries as the header says, if it does, and that each has all its fields."""
     if path.stem not in _TEXT_FIELDS:
         return
     announced, entries = None, 0
@@ -125,7 +125,7 @@ def _check_text(path: Path) -> None:
 
 
 def _entry_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Numbered comments and first lines of entries; in images.txt each entry has a second line, which may be empty."""
+    """Yield numbered comments and first lines of entries; in images.txt each entry has a second line, perhaps empty."""
     try:
         with path.open(encoding="utf-8") as file:
             skip_next = False
@@ -141,7 +141,7 @@ def _entry_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _announced_count(comment: str) -> int | None:
-    """N of a comment like ``# Number of images: N, mean ...``."""
+    """Return N of a comment like ``# Number of images: N, mean ...``."""
     head, _, tail = comment.partition(":")
     digits = tail.strip().split(",")[0].strip()
     return int(digits) if "Number of" in head and digits.isdigit() else None

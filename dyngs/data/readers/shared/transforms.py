@@ -1,4 +1,4 @@
-"""Views from a transforms JSON file: what Blender, nerfstudio and instant-ngp captures have in common."""
+"""Views of a transforms JSON file, as Blender, nerfstudio and instant-ngp captures have it."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
 @dataclass(frozen=True)
 class Frame:
-    """One entry of ``frames``; what it lacks is looked up in the file's top level.
+    """One entry of ``frames``; keys that it lacks are looked up at the file's top level.
 
     Attributes:
         where: file and index, for messages.
         own: the frame's fields.
         shared: the file's fields.
-        picture: the picture where ``file_path`` does not name it.
-        video: what the picture comes out of, if anything.
+        picture: the picture if ``file_path`` does not name it.
+        video: the video frame that the picture is decoded from, if any.
     """
 
     where: str
@@ -44,18 +44,18 @@ class Frame:
     video: VideoFrame | None = None
 
     def number(self, key: str) -> float | None:
-        """The finite number at ``key``, None if absent."""
+        """Return the finite number at ``key``, None if absent."""
         return _number(self.own.get(key, self.shared.get(key)), key, self.where)
 
     def integer(self, key: str) -> int | None:
-        """The whole number at ``key`` of this frame alone, None if absent or something else."""
+        """Return the whole number at ``key`` of this frame alone, None if absent or no whole number."""
         value = self.own.get(key)
         if not is_number(value):
             return None
         return int(value) if value % 1 == 0 and abs(value) < _LARGEST_INTEGER else None
 
     def text(self, key: str) -> str | None:
-        """The string at ``key``, None if absent."""
+        """Return the string at ``key``, None if absent."""
         value = self.own.get(key, self.shared.get(key))
         if value is not None and not isinstance(value, str):
             raise DyngsError(f"{self.where}: '{key}' must be a string, got {value!r:.40}")
@@ -80,8 +80,8 @@ class FrameFile:
 
 
 @dataclass
-class _Notes:
-    """Suspicions collected while views are made."""
+class _Warnings:
+    """Warnings collected while views are made."""
 
     repaired: dict[str, float] = field(default_factory=dict)
     rescaled: list[str] = field(default_factory=list)
@@ -91,7 +91,7 @@ class _Notes:
 
 
 def read_frame_file(path: Path) -> FrameFile:
-    """The file's fields and frames.
+    """Read the fields and frames of a transforms file.
 
     Raises:
         DyngsError: unreadable, broken JSON (with line and column), or no list ``frames`` of objects.
@@ -113,7 +113,7 @@ def read_frame_file(path: Path) -> FrameFile:
 
 
 def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
-    """Views by ``file_path`` as written in the file, in its order, and warnings.
+    """Return views by ``file_path`` as written in the file, in its order, and warnings.
 
     Raises:
         DyngsError: missing or wrong fields, impossible poses, sizes that disagree, the same picture twice.
@@ -128,7 +128,7 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
         for frame, path in zip(file.frames, paths, strict=True)
     ]
     common = _common_size(file, paths, headers)
-    notes = _Notes()
+    notes = _Warnings()
     views = {}
     for frame, path, header in zip(file.frames, paths, headers, strict=True):
         stored = (header.width, header.height) if header else None
@@ -137,17 +137,22 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
 
 
 def view_name(path: Path, root: Path) -> str:
-    """The picture's path below ``root`` without its extension, safe as a relative file name."""
+    """Name of a view: the picture's path below ``root`` without extension, safe as a relative file name."""
     relative = PurePosixPath(os.path.relpath(path, root).replace(os.sep, "/")).with_suffix("")
     return "/".join(part for part in relative.parts if part not in ("..", "/"))
 
 
 def _view(
-    frame: Frame, root: Path, path: Path, stored: tuple[int, int] | None, common: tuple[int, int] | None, notes: _Notes
+    frame: Frame,
+    root: Path,
+    path: Path,
+    stored: tuple[int, int] | None,
+    common: tuple[int, int] | None,
+    notes: _Warnings,
 ) -> View:
     described = _described_size(frame) or stored or common
     if described is None:
-        header = read_header(path)  # says what is wrong with the file
+        header = read_header(path)  # raises the error
         described = header.width, header.height
     intrinsics, size, rescaled = match_size(_intrinsics(frame, *described), described, stored, frame.where)
     if rescaled:
@@ -211,7 +216,7 @@ def _described_size(frame: Frame) -> tuple[int, int] | None:
 
 
 def _common_size(file: FrameFile, paths: list[Path], headers: list[PictureHeader | None]) -> tuple[int, int] | None:
-    """(width, height) of the pictures that the file says no size of and that share its focal length."""
+    """(width, height) of the pictures without a size of their own, which share the file's focal length."""
     sizes: dict[tuple[int, int], Path] = {}
     for frame, path, header in zip(file.frames, paths, headers, strict=True):
         has_own = any(key in frame.own for key in _FOCAL_KEYS)
@@ -242,7 +247,7 @@ def _intrinsics(frame: Frame, width: int, height: int) -> np.ndarray:
 
 
 def _focal(source: dict[str, object], axis: str, size: int, where: str) -> float | None:
-    """Focal length in pixels along one axis, None where the source does not say it for this axis."""
+    """Focal length in pixels along one axis, None where the source does not give it."""
     focal = _number(source.get(f"fl_{axis}"), f"fl_{axis}", where)
     # An angle beside an fl_x for the other axis only repeats it rounded: square pixels are the better guess.
     if focal is None and not any(source.get(key) is not None for key in ("fl_x", "fl_y")):
