@@ -149,5 +149,5 @@ class EditResult:
     """
 
     edit: TopologyEdit | None
-    changes: dict[str, Tensor] = field(default_factory=dict)
+    changes: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
     zero_moments: frozenset[str] = frozenset()
