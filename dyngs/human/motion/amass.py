@@ -1,4 +1,4 @@
-"""Reader of AMASS motion files: ``.npz`` of SMPL, SMPL-H and SMPL-X.
+"""Reader and writer of AMASS motion files: ``.npz`` of SMPL, SMPL-H and SMPL-X.
 
 Local letters: J joints, F frames, B shape parameters.
 """
@@ -26,24 +26,24 @@ from dyngs.human.template.joints import SMPLX_ROWS
 
 _MODELS = {72: "smpl", 156: "smplh", 165: "smplx"}
 _PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
-"""Keys and widths of the parts of 165 numbers, in their order; all after the second may be missing."""
+"""Keys and widths of the parts of 165 numbers, in order; all after the second may be missing."""
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
-    """The motion of 55 joints, y up, in float32; joints that the file lacks do not turn.
+    """Read a motion of 55 joints, y up, in float32; joints that the file lacks do not rotate.
 
     Keys: ``poses`` (F, 72, 156 or 165), or ``root_orient``, ``pose_body`` and the like; ``trans`` (F, 3);
     ``mocap_framerate`` or ``mocap_frame_rate``; ``betas`` (B,) if known; ``scale`` (one or F) and ``up_axis`` ("y" or
-    "z") of files that dyngs or a fit wrote. The last two numbers of SMPL's 24 joints, the hands, are left out.
+    "z") in files that dyngs or a fit wrote. The last two of SMPL's 24 joints, the hands, are left out.
 
     AMASS files are z up: unless ``up`` or the key ``up_axis`` says otherwise, a file is z up if it has no ``scale``.
-    Turned by T, it poses every vertex to T v: the root rotates about the pelvis of the shaped body, J_0, hence
-    R_0' = T R_0 and trans' = T (trans + s J_0) - s J_0.
+    The rotation T from z up to y up moves every vertex v to T v: the root rotates about the pelvis J_0 of the shaped
+    body, hence R_0' = T R_0 and trans' = T (trans + s J_0) - s J_0.
 
-    A file without ``scale`` and ``up_axis`` was made for SMPL, SMPL-H or SMPL-X (by its width). Shape parameters that
-    ``body`` lacks are left out. If it is not of that kind, all are set to zero and the lowest vertex of the clip to
-    y = 0, as the pelvis of the file's body is not known.
+    A file without ``scale`` and ``up_axis`` was made for SMPL, SMPL-H or SMPL-X (told by its width). Shape parameters
+    that ``body`` lacks are left out. If ``body`` is of another family, all are set to zero and the lowest vertex of the
+    motion to y = 0, as the pelvis of the file's body is not known.
 
     Raises:
         DyngsError: names the file and what is missing or wrong.
@@ -53,8 +53,7 @@ def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
 
 
 def write_amass(motion: Motion, path: Path) -> None:
-    """Write the motion of 55 joints as an AMASS file of SMPL-X that says ``up_axis`` y, from which it is read back
-    exactly.
+    """Write the motion of 55 joints as an AMASS file of SMPL-X with ``up_axis`` y; reading it gives the same motion.
 
     Raises:
         DyngsError: the suffix is not ``.npz``, or the file cannot be written.
@@ -66,10 +65,10 @@ def write_amass(motion: Motion, path: Path) -> None:
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
-            poses=motion.poses.reshape(len(motion), -1).numpy(),
-            trans=motion.trans.numpy(),
-            betas=motion.betas.numpy(),
-            scale=motion.scale.numpy(),
+            poses=motion.poses.reshape(len(motion), -1).cpu().numpy(),
+            trans=motion.trans.cpu().numpy(),
+            betas=motion.betas.cpu().numpy(),
+            scale=motion.scale.cpu().numpy(),
             mocap_frame_rate=np.float64(motion.fps),
             surface_model_type="smplx",
             gender="neutral",
@@ -78,6 +77,7 @@ def write_amass(motion: Motion, path: Path) -> None:
 
 
 def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: UpAxis) -> Motion:
+    """Return the motion of the arrays, y up, fitted to ``body``."""
     poses, width = _poses(path, arrays)
     frames = len(poses)
     trans = _numbers(path, arrays, "trans")
@@ -102,7 +102,7 @@ def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: U
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of numbers and text that matter; others, which may hold objects, are not touched."""
+    """Return the arrays that are needed; others, which may hold objects, are not read."""
     keys = ("poses", *_PARTS, "trans", "betas", "scale", "up_axis", "mocap_framerate", "mocap_frame_rate")
     if not path.is_file():
         raise DyngsError(f"{path}: no such file")
@@ -110,7 +110,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
-    """(F, 55, 3) axis-angle, and how many numbers a frame has in the file."""
+    """Return axis-angle poses (F, 55, 3), and how many numbers a frame has in the file."""
     if "poses" in arrays:
         flat = _numbers(path, arrays, "poses")
         if flat.ndim != 2 or flat.shape[1] not in _MODELS:
@@ -127,6 +127,7 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
 
 
 def _joined_parts(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """Return poses (F, 165) joined from the parts of the body."""
     missing = [key for key in ("root_orient", "pose_body") if key not in arrays]
     if missing:
         raise DyngsError(f"{path}: has neither 'poses' nor '{missing[0]}'; give an AMASS file of a motion")
@@ -141,13 +142,13 @@ def _joined_parts(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str) -> np.ndarray:
-    """The finite float64 numbers at ``key``."""
+    """Return the finite float64 numbers at ``key``."""
     if key not in arrays:
         raise DyngsError(f"{path}: the key '{key}' is missing; give an AMASS file of a motion")
     value = arrays[key]
     if value.dtype.kind not in "fiu":
         raise DyngsError(f"{path}: '{key}' must hold numbers, not {value.dtype}")
-    with np.errstate(invalid="ignore", over="ignore"):  # of NaN and the like, which are refused below
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN and the like, which are refused below
         value = value.astype(np.float64)
     if not (np.abs(value) < 1e9).all():
         raise DyngsError(f"{path}: '{key}' holds NaN or huge numbers; repair or export it again")
@@ -155,6 +156,7 @@ def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str) -> np.ndarray:
 
 
 def _fps(path: Path, arrays: dict[str, np.ndarray]) -> float:
+    """Return the frames per second."""
     key = "mocap_frame_rate" if "mocap_frame_rate" in arrays else "mocap_framerate"
     rate = _numbers(path, arrays, key)
     if rate.size != 1 or not rate.item() > 0:
@@ -163,7 +165,7 @@ def _fps(path: Path, arrays: dict[str, np.ndarray]) -> float:
 
 
 def _scale(path: Path, arrays: dict[str, np.ndarray], frames: int) -> np.ndarray:
-    """(F,) of the template; 1 where nothing is said."""
+    """Return the scale (F,) of the template; 1 where the file has none."""
     scale = _numbers(path, arrays, "scale") if "scale" in arrays else np.ones(())
     if scale.shape not in ((), (1,), (frames,)) or not (scale > 0).all():
         raise DyngsError(f"{path}: 'scale' must be one positive number, or one for each of {frames} frames")
@@ -171,6 +173,7 @@ def _scale(path: Path, arrays: dict[str, np.ndarray], frames: int) -> np.ndarray
 
 
 def _is_z_up(path: Path, arrays: dict[str, np.ndarray], up: UpAxis) -> bool:
+    """Return whether the file is z up: by ``up``, its key ``up_axis``, or as AMASS files are."""
     if up != "auto":
         return up == "z"
     if "up_axis" not in arrays:
@@ -182,13 +185,14 @@ def _is_z_up(path: Path, arrays: dict[str, np.ndarray], up: UpAxis) -> bool:
 
 
 def _pelvis(body: BodyTemplate, betas: np.ndarray) -> np.ndarray:
-    """(3,) the root joint of the shaped body at rest."""
-    pelvis = body.joints[0].double().numpy()
+    """Return the root joint (3,) of the shaped body at rest."""
+    pelvis = body.joints[0].double().cpu().numpy()
     if body.joint_shape_dirs is None:
         return pelvis
-    directions = body.joint_shape_dirs[0].double().numpy()[:, : len(betas)]
+    directions = body.joint_shape_dirs[0].double().cpu().numpy()[:, : len(betas)]
     return pelvis + directions @ betas[: directions.shape[1]]
 
 
 def _got(value: np.ndarray) -> str:
+    """Return the shape in words."""
     return f"has {' x '.join(map(str, value.shape)) or 'one number'}"

@@ -23,7 +23,7 @@ _END_SITE = -1
 _MOST_JOINTS = 4096
 _LONGEST_NAME = 200
 _CHARACTERS = 1 << 16
-"""Of the part MOTION that are parsed at once."""
+"""Characters of MOTION that are parsed at once."""
 _GAP = re.compile(r"\s")
 _CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz")
 
@@ -37,10 +37,10 @@ class _Joint:
 
 
 def read_bvh(path: Path) -> SkeletonMotion:
-    """The motion of the file's joints, in its own units and axes; rest is where all rotations are zero.
+    """Read the motion of the file's joints, in its own units and axes; in the rest pose all rotations are zero.
 
-    A joint moves relative to its parent by T R: T is its position channels, or OFFSET along axes that have none, and
-    R = R_1 R_2 R_3 its rotations about single axes, in degrees, in the order of its channels.
+    The transform of a joint relative to its parent is T R: T from its position channels, or from OFFSET along axes
+    without one, and R = R_1 R_2 R_3 from its rotations about single axes, in degrees, in the order of its channels.
 
     Raises:
         DyngsError: names the file and what is wrong with it.
@@ -53,13 +53,15 @@ def read_bvh(path: Path) -> SkeletonMotion:
         positions = np.empty((len(values), len(joints), 3))
         rest = np.zeros((len(joints), 3))
         for part in frame_chunks(len(values)):
-            rest = _place(joints, values[part], rotations[part], positions[part])
+            rest = _forward_kinematics(joints, values[part], rotations[part], positions[part])
         names = tuple(joint.name for joint in joints)
         return SkeletonMotion(path, names, rest, rotations, positions, fps, world_is_y_up=False)
 
 
-def _place(joints: Sequence[_Joint], values: np.ndarray, rotations: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """(S, 3) the joints at rest; fills rotations (F, S, 3, 3) and positions (F, S, 3) of frames with values (F, C)."""
+def _forward_kinematics(
+    joints: Sequence[_Joint], values: np.ndarray, rotations: np.ndarray, positions: np.ndarray
+) -> np.ndarray:
+    """Fill world rotations (F, S, 3, 3) and positions (F, S, 3) from channels (F, C); return joints (S, 3) at rest."""
     rest = np.zeros((len(joints), 3))
     column = 0
     for i, joint in enumerate(joints):
@@ -76,9 +78,9 @@ def _place(joints: Sequence[_Joint], values: np.ndarray, rotations: np.ndarray, 
 
 
 def _halves(path: Path) -> tuple[str, str]:
-    """What stands before and after the line ``MOTION``."""
+    """Return the text before and after the line ``MOTION``."""
     if path.exists() and not path.is_file():
-        raise DyngsError(f"{path}: is no file; name a .bvh")
+        raise DyngsError(f"{path}: is not a file; name a .bvh")
     try:
         text = path.read_bytes().decode("utf-8-sig", errors="replace")
     except OSError as error:
@@ -92,11 +94,11 @@ def _halves(path: Path) -> tuple[str, str]:
 
 
 def _joints(path: Path, hierarchy: str) -> list[_Joint]:
-    """The joints, parents first."""
+    """Return the joints, parents first."""
     joints: list[_Joint] = []
-    lacking: set[int] = set()  # an OFFSET
-    blocks: list[int] = []  # the joints whose braces are open, _END_SITE among them
-    announced: int | None = None  # what the next brace opens
+    without_offset: set[int] = set()
+    blocks: list[int] = []  # joints with open braces, _END_SITE among them
+    announced: int | None = None  # the joint that the next brace opens
     for line in hierarchy.replace("{", "\n{\n").replace("}", "\n}\n").splitlines():
         words = line.split()
         if not words:
@@ -112,7 +114,7 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
         elif (starts_root or starts_joint) and len(words) > 1:
             announced = len(joints)
             require_at_most(path, announced + 1, _MOST_JOINTS, "joints")
-            lacking.add(announced)
+            without_offset.add(announced)
             joints.append(_Joint(" ".join(words[1:])[:_LONGEST_NAME], -1 if inside is None else inside))
         elif word == "END" and inside is not None and inside >= 0:
             announced = _END_SITE
@@ -122,15 +124,15 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
             continue
         elif word == "OFFSET" and inside is not None:
             joints[inside].offset = _offset(path, joints[inside].name, words[1:])
-            lacking.discard(inside)
+            without_offset.discard(inside)
         elif word == "CHANNELS" and inside is not None and inside >= 0:
             joints[inside].channels = _channels(path, joints[inside].name, words[1:])
         else:
             raise DyngsError(f"{path}: HIERARCHY: did not expect '{line.strip():.60}'; export it again")
     if not joints or blocks or announced is not None:
         raise DyngsError(f"{path}: HIERARCHY is cut off or has no ROOT; export it again")
-    if lacking:
-        raise DyngsError(f"{path}: the joint '{joints[min(lacking)].name}' has no OFFSET; export it again")
+    if without_offset:
+        raise DyngsError(f"{path}: the joint '{joints[min(without_offset)].name}' has no OFFSET; export it again")
     return joints
 
 
@@ -149,7 +151,7 @@ def _channels(path: Path, name: str, words: list[str]) -> list[str]:
 
 
 def _values(path: Path, rows: str, joints: Sequence[_Joint]) -> tuple[np.ndarray, float]:
-    """(F, C) numbers of the frames, and frames per second."""
+    """Return the channels (F, C) of the frames, and frames per second."""
     header = re.match(r"\s*Frames\s*:\s*(\d{1,9})\s+Frame\s+Time\s*:\s*(\S+)", rows, re.IGNORECASE)
     if header is None:
         raise DyngsError(f"{path}: MOTION must begin with 'Frames: ' and 'Frame Time: '; export it again")
@@ -158,7 +160,7 @@ def _values(path: Path, rows: str, joints: Sequence[_Joint]) -> tuple[np.ndarray
     if not frames or not channels or not seconds > 0:
         raise DyngsError(f"{path}: needs at least one frame, one channel and a positive Frame Time")
     fps = require_frame_rate(path, 1.0 / seconds if seconds > 1e-300 else math.inf)
-    if frames * channels > (len(rows) - header.end() + 1) // 2:  # each has a digit and a gap
+    if frames * channels > (len(rows) - header.end() + 1) // 2:  # each number takes a digit and a gap
         count = sum(1 for _ in re.finditer(r"\S+", rows[header.end() :]))
         raise _cut_off(path, frames, channels, count)
     require_frame_count(path, frames, len(joints))
@@ -182,7 +184,7 @@ def _cut_off(path: Path, frames: int, channels: int, count: int) -> DyngsError:
 
 
 def _numbers(path: Path, words: list[str]) -> np.ndarray:
-    """The finite float64 numbers."""
+    """Return the words as finite float64 numbers."""
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
@@ -193,7 +195,7 @@ def _numbers(path: Path, words: list[str]) -> np.ndarray:
 
 
 def _local_motion(offset: np.ndarray, channels: list[str], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(F, 3) position and (F, 3, 3) rotation relative to the parent."""
+    """Return position (F, 3) and rotation (F, 3, 3) relative to the parent."""
     position = np.tile(offset, (len(values), 1))
     rotation = Rotation.identity(len(values))
     for channel, value in zip(channels, values.T, strict=True):

@@ -1,27 +1,28 @@
-"""A person's motion in the world of the cameras: body parameters at the times of a clip, and at any moment between.
+"""A motion clip in the world of the cameras: body parameters at given times, interpolated at any time between.
 
 Local letters: F frames, J joints, V views.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.human.motion.motion import Motion
+from dyngs.human.motion.motion import Motion, interpolate_rotations
+from dyngs.human.pose.tensor_fields import tensors_to
 
 _SAME_TIME = 1e-9
 
 
 @dataclass(frozen=True)
 class MotionClip:
-    """Poses of a body at F >= 1 moments.
+    """Body parameters at F >= 1 times.
 
     Attributes:
-        times: (F,) float64 in [0, 1], ascending, no two alike.
+        times: (F,) float64 in [0, 1], strictly ascending; always on the CPU, as they are read one by one.
         poses: (F, J, 3) axis-angle relative to the parent joint, rad.
         trans: (F, 3) world units, added last.
         scale: (F,) world units per metre of the template.
@@ -35,41 +36,38 @@ class MotionClip:
     def __len__(self) -> int:
         return len(self.times)
 
+    def to(self, *, device: torch.device | str) -> MotionClip:
+        """Return the clip with its poses, translations and scales on ``device``."""
+        return replace(tensors_to(self, device), times=self.times)
+
     def select(self, rows: Tensor) -> MotionClip:
-        """The frames at ``rows``, ascending."""
+        """Return the frames at ``rows`` (long, on the CPU, ascending)."""
         return MotionClip(self.times[rows], self.poses[rows], self.trans[rows], self.scale[rows])
 
     def at(self, time: float | None) -> MotionClip:
-        """The one frame at ``time``, clamped to those there are; None is the first.
+        """Return a clip of one frame at ``time``, clamped to the clip; None: the first frame.
 
-        Between two frames rotations turn evenly the shorter way, all else is linear.
+        Between frames rotations are interpolated spherically the shorter way, all else linearly.
         """
         times = self.times
         moment = float(times[0]) if time is None else min(max(time, float(times[0])), float(times[-1]))
         after = int(torch.searchsorted(times, moment - _SAME_TIME).clamp_max(len(self) - 1))
         if abs(float(times[after]) - moment) <= _SAME_TIME:
-            return self.select(torch.tensor([after]))
+            return self.select(torch.tensor([after], device="cpu"))
         before = after - 1
         share = (moment - float(times[before])) / float(times[after] - times[before])
         return MotionClip(
-            times=torch.tensor([moment], dtype=times.dtype),
-            poses=_turned_partly(self.poses[before], self.poses[after], share)[None],
+            times=torch.tensor([moment], dtype=times.dtype, device=times.device),
+            poses=interpolate_rotations(self.poses[before:after], self.poses[after : after + 1], np.array([share])),
             trans=torch.lerp(self.trans[before], self.trans[after], share)[None],
             scale=torch.lerp(self.scale[before], self.scale[after], share)[None],
         )
 
 
 def motion_clip(motion: Motion) -> MotionClip:
-    """The clip of a motion file, its frames spread evenly over [0, 1], where and as large as the file says."""
+    """Return the motion as a clip, its frames spread evenly over [0, 1]; place and size stay as given."""
     count = len(motion)
-    times = torch.from_numpy(np.linspace(0, 1, count)) if count > 1 else torch.zeros(1, dtype=torch.float64)
+    times = (
+        torch.from_numpy(np.linspace(0, 1, count)) if count > 1 else torch.zeros(1, dtype=torch.float64, device="cpu")
+    )
     return MotionClip(times, motion.poses.float(), motion.trans.float(), motion.scale.float())
-
-
-def _turned_partly(before: Tensor, after: Tensor, share: float) -> Tensor:
-    """(J, 3) rotations between two of those: R_a exp(s log(R_a^T R_b))."""
-    from scipy.spatial.transform import Rotation
-
-    start = Rotation.from_rotvec(before.double().numpy())
-    turn = (start.inv() * Rotation.from_rotvec(after.double().numpy())).as_rotvec()
-    return torch.from_numpy((start * Rotation.from_rotvec(share * turn)).as_rotvec()).to(before)

@@ -1,4 +1,4 @@
-"""Which joint of another skeleton is which of ours, by the names that common programs give them."""
+"""Joints of other skeletons matched to those of SMPL-X, by the names that common programs give them."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ _OURS = (
     "pelvis spine1 spine2 spine3 neck head *_collar *_shoulder *_elbow *_wrist *_hip *_knee *_ankle *_foot "
     "*_index# *_middle# *_pinky# *_ring# *_thumb# jaw *_eye"
 )
-"""Our names; ``*`` stands for left and right, ``#`` for 1, 2 and 3."""
+"""Names of SMPL-X; ``*`` stands for left and right, ``#`` for 1, 2 and 3."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """The names of one kind of skeleton, in lower case and without punctuation.
+    """The joint names of one kind of skeleton, in lower case and without punctuation.
 
     Attributes:
         name: of the program or data set.
-        sides: what stands for ``*``: left and right.
-        words: a name for each word of ours; ``a|b`` is a or b, ``-`` none. Those at the end may be missing.
-        segments: what stands for ``#``.
+        sides: text for ``*``: left and right.
+        words: a name for each word of ``_OURS``; ``a|b`` is a or b, ``-`` none. Words at the end may be missing.
+        segments: text for ``#``.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Rig:
     segments: tuple[str, str, str] = ("1", "2", "3")
 
     def joints(self) -> Iterator[tuple[str, tuple[str, ...]]]:
-        """Each of our joints, and the names that it may have."""
+        """Yield each joint of SMPL-X with the names that it may have here."""
         for ours, theirs in zip(_OURS.split(), self.words.split(), strict=False):
             for our_side, side in zip(("left", "right"), self.sides, strict=True) if "*" in ours else [("", "")]:
                 for i, segment in enumerate(self.segments, 1) if "#" in ours else [("", "")]:
@@ -101,7 +101,7 @@ RIGS = (
         "finger2#* finger3#* finger5#* finger4#* finger1#*",
     ),
 )
-"""Rocketbox avatars are Biped, VALID avatars Mixamo, the cgspeed conversions of CMU are CMU or DAZ."""
+"""Rocketbox avatars use Biped, VALID avatars Mixamo, the cgspeed conversions of CMU either CMU or DAZ."""
 
 _NEEDED = (
     "pelvis",
@@ -110,13 +110,13 @@ _NEEDED = (
 
 
 def match_joints(path: Path, names: Sequence[str]) -> dict[str, int]:
-    """Our joints that a skeleton with these joint names has, and which of them each is.
+    """Return the joints of SMPL-X that a skeleton with these joint names has, with their indices in ``names``.
 
-    Case, punctuation and whatever precedes the name of the pelvis (``mixamorig:``, ``Bip01``) do not matter. Of the
-    known kinds, the one with most joints of the body is taken.
+    Case, punctuation and a prefix before the name of the pelvis (``mixamorig:``, ``Bip01``) do not matter. The rig that
+    matches most joints of the body is chosen.
 
     Raises:
-        DyngsError: the pelvis, a leg or an arm is missing; names it, and the file ``path``.
+        DyngsError: the pelvis, a leg or an arm is missing; names the joint and the file ``path``.
     """
     plain = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
     best: dict[str, int] = {}
@@ -133,19 +133,19 @@ def match_joints(path: Path, names: Sequence[str]) -> dict[str, int]:
     if missing:
         known = ", ".join(rig.name for rig in RIGS)
         raise DyngsError(
-            f"{path}: unknown joint names; as a skeleton of {best_rig.name}, the most similar kind, it lacks "
-            f"{', '.join(missing)}; rename its joints (known kinds: {known})"
+            f"{path}: unknown joint names; compared with {best_rig.name}, the most similar rig, it lacks "
+            f"{', '.join(missing)}; rename its joints (known rigs: {known})"
         )
     return best
 
 
 def _prefixes(names: list[str], pelvis: tuple[str, ...]) -> list[str]:
-    """At most four distinct texts that precede a name of the pelvis, none first."""
+    """Return at most four distinct prefixes of a name of the pelvis, the empty one first."""
     found = [name.removesuffix(end) for name in names for end in pelvis if name.endswith(end)]
     return list(dict.fromkeys(["", *found]))[:4]
 
 
 def _found(wanted: dict[str, tuple[str, ...]], there: dict[str, int]) -> dict[str, int]:
-    """Index of the first name that is there, of each joint that has one."""
+    """Return the index of the first name that is present, for each joint that has one."""
     hits = {ours: [there[name] for name in names if name in there] for ours, names in wanted.items()}
     return {ours: indices[0] for ours, indices in hits.items() if indices}

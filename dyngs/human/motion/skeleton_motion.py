@@ -1,4 +1,7 @@
-"""The motion of any skeleton, as motion files hold it: joints in the world, frame by frame."""
+"""The motion of any skeleton, as motion files hold it: world rotations and positions of joints.
+
+Local letters: S joints of the skeleton, F frames.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +13,16 @@ import numpy as np
 
 @dataclass(frozen=True)
 class SkeletonMotion:
-    """How the S joints of some other skeleton move; float64, in any unit of length.
+    """The motion of S joints of another skeleton than ours; float64, in any unit of length.
 
     Attributes:
         path: of the file, for messages.
-        names: S.
-        rest: (S, 3) joints of the rest pose, in axes of its own.
+        names: (S,) of the joints.
+        rest: (S, 3) joints in the rest pose, in its own axes.
         rotations: (F, S, 3, 3) world_from_rest of each joint.
         positions: (F, S, 3) of the joints in the world.
         fps: frames per second.
-        world_is_y_up: whether the world is known to be y up; otherwise its axes are those of the rest pose.
+        world_is_y_up: whether the world is known to be y up; otherwise it has the axes of the rest pose.
     """
 
     path: Path

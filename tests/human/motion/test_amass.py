@@ -215,8 +215,11 @@ NAN = np.full((FRAMES, 3), np.nan)
         ({"betas": np.zeros((4, 10))}, "'betas' must be one row of numbers, has 4 x 10"),
         ({"scale": -1.0}, "'scale' must be one positive number"),
         ({"scale": np.ones(3)}, "'scale' must be one positive number, or one for each of 4 frames"),
-        ({"mocap_framerate": 1e-310}, "1e-310 frames per second are not those of a motion"),
-        ({"poses": np.zeros((90_910, 72), np.uint8)}, "90910 frames of 55 joints are too many, 5,000,000 poses"),
+        ({"mocap_framerate": 1e-310}, "1e-310 frames per second is not the rate of a motion"),
+        (
+            {"poses": np.zeros((90_910, 72), np.uint8)},
+            "90910 frames of 55 joints are too many; at most 5,000,000 poses",
+        ),
         ({"up_axis": np.frombuffer(b"\xff" * 4, "<U1")}, "'up_axis' is not an array .*what is no text"),
         ({"up_axis": ["y", "z"]}, "'up_axis' must be 'y' or 'z', not"),
         ({"up_axis": "x"}, "'up_axis' must be 'y' or 'z', not 'x'"),

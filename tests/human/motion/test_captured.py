@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.data.body_frames import BodyFrames, body_frames
-from dyngs.data.capture import View
+from dyngs.data.body_frames import body_frames
+from dyngs.data.capture import BodyFrames, View
 from dyngs.errors import DyngsError
 from dyngs.human.motion.captured import captured_motion, same_bodies
 

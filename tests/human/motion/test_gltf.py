@@ -251,7 +251,7 @@ BREAKS: dict[str, tuple[Callable[[Glb], object], str]] = {
     "matrix": (lambda g: _node(g, matrix=np.eye(4).ravel().tolist()), "node 0 is animated but has a matrix"),
     "weights only": (
         lambda g: [c["target"].update(path="weights") for c in g.json["animations"][0]["channels"]],
-        "turns or moves no joint",
+        "moves no joint",
     ),
 }
 

@@ -94,7 +94,7 @@ def test_motions_that_fill_the_memory_are_refused(monkeypatch: pytest.MonkeyPatc
     """Of few joints too, as the body has 55."""
     require_frame_count(Path("x.glb"), MAX_JOINT_POSES // 100, 100)
     for frames, joints in ((MAX_JOINT_POSES // 100 + 1, 100), (MAX_JOINT_POSES // 55 + 1, 1), (float("inf"), 1)):
-        with pytest.raises(DyngsError, match=r"x\.glb: .* too many, 5,000,000 .* or set .* DYNGS_LIMITS="):
+        with pytest.raises(DyngsError, match=r"x\.glb: .* too many; at most 5,000,000 .* or set .* DYNGS_LIMITS="):
             require_frame_count(Path("x.glb"), frames, joints)
     monkeypatch.setenv("DYNGS_LIMITS", "2")
     require_frame_count(Path("x.glb"), 2 * MAX_JOINT_POSES // 100, 100)
@@ -108,7 +108,7 @@ def test_resampling_has_the_same_limit() -> None:
 
 @pytest.mark.parametrize("fps", [0.0, 1e-310, 1e-9, 1e6, float("inf"), float("nan")])
 def test_rates_of_no_motion(fps: float) -> None:
-    with pytest.raises(DyngsError, match=r"x\.bvh: .* frames per second are not those of a motion"):
+    with pytest.raises(DyngsError, match=r"x\.bvh: .* frames per second is not the rate of a motion"):
         require_frame_rate(Path("x.bvh"), fps)
 
 
@@ -117,6 +117,6 @@ def test_long_motions_are_worked_on_in_parts() -> None:
     motion = random_motion(2500)
     whole, parts = motion.resampled(24.0), frame_chunks(2500)
     assert [(part.start, part.stop) for part in parts] == [(0, 1024), (1024, 2048), (2048, 2500)]
-    expected = motion._between(sample_times(2499, 30.0, 24.0), 24.0)
+    expected = motion._interpolated(sample_times(2499, 30.0, 24.0), 24.0)
     for name in ("poses", "trans", "scale"):
         torch.testing.assert_close(getattr(whole, name), getattr(expected, name))

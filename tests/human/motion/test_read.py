@@ -56,7 +56,7 @@ def test_the_body_that_comes_with_dyngs_is_the_default(tmp_path: Path) -> None:
     ("name", "options", "problem"),
     [
         ("x.fbx", {}, r"x\.fbx: unknown kind of motion; give an AMASS \.npz"),
-        ("x.bvh", {"up": "z"}, "the up axis can only be told of an .npz"),
+        ("x.bvh", {"up": "z"}, "the up axis can only be chosen for an .npz"),
         ("x.npz", {"clip": "Walk"}, "holds one motion without a name"),
         ("x.bvh", {}, "cannot be read"),
         ("x.glb", {}, "cannot be read"),

@@ -251,7 +251,7 @@ def test_a_rest_pose_that_lies_in_a_line_is_refused() -> None:
 def test_a_rest_pose_without_sides_is_refused() -> None:
     own = skeleton()
     flat = own.rest * (0, 1, 1)
-    with pytest.raises(DyngsError, match=r"x\.bvh: in its rest pose left and right do not differ"):
+    with pytest.raises(DyngsError, match=r"x\.bvh: in its rest pose left and right coincide"):
         retarget(at_rest(replace(own, rest=flat)), tiny_body())
 
 

@@ -302,7 +302,7 @@ def with_parents(change: dict[int, int]) -> Arrays:
 
 
 WRONG: dict[str, tuple[Arrays, str]] = {
-    "cycle": (with_parents({4: 7, 7: 4}), "no tree: joint .* is its own ancestor"),
+    "cycle": (with_parents({4: 7, 7: 4}), "not a tree: joint .* is its own ancestor"),
     "own parent": (with_parents({3: 3}), "joint 3 is its own ancestor"),
     "no root": (with_parents({0: 23}), "is its own ancestor"),
     "two roots": (with_parents({5: -1}), "joint 5 has no parent; only joint 0"),
