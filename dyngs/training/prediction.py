@@ -60,7 +60,7 @@ class Filmed:
     def look(self, views: list[int]) -> TexelMaps:
         """What these pictures show."""
         return observe_texels(
-            self.sitter, ((self.pictures[i], self.sitter.posing(self.sitter.views[i])) for i in views)
+            self.sitter, ((self.pictures[i], self.sitter.pose_in(self.sitter.views[i])) for i in views)
         )
 
 

@@ -14,33 +14,34 @@ from torch import Tensor
 from dyngs.conventions import num_sh_terms
 from dyngs.gaussians import Gaussians
 from dyngs.human.pose.nearest_rotation import quats_of
+from dyngs.human.pose.tensor_fields import tensors_to
 from dyngs.human.template.atlas import Texels, scaffold_points
 
 MAX_JOINTS = 8
-"""Joints that one Gaussian follows at most; the template's vertices follow no more."""
+"""Limit on the joints that one Gaussian follows; vertices of the free template follow no more."""
 
 
 _WIDTH, _THICKNESS = 0.5, 0.25
-"""Standard deviations of a first Gaussian, in texels of the surface: within it, and along its normal."""
+"""Standard deviations of an initial Gaussian in the tangent plane and along the normal, in sides of its texel."""
 
 
-_SKIN, _SHELL = 0.9, 0.1
-"""Opacities of the first Gaussians: on the lowest scaffold, and on those above it."""
+_LOWEST_OPACITY, _UPPER_OPACITY = 0.9, 0.1
+"""Initial opacities: on the lowest scaffold, and on those above it."""
 
 
 @dataclass(frozen=True)
 class Anchors:
-    """What ties each of N Gaussians to the template: constant, row by row.
+    """What ties each of N Gaussians to the template; constant.
 
     Attributes:
-        points: (N, 3) place at rest on its scaffold, m.
-        size: (N,) side of its texel, m.
-        joints: (N, K) int64 that it follows, heaviest first.
-        weights: (N, K) shares, rows sum to 1.
-        face: (N,) int64 triangle of the template in which its texel lies.
+        points: (N, 3) at rest on the scaffold, m.
+        size: (N,) side of the texel, m.
+        joints: (N, K) int64 joints that the Gaussian follows, heaviest first.
+        weights: (N, K) skinning weights of these joints, rows sum to 1.
+        face: (N,) int64 triangle of the template that holds the texel's centre.
         barycentric: (N, 3) of the texel's centre in that triangle.
         uv: (N, 2) of the texel's centre in the atlas.
-        height: (N,) of its scaffold above the skin, m.
+        height: (N,) of the scaffold above the skin, m.
     """
 
     points: Tensor
@@ -56,49 +57,53 @@ class Anchors:
         return len(self.points)
 
     def select(self, index: Tensor) -> Anchors:
-        """The rows at ``index`` (long or bool)."""
+        """Return the rows at ``index`` (long or bool)."""
         return Anchors(**{name: x[index] for name, x in self.tensors().items()})
 
+    def to(self, *, device: torch.device | str) -> Anchors:
+        """Return the anchors on ``device``."""
+        return tensors_to(self, device)
+
     def tensors(self) -> dict[str, Tensor]:
-        """Field name to tensor."""
+        """Return the tensors by field name."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 def texel_gaussians(texels: Texels, heights: Sequence[float], sh_degree: int) -> tuple[Gaussians, Anchors]:
-    """Grey discs on every texel, ``heights`` (m) above the surface, at rest; the lowest height is nearly opaque.
+    """Return grey discs on every texel, at all ``heights`` (m) above the surface at rest; nearly opaque at the lowest.
 
-    A disc lies in the tangent plane, as wide as its texel; those of one height follow those of the one before.
+    A disc lies in the tangent plane, as wide as its texel. Rows are ordered by height, then by texel.
     """
-    places = scaffold_points(texels, heights)
-    of = places.texel
-    size = texels.size[of]
+    scaffolds = scaffold_points(texels, heights)
+    rows = scaffolds.texel
+    size = texels.size[rows]
     joints, weights = heaviest_joints(texels.weights)
-    rows, columns = (texels.index // texels.resolution, texels.index % texels.resolution)
-    uv = torch.stack([columns + 0.5, texels.resolution - 0.5 - rows], dim=1).to(size) / texels.resolution
+    row, column = (texels.index // texels.resolution, texels.index % texels.resolution)
+    uv = torch.stack([column + 0.5, texels.resolution - 0.5 - row], dim=1).to(size) / texels.resolution
     anchors = Anchors(
-        points=places.points(texels),
+        points=scaffolds.points(texels),
         size=size,
-        joints=joints[of],
-        weights=weights[of],
-        face=texels.faces[of],
-        barycentric=texels.barycentric[of],
-        uv=uv[of],
-        height=places.height,
+        joints=joints[rows],
+        weights=weights[rows],
+        face=texels.faces[rows],
+        barycentric=texels.barycentric[rows],
+        uv=uv[rows],
+        height=scaffolds.height,
     )
     ratios = size.new_tensor([_WIDTH, _WIDTH, _THICKNESS]).log()
-    opacity = torch.where(places.height == min(heights), _SKIN, _SHELL)
+    opacity = torch.where(scaffolds.height == min(heights), _LOWEST_OPACITY, _UPPER_OPACITY)
     gaussians = Gaussians(
         means=anchors.points.clone(),
-        quats=quats_of(texels.frames)[of],
+        quats=quats_of(texels.frames)[rows],
         log_scales=size.log()[:, None] + ratios,
         logit_opacities=(opacity / (1 - opacity)).log().to(size),
-        sh=size.new_zeros(len(places), num_sh_terms(sh_degree), 3),
+        sh=size.new_zeros(len(scaffolds), num_sh_terms(sh_degree), 3),
     )
     return gaussians, anchors
 
 
 def heaviest_joints(weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Joints (P, K) int64 and shares (P, K), normalised, of the heaviest of ``weights`` (P, J); ties by index."""
+    """Return the joints (P, K) int64 of the largest of ``weights`` (P, J), and these, normalised; ties by index."""
     count = min(MAX_JOINTS, weights.shape[1])
     ordered = weights.sort(dim=1, descending=True, stable=True)
     kept = ordered.values[:, :count]
@@ -106,13 +111,13 @@ def heaviest_joints(weights: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def skinning_weights(anchors: Anchors, num_joints: int, corrections: Tensor | None = None) -> Tensor:
-    """(N, J) shares; with ``corrections`` (N, K) those of the followed joints are w e^c, normalised.
+    """Return skinning weights (N, J); with ``corrections`` c (N, K), w e^c, normalised, for the followed joints.
 
-    Where a Gaussian follows one joint alone no correction does anything: they act where parts of the body meet.
+    Corrections have no effect where a Gaussian follows a single joint: they act where parts of the body meet.
     """
-    shares = anchors.weights
+    weights = anchors.weights
     if corrections is not None:
-        shares = shares * corrections.exp()
-        shares = shares / shares.sum(1, keepdim=True)
-    dense = shares.new_zeros(len(anchors), num_joints)
-    return dense.scatter_add(1, anchors.joints, shares)
+        weights = weights * corrections.exp()
+        weights = weights / weights.sum(1, keepdim=True)
+    dense = weights.new_zeros(len(anchors), num_joints)
+    return dense.scatter_add(1, anchors.joints, weights)

@@ -1,7 +1,7 @@
-"""What is learned about a body beside its Gaussians: the fit of every frame, the skeleton, the skinning weights.
+"""Learned corrections of the body fit beside the Gaussians: poses of the frames, skeleton, skinning weights.
 
-Body fits are never exact, and the template is not the person. Everything starts at what was given. Local letters: F
-frames, J joints, N Gaussians, K joints that one follows.
+Body fits are never exact, and the template is not the person. All corrections start at zero. Local letters: F frames,
+J joints, N Gaussians, K joints that one Gaussian follows.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.posing import BodyPose, Skeleton
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.human.pose.tensor_fields import tensors_to
 from dyngs.parameters import Parameters
 from dyngs.state import Role
 
@@ -35,28 +36,32 @@ LR_DECAY = 0.1
 POSE_WEIGHT, WEIGHTS_WEIGHT = 1e-4, 1e-3
 """Of the squared corrections of poses and joints, and of skinning weights, in the loss."""
 POSE_CM = 0.05
-"""Turn of a joint, rad, that counts as much as a centimetre."""
+"""Rotation of a joint, rad, that is penalized as much as a centimetre."""
 
 
 @dataclass(frozen=True)
 class SharedCorrection:
-    """What was learned about all poses of a person.
+    """The correction of all poses of a person.
 
     Attributes:
-        turns: (J, 3) axis-angle, rad, applied before the given rotation of a joint.
-        log_scale: natural logarithm of the change of the template's size.
+        turns: (J, 3) axis-angle, rad: rotations of the joints applied before those of a pose.
+        log_scale: natural logarithm of the factor on the template's size.
     """
 
     turns: Tensor
     log_scale: float
 
+    def to(self, *, device: torch.device | str) -> SharedCorrection:
+        """Return the correction on ``device``."""
+        return tensors_to(self, device)
+
 
 def new_corrections(options: HumanModel, clip: MotionClip, skeleton: Skeleton, anchors: Anchors) -> Parameters:
-    """Return differences, all zero, to a clip of F frames, a skeleton and skinning weights, to be learned.
+    """Return the corrections to learn, all zero, of a clip of F frames, a skeleton and skinning weights.
 
-    Names: ``poses`` (F, J, 3) axis-angle, applied before the given rotation of a joint; ``trans`` (F, 3); ``turns``
-    (J, 3) as ``poses`` but of all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K); as an option
-    ``pose_dirs`` (N, 27), see ``dyngs.human.avatar.posing.learned_offsets``.
+    Tensors: ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before the given ones; ``trans`` (F, 3);
+    ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K);
+    optionally ``pose_dirs`` (N, 27), see ``dyngs.human.avatar.posing.learned_offsets``.
     """
     unit = float(clip.scale.mean())
     zeros = {
@@ -74,7 +79,7 @@ def new_corrections(options: HumanModel, clip: MotionClip, skeleton: Skeleton, a
 
 
 def correction_penalties(learned: Parameters, options: HumanModel) -> dict[str, Tensor]:
-    """Return weighted mean squares: fits and weights should stay near what was given."""
+    """Return weighted mean squares that keep poses, joints and skinning weights near what was given."""
     turns = (learned["poses"].square().mean() + learned["turns"].square().mean()) / POSE_CM**2
     terms = {"pose": POSE_WEIGHT * (turns + (100 * learned["joints"]).square().mean())}
     if "pose_dirs" in learned and options.offset_weight > 0:
@@ -84,7 +89,7 @@ def correction_penalties(learned: Parameters, options: HumanModel) -> dict[str, 
 
 
 def corrected_pose(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
-    """The pose of frame ``row`` of the clip that was trained on."""
+    """Return the corrected pose of frame ``row`` of the clip of training."""
     own = axis_angle_to_matrix(learned["turns"] + learned["poses"][row])
     return BodyPose(
         axis_angle_to_matrix(clip.poses[row]) @ own,
@@ -96,14 +101,14 @@ def corrected_pose(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
 def corrected_clip(
     fit: SharedCorrection, clip: MotionClip, poses: Tensor | None = None, trans: Tensor | None = None
 ) -> MotionClip:
-    """The clip with ``fit`` applied, and with what was learned about its own ``poses`` (F, J, 3) and ``trans`` (F, 3).
+    """Return the clip with ``fit`` applied, and the corrections ``poses`` (F, J, 3) and ``trans`` (F, 3) of its frames.
 
-    The poses of ``corrected_posing`` as axis-angle vectors.
+    The same poses as ``corrected_pose``, as axis-angle vectors.
     """
     from scipy.spatial.transform import Rotation
 
     own = fit.turns.expand_as(clip.poses) if poses is None else fit.turns + poses
-    given, extra = (Rotation.from_rotvec(x.detach().double().reshape(-1, 3).numpy()) for x in (clip.poses, own))
+    given, extra = (Rotation.from_rotvec(x.detach().double().reshape(-1, 3).cpu().numpy()) for x in (clip.poses, own))
     return replace(
         clip,
         poses=torch.from_numpy((given * extra).as_rotvec()).to(clip.poses).reshape(clip.poses.shape),
@@ -113,10 +118,10 @@ def corrected_clip(
 
 
 def corrected_skeleton(learned: Parameters, skeleton: Skeleton) -> Skeleton:
-    """Joints where they were learned to be."""
+    """Return the skeleton with its corrected joints."""
     return Skeleton(skeleton.joints + learned["joints"], skeleton.parents)
 
 
 def corrected_weights(learned: Parameters, anchors: Anchors, num_joints: int) -> Tensor:
-    """(N, J) skinning weights."""
+    """Return the corrected skinning weights (N, J)."""
     return skinning_weights(anchors, num_joints, learned["weights"])

@@ -1,4 +1,4 @@
-"""What the tensors of a person in a file must be like, so that it can be posed and drawn.
+"""Checks of the tensors of a stored avatar: shapes, ranges and indices, so that it can be posed and drawn.
 
 Local letters: N Gaussians, J joints, K joints that one Gaussian follows, F frames, M vertices and T triangles of the
 template.
@@ -20,11 +20,11 @@ _MOST_FACES = 2**31
 
 
 def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
-    """Nothing, if the state of a person's model fits its Gaussians.
+    """Check the state of an avatar against its Gaussians.
 
     Raises:
-        KeyError: a tensor lacks.
-        ValueError: one is not as the others have it.
+        KeyError: a tensor is missing.
+        ValueError: a tensor has a wrong shape, type or range.
     """
     n, j, f = len(gaussians), len(state["joints"]), len(state["clip.times"])
     require_body(gaussians, state["parents"], j)
@@ -41,7 +41,7 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
     prefix = "anchors."
     require_anchors({name.removeprefix(prefix): x for name, x in state.items() if name.startswith(prefix)}, n, j)
     if bool((state["anchors.weights"] < 0).any()) or not bool((state["anchors.weights"].sum(1) > 0).all()):
-        raise ValueError("the skinning weights of a Gaussian are no shares")
+        raise ValueError("the skinning weights of a Gaussian are negative or sum to 0")
     require_tensor("learned.weights", state["learned.weights"], tuple(state["anchors.weights"].shape))
     if "learned.pose_dirs" in state:
         require_tensor("learned.pose_dirs", state["learned.pose_dirs"], (n, 27))
@@ -52,7 +52,7 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
 
 
 def require_body(gaussians: Gaussians, parents: Tensor, num_joints: int) -> None:
-    """Nothing, if there are Gaussians of at most 4 harmonics, on a skeleton of a known kind. Raises ValueError."""
+    """Check that the Gaussians have 1 or 4 harmonics and the skeleton is of a known family. Raises ValueError."""
     terms = gaussians.sh.shape[1]
     if num_joints not in SMPLX_ROWS or terms not in (1, 4):
         raise ValueError(f"{len(gaussians)} Gaussians of {terms} harmonics on {num_joints} joints")
@@ -62,7 +62,7 @@ def require_body(gaussians: Gaussians, parents: Tensor, num_joints: int) -> None
 
 
 def require_anchors(anchors: Mapping[str, Tensor], num_gaussians: int, num_joints: int) -> None:
-    """Nothing, if the anchors are those of N Gaussians on J joints. Raises KeyError or ValueError."""
+    """Check the anchors of N Gaussians on J joints. Raises KeyError or ValueError."""
     n, k = num_gaussians, anchors["weights"].shape[-1]
     shapes = {"points": (n, 3), "size": (n,), "barycentric": (n, 3), "uv": (n, 2), "height": (n,), "weights": (n, k)}
     for name, shape in shapes.items():
@@ -72,7 +72,7 @@ def require_anchors(anchors: Mapping[str, Tensor], num_gaussians: int, num_joint
 
 
 def require_shapes(directions: Tensor, faces: Tensor, num_joints: int) -> None:
-    """Nothing, if these are pose blend shapes of a template with J joints. Raises ValueError."""
+    """Check the pose blend shapes of a template with J joints. Raises ValueError."""
     require_tensor("shapes.directions", directions, (9 * (num_joints - 1), None), torch.float16)
     require_indices("shapes.faces", faces, (None, 3), directions.shape[1] // 3, torch.int32)
     if directions.shape[1] % 3:

@@ -1,5 +1,5 @@
-"""A person from a few pictures, by a network over the atlas that was trained on other people (GHG, Kwon et al. 2024).
+"""An avatar from a few pictures, by a network over the atlas trained on other people (GHG, Kwon et al. 2024).
 
-The way to an avatar without training on the person: ``maps`` brings the pictures to the atlas, ``network`` fills it,
-``fill`` makes Gaussians of it.
+``person`` prepares a capture, ``texel_maps`` maps its pictures to the atlas, ``network`` is the UNet over these maps,
+``predict`` makes Gaussians of its output.
 """

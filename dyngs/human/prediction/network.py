@@ -1,4 +1,4 @@
-"""The network that fills an atlas: a UNet over maps of what a few pictures show (GHG, Kwon et al. 2024).
+"""The network over the atlas: a UNet on maps of observations in a few pictures (GHG, Kwon et al. 2024).
 
 Local letters: D input channels, K scaffolds, S texels per side.
 """
@@ -12,26 +12,26 @@ from torch import Tensor, nn
 
 from dyngs.errors import DyngsError
 
-HEADS = {"turn": 4, "stretch": 3, "opacity": 1, "rise": 1, "paint": 3, "trust": 1}
-"""What is predicted for a texel of a scaffold, and in how many numbers; see ``dyngs.human.prediction.predict``."""
+HEADS = {"rotation": 4, "scale": 3, "opacity": 1, "height": 1, "colour": 3, "picture_weight": 1}
+"""Outputs per texel of a scaffold and their number of channels; see ``dyngs.human.prediction.predict``."""
 
 _GROUPS = 8
 
 
 class AtlasNetwork(nn.Module):
-    """Maps (D, S, S) in, raw predictions (K, 13, S, S) in the order of ``HEADS`` out; these are 0 before training.
+    """UNet from maps (D, S, S) to raw predictions (K, 13, S, S) in the order of ``HEADS``, which are 0 before training.
 
-    Half the resolution after the first layer, and half of that for each further width; back up with what was there on
-    the way down, and the inputs themselves at full resolution.
+    Each width halves the resolution; the way up concatenates the features of the way down, and at full resolution the
+    input itself.
     """
 
     def __init__(self, channels: int, scaffolds: int, widths: Sequence[int], generator: torch.Generator) -> None:
         """
         Args:
-            channels: D.
+            channels: D, of the input.
             scaffolds: K.
-            widths: channels at 1/2, 1/4, .. of the resolution; multiples of 8.
-            generator: of the first weights.
+            widths: channels at 1/2, 1/4, ... of the resolution; multiples of 8.
+            generator: of the initial weights, on the CPU.
 
         Raises:
             DyngsError: a width that is not a multiple of 8.
@@ -57,19 +57,19 @@ class AtlasNetwork(nn.Module):
         nn.init.zeros_(self.heads.weight)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """(K, 13, S, S); S must be a multiple of 2 to the number of widths."""
+        """Return the raw predictions (K, 13, S, S); S must be a multiple of 2 to the number of widths."""
         levels = [maps[None]]
         for layer in self.down:
             levels.append(layer(levels[-1]))
         features = levels.pop()
         for layer in self.up:
-            features = layer(torch.cat([_twice(features), levels.pop()], dim=1))
-        features = self.last(torch.cat([_twice(features), maps[None]], dim=1))
+            features = layer(torch.cat([_upsampled(features), levels.pop()], dim=1))
+        features = self.last(torch.cat([_upsampled(features), maps[None]], dim=1))
         return self.heads(features)[0].unflatten(0, (self.scaffolds, -1))
 
 
 class _Block(nn.Module):
-    """Two convolutions beside a shortcut."""
+    """Residual block of two convolutions."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -82,5 +82,6 @@ class _Block(nn.Module):
         return features + self.layers(features)
 
 
-def _twice(features: Tensor) -> Tensor:
+def _upsampled(features: Tensor) -> Tensor:
+    """Return the features at twice the resolution, bilinear."""
     return nn.functional.interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)

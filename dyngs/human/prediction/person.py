@@ -1,4 +1,4 @@
-"""Who is to be predicted: the template in a person's shape, its texels, and which views show the most of it.
+"""A captured person to predict: the template in the person's shape, its texels, and the choice of views.
 
 Local letters: P texels, K scaffolds, V views, M vertices.
 """
@@ -27,17 +27,17 @@ from dyngs.human.template.mesh import vertex_normals
 
 @dataclass(frozen=True)
 class CapturedPerson:
-    """A person of whom there are pictures.
+    """A person with pictures, as input of a prediction.
 
     Attributes:
         name: of the capture, for messages.
-        body: the template in the person's shape, which is its only one.
-        normals: (M, 3) of its vertices.
+        body: the template in the person's shape, without a shape space.
+        normals: (M, 3) unit normals of its vertices.
         texels: P, of that shape.
         heights: (K,) of the scaffolds, m, ascending.
-        gaussians: K P grey discs, those of one scaffold after those of another.
+        gaussians: K P grey discs, ordered by scaffold.
         subject: skeleton, poses, and the anchors of ``gaussians``.
-        views: with pictures, in the order of the capture's ``train``.
+        views: with pictures, in the order of the split ``train``.
     """
 
     name: str
@@ -49,14 +49,14 @@ class CapturedPerson:
     subject: Subject
     views: tuple[View, ...]
 
-    def posing(self, view: View) -> BodyPose:
-        """The pose in which ``view`` shows the person."""
+    def pose_in(self, view: View) -> BodyPose:
+        """Return the pose of the person in ``view``."""
         row = self.subject.footage.frames.index(-1 if view.frame is None else view.frame)
         return frame_pose(self.subject.footage.clip, row)
 
 
 def captured_person(capture: Capture, model: HumanModel, body: BodyTemplate) -> CapturedPerson:
-    """The person of a capture, on the template ``body``.
+    """Return the person of a capture, on the template ``body``.
 
     Raises:
         DyngsError: a capture without body parameters, without silhouettes, or a view without parameters.
@@ -66,37 +66,39 @@ def captured_person(capture: Capture, model: HumanModel, body: BodyTemplate) -> 
     if not capture.has_alpha:
         raise DyngsError(f"{capture.root}: the pictures have no silhouettes; give them alpha, see docs/human.md")
     given, views = capture.body["train"], capture.splits["train"]
-    vertices, joints = rest_shape(body, torch.from_numpy(given.betas).float())
+    vertices, joints = rest_shape(body, torch.from_numpy(given.betas).to(body.vertices))
     texels = atlas_texels(body, model.resolution, vertices)
     heights = tuple(sorted(set(model.scaffold_heights)))
     gaussians, anchors = texel_gaussians(texels, heights, 0)
-    filmed = captured_motion(capture.root, given, views, joints)
+    captured = captured_motion(capture.root, given, views, joints)
     shape = {"shape_dirs": None, "joint_shape_dirs": None, "expression_dirs": None, "joint_expression_dirs": None}
     return CapturedPerson(
         name=capture.root.name,
         body=replace(body, vertices=vertices, joints=joints, **shape),
-        normals=torch.from_numpy(vertex_normals(vertices.double().numpy(), body.faces.numpy())).float(),
+        normals=torch.from_numpy(vertex_normals(vertices.double().cpu().numpy(), body.faces.cpu().numpy())).to(
+            vertices
+        ),
         texels=texels,
         heights=heights,
         gaussians=gaussians,
-        subject=Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body)),
+        subject=Subject(Skeleton(joints, body.parents), anchors, captured, pose_blend_shapes(body)),
         views=views,
     )
 
 
-def spread_views(sitter: CapturedPerson, count: int, first: int | None = None) -> list[int]:
-    """Indices of ``count`` views that see as much of the person as possible, ascending.
+def spread_views(person: CapturedPerson, count: int, first: int | None = None) -> list[int]:
+    """Return the indices, ascending, of ``count`` views that see as much of the person as possible.
 
-    Of one moment, the first with the most views, where that has enough; else of all. They maximize the mean over texels
-    of the cosine at which the best view would see each, if nothing hid it in rest pose; found by exchanging one after
-    the other.
+    The views are of one frame, the first with the most views, if it has enough; else of all frames. They maximize the
+    mean over texels of the best view's cosine between normal and view direction, in the rest pose and without
+    occlusion; found greedily, then by exchanging one view after the other.
 
     Args:
-        sitter: the person.
-        count: at least 1; all views where there are no more.
-        first: a view that is to be among them, whose moment is then chosen.
+        person: the captured person.
+        count: at least 1; all views if there are fewer.
+        first: a view that must be among them; its frame is then chosen.
     """
-    views = sitter.views
+    views = person.views
     frames = [view.frame for view in views]
     frame = max(dict.fromkeys(frames), key=frames.count) if first is None else frames[first]
     allowed = [i for i, own in enumerate(frames) if own == frame]
@@ -104,8 +106,8 @@ def spread_views(sitter: CapturedPerson, count: int, first: int | None = None) -
         allowed = list(range(len(views)))
     if len(allowed) <= count:
         return allowed
-    normals = sitter.texels.normals[:: max(1, len(sitter.texels) // 1000)]
-    cosines = normals @ torch.stack([_direction(sitter, views[i]) for i in allowed], dim=1)
+    normals = person.texels.normals[:: max(1, len(person.texels) // 1000)]
+    cosines = normals @ torch.stack([_direction(person, views[i]) for i in allowed], dim=1)
     start = [] if first is None else [allowed.index(first)]
     chosen = start + _best(cosines, start, count - len(start))
     for _ in range(count):
@@ -117,26 +119,28 @@ def spread_views(sitter: CapturedPerson, count: int, first: int | None = None) -
     return sorted(allowed[i] for i in chosen)
 
 
-def named_views(sitter: CapturedPerson, names: Sequence[str]) -> list[int]:
-    """Indices of the views of these names, or whose pictures are named so.
+def named_views(person: CapturedPerson, names: Sequence[str]) -> list[int]:
+    """Return the indices of the views with these names, or with pictures of these file names.
 
     Raises:
-        DyngsError: one that is not there, or twice.
+        DyngsError: an unknown name, or the same view twice.
     """
-    files = [view.image_path.name for view in sitter.views]
+    files = [view.image_path.name for view in person.views]
     known = {name: i for i, name in enumerate(files) if files.count(name) == 1}
-    known |= {view.name: i for i, view in enumerate(sitter.views)}
+    known |= {view.name: i for i, view in enumerate(person.views)}
     for name in names:
         if name not in known:
-            raise DyngsError(f"{sitter.name}: no training view is {name!r}; the first is {sitter.views[0].name!r}")
+            raise DyngsError(
+                f"{person.name}: no training view is named {name!r}; the first is {person.views[0].name!r}"
+            )
     found = [known[name] for name in names]
     if len(set(found)) < len(found):
-        raise DyngsError(f"{sitter.name}: a view is named twice; name each once")
+        raise DyngsError(f"{person.name}: a view is named twice; name each once")
     return found
 
 
 def _best(cosines: Tensor, others: list[int], count: int) -> list[int]:
-    """Of the columns of ``cosines`` (P, V) those that add most to ``others``, one after the other."""
+    """Return the columns of ``cosines`` (P, V) that add most to ``others``, chosen greedily."""
     chosen: list[int] = []
     for _ in range(count):
         taken = others + chosen
@@ -147,10 +151,10 @@ def _best(cosines: Tensor, others: list[int], count: int) -> list[int]:
     return chosen
 
 
-def _direction(sitter: CapturedPerson, view: View) -> Tensor:
-    """(3,) unit vector from the pelvis to the camera, in the frame of the body at rest."""
-    posing = sitter.posing(view)
-    pose = torch.from_numpy(view.cam_from_world).float()
-    center = -pose[:3, :3].T @ pose[:3, 3]
-    pelvis = posing.scale * sitter.subject.skeleton.joints[0] + posing.trans
-    return torch.nn.functional.normalize(posing.rotations[0].T @ (center - pelvis), dim=0)
+def _direction(person: CapturedPerson, view: View) -> Tensor:
+    """Return the unit vector (3,) from the pelvis to the camera, in the axes of the body at rest."""
+    pose = person.pose_in(view)
+    cam_from_world = torch.from_numpy(view.cam_from_world).to(pose.trans)
+    center = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
+    pelvis = pose.scale * person.subject.skeleton.joints[0] + pose.trans
+    return torch.nn.functional.normalize(pose.rotations[0].T @ (center - pelvis), dim=0)

@@ -47,7 +47,7 @@ def test_a_given_view_is_among_them(sitter: CapturedPerson, first: int) -> None:
 def test_views_by_name(sitter: CapturedPerson) -> None:
     """In the order given; of the view, or of its file."""
     assert named_views(sitter, ["f000_c05.png", sitter.views[2].name]) == [5, 2]
-    with pytest.raises(DyngsError, match="no training view is 'nobody'; the first is"):
+    with pytest.raises(DyngsError, match="no training view is named 'nobody'; the first is"):
         named_views(sitter, ["nobody"])
     with pytest.raises(DyngsError, match="named twice"):
         named_views(sitter, ["f000_c05.png", sitter.views[5].name])

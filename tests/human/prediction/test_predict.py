@@ -81,7 +81,7 @@ def test_the_skin_is_whole_and_scaffolds_are_carved(shown: Shown) -> None:
 
 def test_every_quaternion_is_normalised_by_itself(shown: Shown) -> None:
     """(1, 0, 0, 0) + 1 in all four is a turn by 2 acos(2 / sqrt 7) about the diagonal of each tangent frame."""
-    bare, turned = predicted(shown).gaussians, predicted(shown, {"turn": 1.0}).gaussians
+    bare, turned = predicted(shown).gaussians, predicted(shown, {"rotation": 1.0}).gaussians
     torch.testing.assert_close(turned.quats.norm(dim=1), torch.ones(len(turned)))
     angle = 2 * torch.tensor(2 / 7**0.5).acos()
     expected = matrices(bare.quats) @ axis_angle_to_matrix(torch.ones(3) / 3**0.5 * angle)
@@ -92,7 +92,7 @@ def test_places_lengths_and_opacities_stay_within_bounds(shown: Shown) -> None:
     """However loud the network: half way to the next scaffold along the normal, e^1.5 times as long."""
     sitter, _ = shown
     bare = predicted(shown).gaussians
-    loud = predicted(shown, {"rise": 50.0, "stretch": 50.0, "opacity": 2.0}).gaussians
+    loud = predicted(shown, {"height": 50.0, "scale": 50.0, "opacity": 2.0}).gaussians
     count = len(sitter.texels)
     torch.testing.assert_close(loud.means[:count], bare.means[:count] + 0.01 * sitter.texels.normals)
     torch.testing.assert_close(loud.log_scales, bare.log_scales + 1.5)
@@ -102,10 +102,10 @@ def test_places_lengths_and_opacities_stay_within_bounds(shown: Shown) -> None:
 def test_unseen_texels_are_painted_and_mistrusted_ones_too(shown: Shown) -> None:
     sitter, maps = shown
     seen = maps.seen[0] > 0
-    trusting = predicted(shown, {"paint": 0.5, "trust": 50.0}).gaussians.base_rgb[: len(sitter.texels)]
+    trusting = predicted(shown, {"colour": 0.5, "picture_weight": 50.0}).gaussians.base_rgb[: len(sitter.texels)]
     torch.testing.assert_close(trusting[seen], maps.rgb[0][seen])
     torch.testing.assert_close(trusting[~seen], torch.full_like(trusting[~seen], 0.75))
-    wary = predicted(shown, {"paint": 0.5, "trust": -50.0}).gaussians.base_rgb
+    wary = predicted(shown, {"colour": 0.5, "picture_weight": -50.0}).gaussians.base_rgb
     torch.testing.assert_close(wary, torch.full_like(wary, 0.75))
 
 
@@ -116,7 +116,7 @@ def test_all_heads_learn(shown: Shown) -> None:
     grad = made.heads.bias.grad
     assert grad is not None
     moved = dict(zip(HEADS, grad.view(2, -1)[0].split(tuple(HEADS.values())), strict=True))
-    assert {name for name, x in moved.items() if bool((x == 0).all())} <= {"turn"}, "a turn changes no length"
+    assert {name for name, x in moved.items() if bool((x == 0).all())} <= {"rotation"}, "a turn changes no length"
 
 
 def test_inputs_hold_everything_in_the_atlas(shown: Shown) -> None:

@@ -87,7 +87,7 @@ def is_arm(joints: np.ndarray | Tensor) -> np.ndarray:
 
 
 def posing(of: CapturedPerson) -> BodyPose:
-    return of.posing(of.views[0])
+    return of.pose_in(of.views[0])
 
 
 def test_what_is_behind_an_arm_does_not_get_its_colour() -> None:
