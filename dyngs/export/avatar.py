@@ -1,4 +1,4 @@
-"""A person in one file: everything that holds in all poses, to be drawn and moved where the run is not.
+"""Avatar files: a trained person in one file, to be rendered in any pose without the run.
 
 Local letters: N Gaussians, J joints, K joints that one Gaussian follows, M vertices and T triangles of the template.
 """
@@ -24,29 +24,31 @@ from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import new_corrections
 from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
 from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.avatar.validation import require_body, require_shapes
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.motion.placement import rest_clip
-from dyngs.human.pose.skinning import check_tree
-from dyngs.human.template.joints import SMPLX_ROWS
 from dyngs.human.template.load import template_path
 from dyngs.runs.checkpoint import LoadedRun, info_of
+from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
 SUFFIX = ".safetensors"
 
 _KIND = FileKind("dyngs avatar", "an avatar", 1)
 _ADVICE = "; export it again with `dyngs export RUN --format avatar`"
-_SHARE_SUM = 1e-3
-"""What skinning weights may miss of 1; in float32 they miss less than 1e-6."""
+_MOST_FACES = 2**31 - 1
+"""All that an int32 can number: the faces of a template without blend shapes are not in the file."""
+_WEIGHT_SUM = 1e-3
+"""Tolerance of the sum of skinning weights; rounding errors in float32 are below 1e-6."""
 
 
 @dataclass(frozen=True)
 class TemplateRef:
-    """Which body template an avatar is built on; it is needed only to bring it motions of other skeletons.
+    """The body template of an avatar; it is needed only to retarget motions of other skeletons.
 
     Attributes:
         file: name of the template's file, without folders.
-        sha256: of the file's bytes.
-        packaged: it is the free template that comes with dyngs.
+        sha256: of the file.
+        packaged: whether it is the free template that comes with dyngs.
     """
 
     file: str
@@ -55,10 +57,10 @@ class TemplateRef:
 
 
 def write_avatar(run: LoadedRun, path: Path) -> Path:
-    """``path`` of the file written: the person of a run, upright and at rest where it was filmed; docs/formats.md.
+    """Write the person of a run, upright and at rest at the place of the capture (docs/formats.md); return ``path``.
 
     Raises:
-        DyngsError: the run is not one of a person, its template is gone, or the file cannot be written.
+        DyngsError: the run is not that of a person, its template is missing, or the file cannot be written.
     """
     scene, model = avatar_of(run.scene), person_of(run.config)
     if scene is None or model is None:
@@ -79,9 +81,9 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
         "anchors.weights": scene.weights.gather(1, anchors.joints),
         "skeleton.joints": scene.learned_skeleton.joints,
         "skeleton.template_joints": scene.skeleton.joints,
-        "skeleton.parents": torch.tensor(scene.skeleton.parents),
+        "skeleton.parents": torch.tensor(scene.skeleton.parents, device="cpu"),
         "fit.turns": scene.fit.turns,
-        "fit.log_scale": torch.tensor([scene.fit.log_scale]),
+        "fit.log_scale": torch.tensor([scene.fit.log_scale], device="cpu"),
         "reference.poses": reference.poses[0],
         "reference.trans": reference.trans[0],
         "reference.scale": reference.scale,
@@ -96,12 +98,12 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
 
 
 def read_avatar(path: Path) -> LoadedRun:
-    """The person of a file, upright and at rest; ``dyngs.view.animation`` moves it as it does one of a run.
+    """Read the person of a file, upright and at rest; ``dyngs.view.animation`` moves it as it does one of a run.
 
-    The template of an avatar that is not built on the free one is looked for beside the file when a motion needs it.
+    A template other than the free one is looked for beside the file when a motion needs it.
 
     Raises:
-        DyngsError: the file is missing, damaged, altered or no avatar, or the template beside it is another one.
+        DyngsError: the file is missing, damaged, altered or not an avatar, or the template beside it is another one.
     """
     header, tensors = read_tensors(path, _KIND, _ADVICE)
     try:
@@ -116,7 +118,7 @@ def read_avatar(path: Path) -> LoadedRun:
             sh_degree={1: 0, 4: 1}[scene.gaussians.sh.shape[1]],
         )
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise DyngsError(f"{path}: no proper avatar ({_reason(error)}){_ADVICE}") from None
+        raise DyngsError(f"{path}: not a valid avatar ({_reason(error)}){_ADVICE}") from None
     return LoadedRun(Config(data=DataConfig(root=path), model=model), scene, info.step, 0.0, info)
 
 
@@ -126,11 +128,11 @@ def _template_ref(model: HumanModel) -> TemplateRef:
 
 
 def _template_beside(path: Path, ref: TemplateRef) -> Path | None:
-    """Where the template of an avatar in ``path`` is or should be; None is the free one."""
+    """Return where the template of an avatar in ``path`` is or should be; None: the free one."""
     file = template_path(HumanModel()) if ref.packaged else path.parent / Path(ref.file).name
     if file.is_file() and _sha256(file) != ref.sha256:
         whose = "that of this version of dyngs" if ref.packaged else f"{file}"
-        raise DyngsError(f"{path}: was built on another template '{ref.file}' than {whose}; give the file of that name")
+        raise DyngsError(f"{path}: needs its own template '{ref.file}', not {whose}; put that file beside it")
     return None if ref.packaged else file
 
 
@@ -142,52 +144,35 @@ def _sha256(file: Path) -> str:
 
 
 def _check(tensors: Mapping[str, Tensor]) -> None:
-    """Raises ValueError or KeyError where something lacks, or has another type, shape or range than it must."""
-    n, (j, _) = len(tensors["gaussians.means"]), tensors["skeleton.joints"].shape
-    k, terms = tensors["anchors.joints"].shape[1], tensors["gaussians.sh"].shape[1]
-    per_gaussian = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (terms, 3)}
-    per_anchor = {"points": (3,), "size": (), "barycentric": (3,), "uv": (2,), "height": (), "weights": (k,)}
-    shapes: dict[str, tuple[int, ...]] = {f"gaussians.{name}": (n, *shape) for name, shape in per_gaussian.items()}
-    shapes |= {f"anchors.{name}": (n, *shape) for name, shape in per_anchor.items()}
-    shapes |= {"anchors.face": (n,), "anchors.joints": (n, k), "skeleton.parents": (j,)}
-    shapes |= {
-        "skeleton.joints": (j, 3),
-        "skeleton.template_joints": (j, 3),
-        "fit.turns": (j, 3),
-        "fit.log_scale": (1,),
-    }
-    shapes |= {"reference.poses": (j, 3), "reference.trans": (3,), "reference.scale": (1,)}
-    optional: dict[str, tuple[int, ...]] = {"pose_dirs": (n, 27)}
+    """Raises KeyError for a missing tensor, ValueError for a wrong type, shape or range."""
+    n, j, terms = len(tensors["gaussians.means"]), len(tensors["skeleton.joints"]), tensors["gaussians.sh"].shape[1]
+    k, count = tensors["anchors.joints"].shape[1], _MOST_FACES
+    gaussians = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,), "sh": (n, terms, 3)}
+    shapes: dict[str, tuple[int, ...]] = {f"gaussians.{name}": shape for name, shape in gaussians.items()}
+    anchors = {"points": (n, 3), "size": (n,), "barycentric": (n, 3), "uv": (n, 2), "height": (n,), "weights": (n, k)}
+    shapes |= {f"anchors.{name}": shape for name, shape in anchors.items()}
+    shapes |= dict.fromkeys(("skeleton.joints", "skeleton.template_joints", "fit.turns", "reference.poses"), (j, 3))
+    shapes |= {"fit.log_scale": (1,), "reference.trans": (3,), "reference.scale": (1,)}
+    if "pose_dirs" in tensors:
+        shapes["pose_dirs"] = (n, 27)
+    if not n:
+        raise ValueError("there are no Gaussians")
+    for name, shape in shapes.items():
+        require_tensor(name, tensors[name], shape)
+    require_body(n, terms, tensors["skeleton.parents"], j)
     if "shapes.directions" in tensors:
-        faces, directions = tensors["shapes.faces"], tensors["shapes.directions"]
-        optional |= {"shapes.faces": (len(faces), 3), "shapes.directions": (9 * (j - 1), directions.shape[1])}
-        _require_index("shapes.faces", faces, directions.shape[1] // 3)
-        _require_index("anchors.face", tensors["anchors.face"], len(faces))
-    integers = ("anchors.face", "anchors.joints", "skeleton.parents", "shapes.faces")
-    for name, shape in (shapes | {x: s for x, s in optional.items() if x in tensors}).items():
-        tensor = tensors[name]
-        if tuple(tensor.shape) != shape or tensor.is_floating_point() == (name in integers):
-            raise ValueError(f"'{name}' is {tensor.dtype} {tuple(tensor.shape)}, not {shape}")
-        if name not in integers and not bool(tensor.isfinite().all()):
-            raise ValueError(f"'{name}' holds NaN or infinite numbers")
-    if j not in SMPLX_ROWS or terms not in (1, 4) or not n:
-        raise ValueError(f"{n} Gaussians of {terms} harmonics on {j} joints")
-    check_tree(tuple(tensors["skeleton.parents"].tolist()))
-    _require_index("anchors.joints", tensors["anchors.joints"], j)
+        count = len(tensors["shapes.faces"])
+        require_shapes(tensors["shapes.directions"], tensors["shapes.faces"], j)
+    require_indices("anchors.face", tensors["anchors.face"], (n,), count, torch.int32)
+    require_indices("anchors.joints", tensors["anchors.joints"], (n, k), j, torch.uint8)
+    require_positive("reference.scale", tensors["reference.scale"])
     weights = tensors["anchors.weights"]
-    if bool((weights < 0).any()) or bool(((weights.sum(1) - 1).abs() > _SHARE_SUM).any()):
-        raise ValueError("the skinning weights of a Gaussian are no shares of 1")
-    if not bool((tensors["reference.scale"] > 0).all()):
-        raise ValueError("the size is not positive")
-
-
-def _require_index(name: str, index: Tensor, count: int) -> None:
-    if bool(((index < 0) | (index >= count)).any()):
-        raise ValueError(f"'{name}' names something beyond the {count} that there are")
+    if bool((weights < 0).any()) or bool(((weights.sum(1) - 1).abs() > _WEIGHT_SUM).any()):
+        raise ValueError("the skinning weights of a Gaussian are negative or do not sum to 1")
 
 
 def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
-    """The person of checked tensors."""
+    """Return the scene of checked tensors."""
 
     def part(prefix: str) -> dict[str, Any]:
         return {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}
@@ -196,7 +181,7 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
     anchors = Anchors(**{**own, "face": own["face"].long(), "joints": own["joints"].long()})
     parents = tuple(tensors["skeleton.parents"].tolist())
     reference = MotionClip(
-        times=torch.zeros(1, dtype=torch.float64),
+        times=torch.zeros(1, dtype=torch.float64, device="cpu"),
         poses=tensors["reference.poses"][None],
         trans=tensors["reference.trans"][None],
         scale=tensors["reference.scale"],

@@ -27,7 +27,7 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
         ValueError: a tensor has a wrong shape, type or range.
     """
     n, j, f = len(gaussians), len(state["joints"]), len(state["clip.times"])
-    require_body(gaussians, state["parents"], j)
+    require_body(n, gaussians.sh.shape[1], state["parents"], j)
     require_moments("clip.times", state["clip.times"])
     shapes = dict.fromkeys(("joints", "learned.joints", "learned.turns"), (j, 3))
     shapes |= dict.fromkeys(("clip.poses", "learned.poses"), (f, j, 3))
@@ -51,11 +51,10 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
         require_indices("near", state["near"], (n, None), n)
 
 
-def require_body(gaussians: Gaussians, parents: Tensor, num_joints: int) -> None:
+def require_body(num_gaussians: int, terms: int, parents: Tensor, num_joints: int) -> None:
     """Check that the Gaussians have 1 or 4 harmonics and the skeleton is of a known family. Raises ValueError."""
-    terms = gaussians.sh.shape[1]
     if num_joints not in SMPLX_ROWS or terms not in (1, 4):
-        raise ValueError(f"{len(gaussians)} Gaussians of {terms} harmonics on {num_joints} joints")
+        raise ValueError(f"{num_gaussians} Gaussians of {terms} harmonics on {num_joints} joints")
     if parents.is_floating_point() or tuple(parents.shape) != (num_joints,):
         raise ValueError(f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({num_joints},)")
     check_tree(tuple(parents.tolist()))

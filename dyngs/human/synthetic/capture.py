@@ -1,7 +1,6 @@
-"""A synthetic capture of a person: the dressed template in motion, from many cameras, with its exact pose.
+"""A synthetic capture of a person: the dressed template in motion, from many cameras, with exact body parameters.
 
-Pictures come from a z-buffer of triangles in numpy. It shares no formula with the rasterizer of Gaussians, so that they
-are an independent ground truth.
+Pictures are rasterized with a depth buffer in numpy, independently of the rasterizer of Gaussians, as ground truth.
 
 Local letters: J joints, M vertices, T triangles, U vertices of the atlas, F frames, H fragments, S texels per side.
 """
@@ -37,25 +36,25 @@ from dyngs.human.template.mesh import Fragments, interpolate, normalized, raster
 
 _FPS = 12.0
 _RADIUS = 3.5
-"""Of the ring of cameras, m."""
+"""Radius of the ring of cameras, m."""
 _TARGET = np.array([0.0, 0.95, 0.0])
-"""What all cameras look at, m."""
+"""The point that all cameras look at, m."""
 _TO_LIGHT = np.array([0.35, 0.75, 0.56])
 _AMBIENT, _DIFFUSE = 0.6, 0.45
 
 
 @dataclass(frozen=True)
 class HumanOptions:
-    """How a capture of a person is taken.
+    """Options of a synthetic capture of a person.
 
     Attributes:
         size: width and height in pixels.
-        num_frames: of the walk, which train and test show.
-        num_new: frames of the other clip, ``pose``; 0 = no such split.
+        num_frames: frames of the walk, for the splits train and test.
+        num_new: frames of another motion, the split ``pose``; 0: no such split.
         num_cameras: training cameras, on a ring around the person.
-        num_test: test cameras, each midway between two training cameras; 0 = neither test nor ``pose``.
+        num_test: test cameras, each midway between two training cameras; 0: neither test nor ``pose``.
         seed: of the outfit, see ``dyngs.human.synthetic.clothes.random_outfit``; the same seed gives the same bytes.
-        samples: per pixel side.
+        samples: per side of a pixel.
     """
 
     size: int = 128
@@ -69,7 +68,7 @@ class HumanOptions:
 
 @dataclass(frozen=True)
 class PosedMesh:
-    """A textured surface as it is lit and seen; float64, m.
+    """A textured mesh in the world; float64, m.
 
     Attributes:
         vertices: (M, 3) in the world.
@@ -91,11 +90,11 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
 
     Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha, sRGB), ``transforms_SPLIT.json`` (OpenGL poses, m,
     y up, floor at y = 0), and the exact parameters of the default template, ``body_train.npz`` and ``body_pose.npz``.
-    Clothes stand away from the template; how tall the person is, is the ``scale`` of the parameters.
-    Test shows the frames of train from other cameras; ``pose`` shows another clip from these other cameras.
+    Clothes are offset from the template's surface; the person's size is the ``scale`` of the parameters. The split test
+    shows the frames of train from other cameras, ``pose`` another motion from these other cameras.
 
     Raises:
-        DyngsError: nothing asked for, ``out`` holds something already, or cannot be written.
+        DyngsError: options out of range, or ``out`` is not empty or cannot be written.
     """
     if min(options.size, options.num_frames, options.num_cameras, options.samples) < 1:
         raise DyngsError("a synthetic person needs size, num_frames, num_cameras and samples of at least 1")
@@ -121,50 +120,50 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
 
 
 def walk(body: BodyTemplate, num_frames: int) -> Motion:
-    """(F frames) three swings of legs and arms on the spot while the body turns by 50 degrees; soles at y = 0."""
+    """Return three swings of legs and arms in place while the body turns by 50 degrees; soles at y = 0."""
     time = np.linspace(0.0, 1.0, num_frames)
     swing, lift = np.sin(3 * np.pi * time), 0.3 - 0.3 * np.cos(3 * np.pi * time)
-    turns = {
-        "pelvis": _turn(y=np.radians(50.0) * (time - 0.5)),
-        "spine2": _turn(y=0.2 * swing),
-        "head": _turn(y=0.5 * np.sin(2 * np.pi * time)),
+    rotations = {
+        "pelvis": _axis_angle(y=np.radians(50.0) * (time - 0.5)),
+        "spine2": _axis_angle(y=0.2 * swing),
+        "head": _axis_angle(y=0.5 * np.sin(2 * np.pi * time)),
     }
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        turns |= {
-            f"{side}_hip": _turn(x=-0.5 * sign * swing),
-            f"{side}_knee": _turn(x=0.2 + 0.6 * np.maximum(-sign * swing, 0.0) + 0.3 * lift),
-            f"{side}_shoulder": _turn(x=0.6 * sign * swing, z=-sign * 1.15),
-            f"{side}_elbow": _turn(y=-sign * (0.3 + lift)),
+        rotations |= {
+            f"{side}_hip": _axis_angle(x=-0.5 * sign * swing),
+            f"{side}_knee": _axis_angle(x=0.2 + 0.6 * np.maximum(-sign * swing, 0.0) + 0.3 * lift),
+            f"{side}_shoulder": _axis_angle(x=0.6 * sign * swing, z=-sign * 1.15),
+            f"{side}_elbow": _axis_angle(y=-sign * (0.3 + lift)),
         }
-    return _on_floor(body, turns, num_frames)
+    return _grounded_motion(body, rotations, num_frames)
 
 
 def squat(body: BodyTemplate, num_frames: int) -> Motion:
-    """(F frames) from standing down into a squat, while the arms go up sideways; soles at y = 0."""
+    """Return a motion from standing into a squat while the arms rise sideways; soles at y = 0."""
     depth = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, num_frames))
-    turns = {"spine1": _turn(x=0.35 * depth), "head": _turn(x=-0.3 * depth, z=0.2 * depth)}
+    rotations = {"spine1": _axis_angle(x=0.35 * depth), "head": _axis_angle(x=-0.3 * depth, z=0.2 * depth)}
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        turns |= {
-            f"{side}_hip": _turn(x=-1.3 * depth, z=0.15 * sign * depth),
-            f"{side}_knee": _turn(x=1.9 * depth),
-            f"{side}_ankle": _turn(x=-0.6 * depth),
-            f"{side}_shoulder": _turn(z=sign * (-1.2 + 2.1 * depth)),
-            f"{side}_elbow": _turn(y=-0.4 * sign * depth),
+        rotations |= {
+            f"{side}_hip": _axis_angle(x=-1.3 * depth, z=0.15 * sign * depth),
+            f"{side}_knee": _axis_angle(x=1.9 * depth),
+            f"{side}_ankle": _axis_angle(x=-0.6 * depth),
+            f"{side}_shoulder": _axis_angle(z=sign * (-1.2 + 2.1 * depth)),
+            f"{side}_elbow": _axis_angle(y=-0.4 * sign * depth),
         }
-    return _on_floor(body, turns, num_frames)
+    return _grounded_motion(body, rotations, num_frames)
 
 
 def render_mesh(mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int) -> np.ndarray:
-    """(size, size, 4) sRGB values and straight alpha in [0, 1], of ``samples`` x ``samples`` places per pixel.
+    """Return sRGB values and straight alpha (size, size, 4) in [0, 1], of ``samples`` x ``samples`` per pixel.
 
-    Lambert: the texture's value times 0.6 + 0.45 max(n . l, 0) with n smooth over edges, at most 1; no shadows. Alpha
-    is the share of places that see the mesh, whose colours are averaged.
+    Lambertian: the texture's value times 0.6 + 0.45 max(n . l, 0) with smooth normals n, at most 1; no shadows. Alpha
+    is the share of samples that hit the mesh, whose colours are averaged.
 
     Args:
-        mesh: what is seen, from both sides.
+        mesh: visible from both sides.
         world_from_cam: (4, 4) OpenGL pose; square pixels, centred, ``CAMERA_ANGLE_X`` across.
         size: width and height in pixels.
-        samples: places per pixel side.
+        samples: per side of a pixel.
 
     Raises:
         ValueError: the mesh reaches behind the camera.
@@ -178,9 +177,9 @@ def render_mesh(mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples:
     normals = vertex_normals(mesh.vertices, mesh.faces)
     sums = np.zeros((size * size, 4))
     for k in range(samples * samples):
-        place = np.array([(k % samples + 0.5) / samples, (k // samples + 0.5) / samples, 0.0])
-        fragments = rasterize((image - place)[mesh.faces], size, size)
-        sums[fragments.index, :3] += _lit(mesh, normals, fragments)
+        sample = np.array([(k % samples + 0.5) / samples, (k // samples + 0.5) / samples, 0.0])
+        fragments = rasterize((image - sample)[mesh.faces], size, size)
+        sums[fragments.index, :3] += _shaded(mesh, normals, fragments)
         sums[fragments.index, 3] += 1.0
     rgb = sums[:, :3] / np.maximum(sums[:, 3:], 1.0)
     return np.concatenate([rgb, sums[:, 3:] / samples**2], axis=1).reshape(size, size, 4)
@@ -189,7 +188,7 @@ def render_mesh(mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples:
 def _write_split(
     out: Path, split: str, meshes: list[PosedMesh], cameras: dict[int, np.ndarray], options: HumanOptions
 ) -> None:
-    """The pictures of one split, then its JSON; nothing where it has no cameras."""
+    """Write the pictures of one split and its JSON; nothing without cameras."""
     if not cameras:
         return
     frames = []
@@ -205,46 +204,51 @@ def _write_split(
 
 
 def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> Iterator[PosedMesh]:
-    """The mesh of each frame, posed in float64."""
+    """Yield the mesh of each frame, posed in float64."""
     uv, uv_faces = texture_coordinates(body)
-    exact, faces = body.to(dtype=torch.float64), body.faces.numpy()
+    exact, faces = body.to(dtype=torch.float64), body.faces.cpu().numpy()
     for pose, trans, scale in zip(*(x.double() for x in (motion.poses, motion.trans, motion.scale)), strict=True):
-        vertices = posed_vertices(exact, pose[None], trans[None], scale=scale[None])[0].numpy()
+        vertices = posed_vertices(exact, pose[None], trans[None], scale=scale[None])[0].cpu().numpy()
         yield PosedMesh(vertices, faces, uv, uv_faces, texture)
 
 
-def _on_floor(body: BodyTemplate, turns: dict[str, np.ndarray], num_frames: int) -> Motion:
-    """The motion of joints that turn by axis-angle (F, 3) or (3,), its lowest vertex at y = 0 in every frame."""
-    poses = torch.zeros(num_frames, len(JOINT_NAMES), 3)
-    for name, turn in turns.items():
-        poses[:, JOINT_NAMES.index(name)] = torch.from_numpy(turn).float()
-    trans = torch.zeros(num_frames, 3)
+def _grounded_motion(body: BodyTemplate, rotations: dict[str, np.ndarray], num_frames: int) -> Motion:
+    """Return the motion of joints rotated by axis-angle (F, 3) or (3,), the lowest vertex always at y = 0."""
+    device = body.vertices.device
+    poses = torch.zeros(num_frames, len(JOINT_NAMES), 3, device=device)
+    for name, rotation in rotations.items():
+        poses[:, JOINT_NAMES.index(name)] = torch.from_numpy(rotation).to(poses)
+    trans = torch.zeros(num_frames, 3, device=device)
     exact = body.to(dtype=torch.float64)
     for frame, pose in enumerate(poses.double()):
-        trans[frame, 1] = -posed_vertices(exact, pose[None], torch.zeros(1, 3).double())[0, :, 1].min().float()
-    return Motion(poses, trans, torch.zeros(10), _FPS, torch.ones(num_frames))
+        trans[frame, 1] = (
+            -posed_vertices(exact, pose[None], torch.zeros(1, 3, dtype=torch.float64, device=device))[0, :, 1]
+            .min()
+            .float()
+        )
+    return Motion(poses, trans, torch.zeros(10, device=device), _FPS, torch.ones(num_frames, device=device))
 
 
-def _turn(x: np.ndarray | float = 0.0, y: np.ndarray | float = 0.0, z: np.ndarray | float = 0.0) -> np.ndarray:
-    """(F, 3) axis-angle of turning about z, then y, then x by angles (F,) in radians, all about fixed axes."""
+def _axis_angle(x: np.ndarray | float = 0.0, y: np.ndarray | float = 0.0, z: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return axis-angle vectors (F, 3) of rotations about the fixed axes z, then y, then x by angles (F,), rad."""
     angles = np.stack(np.broadcast_arrays(np.atleast_1d(z), y, x), axis=-1)
     return Rotation.from_euler("zyx", angles).as_rotvec()
 
 
 def _ring(count: int) -> np.ndarray:
-    """(count, 4, 4) OpenGL camera-to-world poses all around, the first one in front, low and high in turn."""
+    """Return OpenGL camera-to-world poses (count, 4, 4) on a ring, the first in front, alternately low and high."""
     share = np.arange(count) / max(count, 1)
-    return _looking(2 * np.pi * share, np.where(np.arange(count) % 2 == 0, 0.9, 1.7))
+    return _look_at_target(2 * np.pi * share, np.where(np.arange(count) % 2 == 0, 0.9, 1.7))
 
 
 def _ring_between(count: int, others: int) -> np.ndarray:
-    """(count, 4, 4) poses on the ring of ``others``, each midway between two of them."""
+    """Return poses (count, 4, 4) on the ring of ``others`` cameras, each midway between two of them."""
     share = (np.arange(count) * others // max(count, 1) + 0.5) / others
-    return _looking(2 * np.pi * share, np.full(count, 1.3))
+    return _look_at_target(2 * np.pi * share, np.full(count, 1.3))
 
 
-def _looking(azimuths: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """(V, 4, 4) OpenGL camera-to-world poses, y up; azimuths (V,) from +z towards +x in radians, heights (V,) in m."""
+def _look_at_target(azimuths: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """Return OpenGL camera-to-world poses (V, 4, 4), y up, of azimuths (V,) from +z to +x, rad, and heights (V,), m."""
     centers = np.stack([_RADIUS * np.sin(azimuths), heights, _RADIUS * np.cos(azimuths)], axis=-1)
     backward = normalized(centers - _TARGET)
     right = normalized(np.cross([0.0, 1.0, 0.0], backward))
@@ -254,12 +258,12 @@ def _looking(azimuths: np.ndarray, heights: np.ndarray) -> np.ndarray:
 
 
 def _focal(size: int) -> float:
-    """Pixels."""
+    """Return the focal length in pixels."""
     return float(0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X))
 
 
-def _lit(mesh: PosedMesh, normals: np.ndarray, fragments: Fragments) -> np.ndarray:
-    """(H, 3) sRGB values of what is hit."""
+def _shaded(mesh: PosedMesh, normals: np.ndarray, fragments: Fragments) -> np.ndarray:
+    """Return the sRGB values (H, 3) of the fragments."""
     uv = interpolate(fragments.barycentric, mesh.uv[mesh.uv_faces[fragments.faces]])
     normal = normalized(interpolate(fragments.barycentric, normals[mesh.faces[fragments.faces]]))
     light = _AMBIENT + _DIFFUSE * np.maximum(normal @ normalized(_TO_LIGHT), 0.0)
@@ -267,7 +271,7 @@ def _lit(mesh: PosedMesh, normals: np.ndarray, fragments: Fragments) -> np.ndarr
 
 
 def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """(H, 3) of a texture (S, S, 3) at ``uv`` (H, 2), bilinear between the centres of texels."""
+    """Return the values (H, 3) of a texture (S, S, 3) at ``uv`` (H, 2), bilinear between texel centres."""
     last = len(texture) - 1
     column, row = (np.clip(place, 0.0, last) for place in texel_coordinates(uv, len(texture)))
     left, top = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)

@@ -1,6 +1,6 @@
-"""What a synthetic person wears: colours and cut of clothes and hair, chosen by a number.
+"""Clothes and hair of synthetic people: colours, patterns and cut, chosen by a seed.
 
-Local letters: M vertices, P places, U vertices of the atlas, S texels per side.
+Local letters: M vertices, P points, U vertices of the atlas, S texels per side.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ _PARTS = {
     "leg": ("hip", "knee"),
     "shoe": ("ankle", "foot"),
 }
-"""The joints by which the parts of the body move, without side and number."""
+"""The joints of each part of the body, without side and number."""
 
 _BELOW_KNEE = -0.36
-"""Height in T-pose at which shorts end, m."""
+"""Height at which shorts end in T-pose, m."""
 
 
 @dataclass(frozen=True)
 class Outfit:
-    """Clothes and hair of a person who stands in T-pose, and how tall the person is.
+    """Clothes and hair of a person in T-pose, and the person's size.
 
     Attributes:
-        palette: by name of cloth or part: (3,) sRGB values.
-        pitch: of stripes and checks, relative to those of 0.05 m.
-        upright: the stripes on the front run from top to bottom, not across.
-        long_sleeves, long_legs: they reach down to the hands and shoes.
-        shirt, trousers, hair: how far they stand away from the skin at most, m.
-        folds: radians per metre.
-        size: of the whole person, relative to the template.
+        palette: sRGB values (3,) by name of cloth or part of the body.
+        pitch: width of stripes and checks, relative to 0.05 m.
+        upright: whether the stripes on the front are vertical.
+        long_sleeves, long_legs: whether they reach the hands and shoes.
+        shirt, trousers, hair: largest offset from the skin, m.
+        folds: spatial frequency, radians per metre.
+        size: of the person, relative to the template.
     """
 
     palette: dict[str, np.ndarray]
@@ -60,8 +60,8 @@ class Outfit:
 
 
 def random_outfit(seed: int) -> Outfit:
-    """What the person of ``seed`` wears. 0 is the template as it is, painted; all others stand away from it by up to
-    4 cm, differ in cut and pattern, and are 0.88 to 1.04 times as tall."""
+    """Return the outfit of ``seed``. 0 is the bare template, painted; others have clothes with offsets of up to 4 cm,
+    differ in cut and pattern, and are 0.88 to 1.04 times as tall."""
     palette = _palette(seed)
     if seed == 0:
         return Outfit(palette)
@@ -81,21 +81,21 @@ def random_outfit(seed: int) -> Outfit:
 
 
 def dress_body(body: BodyTemplate, outfit: Outfit) -> BodyTemplate:
-    """``body`` with the clothes as part of its surface, smooth; joints, weights and atlas stay."""
-    vertices = body.vertices.double().numpy()
-    away = _heights(vertices, _shares_of_parts(body), _left_eye(body), outfit)
-    moved = vertices + away[:, None] * vertex_normals(vertices, body.faces.numpy())
+    """Return ``body`` with the clothes as part of its surface; joints, weights and atlas stay the same."""
+    vertices = body.vertices.double().cpu().numpy()
+    away = _cloth_offsets(vertices, _part_weights(body), _left_eye(body), outfit)
+    moved = vertices + away[:, None] * vertex_normals(vertices, body.faces.cpu().numpy())
     return replace(body, vertices=torch.from_numpy(moved).to(body.vertices))
 
 
 def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> np.ndarray:
-    """(S, S, 3) sRGB values in [0, 1] of ``outfit``, float64; left and right, front and back differ.
+    """Return the texture (S, S, 3) of ``outfit``, sRGB in [0, 1], float64; left and right, front and back differ.
 
-    Texels that no triangle covers repeat the nearest that one does, so that interpolation at seams stays on the body.
+    Texels that no triangle covers repeat the nearest covered one, so that interpolation at seams is correct.
 
     Args:
         body: a template in T-pose with texture coordinates and the 55 joints of SMPL-X.
-        outfit: what is worn.
+        outfit: clothes and hair.
         resolution: S, texels per side.
 
     Raises:
@@ -104,9 +104,9 @@ def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> 
     uv, uv_faces = texture_coordinates(body)
     columns, rows = texel_coordinates(uv, resolution)
     fragments = rasterize(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], resolution, resolution)
-    around = body.faces.numpy()[fragments.faces]
-    points = interpolate(fragments.barycentric, body.vertices.double().numpy()[around])
-    parts = interpolate(fragments.barycentric, _shares_of_parts(body)[around]).argmax(axis=1)
+    around = body.faces.cpu().numpy()[fragments.faces]
+    points = interpolate(fragments.barycentric, body.vertices.double().cpu().numpy()[around])
+    parts = interpolate(fragments.barycentric, _part_weights(body)[around]).argmax(axis=1)
     texture = np.zeros((resolution * resolution, 3))
     texture[fragments.index] = _painted(points, np.array(list(_PARTS))[parts], _left_eye(body), outfit)
     is_bare = np.ones(resolution * resolution, dtype=bool)
@@ -117,55 +117,55 @@ def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> 
 
 
 def texture_coordinates(body: BodyTemplate) -> tuple[np.ndarray, np.ndarray]:
-    """Texture coordinates (U, 2), float64, and the triangles (T, 3) into them.
+    """Return texture coordinates (U, 2), float64, and the triangles (T, 3) that index them.
 
     Raises:
         DyngsError: the template has none.
     """
     if body.uv is None or body.uv_faces is None:
         raise DyngsError(f"the body template '{body.name}' has no texture coordinates; give one with a texture atlas")
-    return body.uv.double().numpy(), body.uv_faces.numpy()
+    return body.uv.double().cpu().numpy(), body.uv_faces.cpu().numpy()
 
 
 def texel_coordinates(uv: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row (U,) of a texture, whole numbers at the centres of texels, of ``uv`` (U, 2)."""
+    """Return column and row (U,) of ``uv`` (U, 2) in a texture, whole numbers at texel centres."""
     return uv[:, 0] * resolution - 0.5, (1.0 - uv[:, 1]) * resolution - 0.5
 
 
 def _left_eye(body: BodyTemplate) -> np.ndarray:
-    """(3,)"""
-    return body.joints[JOINT_NAMES.index("left_eye")].double().numpy()
+    """Return the left eye (3,), m."""
+    return body.joints[JOINT_NAMES.index("left_eye")].double().cpu().numpy()
 
 
-def _shares_of_parts(body: BodyTemplate) -> np.ndarray:
-    """(M, 8) how much every vertex belongs to each of ``_PARTS``; rows sum to 1."""
+def _part_weights(body: BodyTemplate) -> np.ndarray:
+    """Return the weights (M, 8) of each vertex for the parts of ``_PARTS``; rows sum to 1."""
     bases = [name.removeprefix("left_").removeprefix("right_").rstrip("123") for name in JOINT_NAMES]
     member = np.array([[base in names for names in _PARTS.values()] for base in bases], dtype=np.float64)
-    return body.weights.double().numpy() @ member
+    return body.weights.double().cpu().numpy() @ member
 
 
-def _heights(vertices: np.ndarray, shares: np.ndarray, eye: np.ndarray, outfit: Outfit) -> np.ndarray:
-    """(M,) how far the surface lies above the skin, m."""
+def _cloth_offsets(vertices: np.ndarray, part_weights: np.ndarray, eye: np.ndarray, outfit: Outfit) -> np.ndarray:
+    """Return the offsets (M,) of clothes and hair from the skin along the normal, m."""
     x, y, z = vertices.T
-    of = dict(zip(_PARTS, shares.T, strict=True))
-    waist, below = _step((y - 0.1) / 0.08), _step((_BELOW_KNEE - y) / 0.06)
+    of = dict(zip(_PARTS, part_weights.T, strict=True))
+    waist, below = _smoothstep((y - 0.1) / 0.08), _smoothstep((_BELOW_KNEE - y) / 0.06)
     sleeves = of["arm"] + (of["forearm"] if outfit.long_sleeves else 0.0)
     legs = of["leg"] * (1.0 if outfit.long_legs else 1.0 - below) + of["torso"] * (1.0 - waist)
-    legs = legs * _step(np.abs(x) / 0.05) * (0.5 + 0.5 * _step(-y / 0.6))
-    scalp = of["head"] * np.maximum(_step((y - eye[1] - 0.03) / 0.04), _step((-0.02 - z) / 0.04))
-    scalp = scalp * _step((y - eye[1] + 0.1) / 0.06)
+    legs = legs * _smoothstep(np.abs(x) / 0.05) * (0.5 + 0.5 * _smoothstep(-y / 0.6))
+    scalp = of["head"] * np.maximum(_smoothstep((y - eye[1] - 0.03) / 0.04), _smoothstep((-0.02 - z) / 0.04))
+    scalp = scalp * _smoothstep((y - eye[1] + 0.1) / 0.06)
     folds = 0.8 + 0.2 * np.sin(outfit.folds * (y + 0.5 * x) + 4.0 * np.arctan2(z, np.abs(x) - 0.1))
     return folds * (outfit.shirt * (of["torso"] * waist + sleeves) + outfit.trousers * legs) + outfit.hair * scalp
 
 
-def _step(x: np.ndarray) -> np.ndarray:
-    """From 0 at 0 to 1 at 1, smoothly."""
+def _smoothstep(x: np.ndarray) -> np.ndarray:
+    """Return the smoothstep of x: from 0 at 0 to 1 at 1."""
     x = x.clip(0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
 
 def _palette(seed: int) -> dict[str, np.ndarray]:
-    """By name of cloth or part: (3,) sRGB values; hues far from each other, in an order that ``seed`` chooses."""
+    """Return sRGB values (3,) by name of cloth or part: well separated hues in an order that ``seed`` chooses."""
     make = np.random.default_rng(seed)
     names = ("shirt", "stripe", "back", "left_leg", "right_leg", "left_hand", "right_hand", "left_shoe", "right_shoe")
     hues = (make.permutation(len(names)) + make.uniform()) / len(names)
@@ -179,7 +179,7 @@ def _palette(seed: int) -> dict[str, np.ndarray]:
 
 
 def _painted(points: np.ndarray, part: np.ndarray, eye: np.ndarray, outfit: Outfit) -> np.ndarray:
-    """(P, 3) colours of places ``points`` (P, 3) of the T-pose, m; their ``part`` (P,); ``eye`` (3,) the left."""
+    """Return the colours (P, 3) of ``points`` (P, 3) in T-pose, m, by ``part`` (P,); ``eye`` (3,) is the left eye."""
     x, y, z = points.T
     is_left, is_front, side = x > 0, z > -0.02, np.abs(x)
     palette, pitch = outfit.palette, outfit.pitch
