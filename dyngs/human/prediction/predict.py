@@ -57,23 +57,23 @@ def network_inputs(person: CapturedPerson, maps: TexelMaps, mean: Tensor) -> Ten
 
 
 def predict_gaussians(
-    person: CapturedPerson, maps: TexelMaps, mean: Tensor, network: AtlasNetwork | None, carve: float
+    person: CapturedPerson, maps: TexelMaps, mean: Tensor, network: AtlasNetwork | None, min_silhouette_share: float
 ) -> PredictedAvatar:
     """Return the avatar that ``network`` predicts, differentiable in its weights; None: discs in observed colours.
 
-    All texels of the lowest scaffold get a Gaussian; those above it where a view sees them and they lie inside a share
-    ``carve`` of the silhouettes. Rotations are relative to the tangent frame, scales to the initial Gaussian, means
-    move along the normal. Colours are a weighted mean of those of the pictures and those of the network; without a
-    network those of the pictures, else the mean colours.
+    All texels of the lowest scaffold get a Gaussian; those above it where a view sees them and they lie inside at
+    least the share ``min_silhouette_share`` of the silhouettes. Rotations are relative to the tangent frame, scales to
+    the initial Gaussian, means move along the normal. Colours are a weighted mean of those of the pictures and those of
+    the network; without a network those of the pictures, else the mean colours.
 
     Args:
         person: the captured person.
         maps: of the pictures.
         mean: (3, S, S) as in ``network_inputs``.
         network: or None.
-        carve: in [0, 1].
+        min_silhouette_share: in [0, 1].
     """
-    kept = (maps.inside >= carve) & (maps.seen > 0)
+    kept = (maps.inside >= min_silhouette_share) & (maps.seen > 0)
     kept[0] = True
     rows = kept.flatten().nonzero()[:, 0]
     first, subject = person.gaussians.select(rows), replace(person.subject, anchors=person.subject.anchors.select(rows))
