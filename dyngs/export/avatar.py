@@ -123,6 +123,7 @@ def read_avatar(path: Path) -> LoadedRun:
 
 
 def _template_ref(model: HumanModel) -> TemplateRef:
+    """Return the reference to the template of ``model``."""
     file = template_path(model)
     return TemplateRef(file.name, _sha256(file), model.body is None)
 
@@ -137,6 +138,7 @@ def _template_beside(path: Path, ref: TemplateRef) -> Path | None:
 
 
 def _sha256(file: Path) -> str:
+    """Return the SHA-256 of a template's file, in hexadecimal."""
     try:
         return hashlib.sha256(file.read_bytes()).hexdigest()
     except OSError as error:
@@ -210,4 +212,5 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
 
 
 def _reason(error: Exception) -> str:
+    """Return what is wrong, in at most 120 characters."""
     return f"{error.args[0]} is missing" if isinstance(error, KeyError) else " ".join(str(error).split())[:120]

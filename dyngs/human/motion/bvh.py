@@ -137,6 +137,7 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
 
 
 def _offset(path: Path, name: str, words: list[str]) -> np.ndarray:
+    """Return the offset (3,) of a joint."""
     offset = _numbers(path, words)
     if len(offset) != 3:
         raise DyngsError(f"{path}: the OFFSET of '{name}' must be three numbers; export it again")
@@ -144,6 +145,7 @@ def _offset(path: Path, name: str, words: list[str]) -> np.ndarray:
 
 
 def _channels(path: Path, name: str, words: list[str]) -> list[str]:
+    """Return the channels of a joint in lower case, in the order of the file."""
     channels = [word.lower() for word in words[1:]]
     if words[:1] != [str(len(channels))] or not set(channels) <= set(_CHANNELS):
         raise DyngsError(f"{path}: the CHANNELS of '{name}' must be a count and so many of Xposition ... Zrotation")
@@ -178,6 +180,7 @@ def _values(path: Path, rows: str, joints: Sequence[_Joint]) -> tuple[np.ndarray
 
 
 def _cut_off(path: Path, frames: int, channels: int, count: int) -> DyngsError:
+    """Return the error to raise for a file with another count of numbers than it says."""
     return DyngsError(
         f"{path}: says {frames} frames of {channels} numbers but holds {count} numbers; it may be cut off"
     )

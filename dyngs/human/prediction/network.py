@@ -31,7 +31,7 @@ class AtlasNetwork(nn.Module):
             channels: D, of the input.
             scaffolds: K.
             widths: channels at 1/2, 1/4, ... of the resolution; multiples of 8.
-            generator: of the initial weights, on the CPU.
+            generator: of the initial weights, on the CPU, where the network is made.
 
         Raises:
             DyngsError: a width that is not a multiple of 8.
@@ -40,6 +40,16 @@ class AtlasNetwork(nn.Module):
         if any(width % _GROUPS for width in widths):
             raise DyngsError(f"model.widths must be multiples of {_GROUPS}, not {list(widths)}")
         self.scaffolds, self.halvings = scaffolds, len(widths)
+        with torch.device("cpu"):
+            self._make_layers(channels, scaffolds, widths)
+        for layer in self.modules():
+            if isinstance(layer, nn.Conv2d):
+                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
+                nn.init.zeros_(layer.bias)  # pyright: ignore[reportArgumentType]
+        nn.init.zeros_(self.heads.weight)
+
+    def _make_layers(self, channels: int, scaffolds: int, widths: Sequence[int]) -> None:
+        """Make the layers of the way down and up, and of the heads."""
         self.down = nn.ModuleList(
             nn.Sequential(nn.Conv2d(before, width, 5 if i == 0 else 3, 2, padding=2 if i == 0 else 1), _Block(width))
             for i, (before, width) in enumerate(zip((channels, *widths), widths, strict=False))
@@ -50,11 +60,6 @@ class AtlasNetwork(nn.Module):
         )
         self.last = nn.Sequential(nn.Conv2d(widths[0] + channels, widths[0], 3, padding=1), nn.SiLU())
         self.heads = nn.Conv2d(widths[0], scaffolds * sum(HEADS.values()), 1)
-        for layer in self.modules():
-            if isinstance(layer, nn.Conv2d):
-                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
-                nn.init.zeros_(layer.bias)  # pyright: ignore[reportArgumentType]
-        nn.init.zeros_(self.heads.weight)
 
     def forward(self, maps: Tensor) -> Tensor:
         """Return the raw predictions (K, 13, S, S); S must be a multiple of 2 to the number of widths."""

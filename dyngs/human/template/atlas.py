@@ -49,7 +49,7 @@ class Texels:
 
     @property
     def normals(self) -> Tensor:
-        """(P, 3) outward unit normals."""
+        """Outward unit normals (P, 3)."""
         return self.frames[..., 2]
 
 

@@ -156,6 +156,7 @@ def _num_shapes(joints: int, directions: int) -> int:
 
 
 def _float(values: np.ndarray) -> Tensor:
+    """Return the values as a float32 tensor."""
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
@@ -223,6 +224,7 @@ def _wanted(path: Path, present: Collection[object]) -> list[str]:
 
 
 def _read_pickle(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a pickle under the keys that are needed."""
     loaded = read_pickle(path)
     if not isinstance(loaded, dict):
         raise DyngsError(f"{path}: does not hold a dictionary; give a body file of SMPL, SMPL-H or SMPL-X")

@@ -26,7 +26,7 @@ def view(frame: int, time: float | None) -> View:
     return View(f"v{frame}", Path("x.png"), np.eye(4), np.eye(3), 4, 4, time=time, frame=frame)
 
 
-def test_footage_has_the_frames_that_views_show_in_order_of_time() -> None:
+def test_a_captured_motion_has_the_frames_that_views_show_in_order_of_time() -> None:
     given = bodies([3, 4, 7, 9])
     filmed = captured_motion(WHERE, given, [view(9, 1.0), view(3, 0.0), view(7, 0.5), view(3, 0.0)], torch.zeros(55, 3))
     assert filmed.frames == (3, 7, 9)
@@ -35,7 +35,7 @@ def test_footage_has_the_frames_that_views_show_in_order_of_time() -> None:
     np.testing.assert_allclose(filmed.clip.poses.numpy(), given.poses[[0, 2, 3]], rtol=1e-6)
 
 
-def test_footage_without_times_is_spread_by_frame_number() -> None:
+def test_a_captured_motion_without_times_is_spread_by_frame_number() -> None:
     filmed = captured_motion(WHERE, bodies([0, 1, 2]), [view(2, None), view(1, None)], torch.zeros(55, 3))
     assert filmed.frames == (1, 2)
     assert filmed.clip.times.tolist() == [0.5, 1.0]
