@@ -1,4 +1,4 @@
-"""A tiny body, slow skinning, and writers of BVH and GLB for the tests of motion files."""
+"""A tiny body template, skinning in plain loops, and writers of BVH and GLB files, for tests of motion files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ for limb, (above, (x, y, z)) in LIMBS.items():
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Joints of a rest pose, parents first, and what drives them."""
+    """Names, parents and rest positions of S joints, parents first."""
 
     names: tuple[str, ...]
     parents: tuple[int, ...]
@@ -49,7 +49,7 @@ class Skeleton:
 
 
 def skeleton(names: Sequence[str] = JOINT_NAMES) -> Skeleton:
-    """These of our joints in T-pose, metres, y up, facing +z; each hangs on the nearest joint above that is there."""
+    """The named joints in T-pose, metres, y up, facing +z; each is a child of its nearest ancestor among them."""
     parents = []
     for name in names:
         above = ABOVE[name]
@@ -60,7 +60,7 @@ def skeleton(names: Sequence[str] = JOINT_NAMES) -> Skeleton:
 
 
 def tiny_body(count: int = 55, shapes: int = 0) -> BodyTemplate:
-    """165 vertices around 55 (or 52, 24) joints, with random weights and, if asked, shape directions."""
+    """165 vertices around 55 (or 52, 24) joints, with random weights and optionally shape directions."""
     torch.manual_seed(count)
     names = [JOINT_NAMES[i] for i in SMPLX_ROWS[count]]
     own = skeleton(names)
@@ -84,14 +84,14 @@ def tiny_body(count: int = 55, shapes: int = 0) -> BodyTemplate:
 
 
 def random_motion(frames: int = 4, angle: float = 1.0, seed: int = 0) -> Motion:
-    """Every joint turned by up to about ``angle`` rad, places within a metre."""
+    """Every joint rotated by up to about ``angle`` rad, translations within a metre."""
     make = torch.Generator().manual_seed(seed)
     poses = angle * (2 * torch.rand(frames, 55, 3, generator=make) - 1)
     return Motion(poses, torch.rand(frames, 3, generator=make), torch.zeros(10), 30.0, torch.ones(frames))
 
 
 def world_rotations(poses: np.ndarray, parents: Sequence[int]) -> np.ndarray:
-    """(F, S, 3, 3) of axis-angle vectors (F, S, 3)."""
+    """World rotations (F, S, 3, 3) of axis-angle vectors (F, S, 3) relative to the parents."""
     world = np.empty((*poses.shape, 3))
     for frame, pose in enumerate(poses):
         for i, parent in enumerate(parents):
@@ -101,7 +101,7 @@ def world_rotations(poses: np.ndarray, parents: Sequence[int]) -> np.ndarray:
 
 
 def slow_vertices(body: BodyTemplate, motion: Motion) -> np.ndarray:
-    """(F, M, 3) of linear blend skinning as written down in the SMPL paper, with 4x4 matrices and loops; float64."""
+    """Vertices (F, M, 3) by linear blend skinning as in the SMPL paper, with 4x4 matrices and loops; float64."""
     betas = motion.betas.double().numpy()[: body.num_shapes]
     vertices, joints = body.vertices.double().numpy(), body.joints.double().numpy()
     if body.shape_dirs is not None and body.joint_shape_dirs is not None:
@@ -125,7 +125,7 @@ def slow_vertices(body: BodyTemplate, motion: Motion) -> np.ndarray:
 
 
 def pelvis_path(body: BodyTemplate, motion: Motion) -> np.ndarray:
-    """(F, 3) of the root joint."""
+    """Positions (F, 3) of the root joint."""
     return (body.joints[0] + motion.trans).double().numpy()
 
 
@@ -135,7 +135,7 @@ def pelvis_path(body: BodyTemplate, motion: Motion) -> np.ndarray:
 def write_bvh(
     path: Path, own: Skeleton, local: np.ndarray, root: np.ndarray, order: str = "ZXY", fps: float = 30.0
 ) -> Path:
-    """A BVH of local rotations (F, S, 3, 3) and places of the root (F, 3), with Euler angles in ``order``."""
+    """Write a BVH of local rotations (F, S, 3, 3) and root positions (F, 3), with Euler angles in ``order``."""
     lines = ["HIERARCHY"]
 
     def block(i: int, depth: int) -> None:
@@ -182,7 +182,7 @@ def depth_first(parents: Sequence[int]) -> list[int]:
 
 @dataclass(frozen=True)
 class Clip:
-    """What ``write_glb`` writes: local rotations (F, S, 3, 3), root places (F, 3), and how."""
+    """An animation for ``glb_of``: local rotations (F, S, 3, 3), root positions (F, 3), and options."""
 
     local: np.ndarray
     root: np.ndarray
@@ -201,7 +201,7 @@ class Glb:
         self.data = b""
 
     def add(self, values: np.ndarray, kind: str) -> int:
-        """The number of a new accessor of float32 ``values``."""
+        """Add an accessor of float32 ``values``; return its number."""
         content = np.ascontiguousarray(values, dtype="<f4").tobytes()
         view: dict = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content)}
         self.json["bufferViews"].append(view)
@@ -261,7 +261,7 @@ def glb_of(own: Skeleton, clip: Clip) -> Glb:
 
 
 def as_local(motion: Motion, own: Skeleton) -> np.ndarray:
-    """(F, S, 3, 3) local rotations of those of our joints that the skeleton has; others are taken as still."""
+    """Local rotations (F, S, 3, 3) of the joints that the skeleton has; the others are ignored."""
     rows = [JOINT_NAMES.index(name) for name in own.names]
     poses = motion.poses.double().numpy()[:, rows]
     return Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)

@@ -1,4 +1,4 @@
-"""Small synthetic people for tests of predictions: captures, and the persons in them."""
+"""Small synthetic captures of people, for tests of predictions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def body() -> BodyTemplate:
 
 
 def people(folder: Path, seeds: tuple[int, ...], options: HumanOptions = TINY) -> Path:
-    """``folder`` with a capture of a person per seed."""
+    """Write a capture of a person per seed into ``folder``; return it."""
     for seed in seeds:
         write_human_capture(folder / f"p{seed}", replace(options, seed=seed))
     return folder
