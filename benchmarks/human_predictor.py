@@ -22,6 +22,8 @@ from statistics import fmean
 
 import torch
 
+from dyngs.api.predict import network_config, predict_person, write_run
+from dyngs.api.train import train
 from dyngs.config import Config, HumanPredictorModel
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.evaluate.report import evaluate_run
@@ -31,8 +33,6 @@ from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.load import load_template
 from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at
 from dyngs.training.prediction import filmed, human_options, load_network, new_network
-from dyngs.api.predict import network_config, predict_person, write_run
-from dyngs.api.train import train
 
 FIRST_HELD_OUT = 101
 """Seed of the first person that is not trained on."""

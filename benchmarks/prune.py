@@ -4,8 +4,8 @@
 
 FOLDER keeps the pruned runs, which are used again. `stages` goes the whole way: pruned, fine-tuned, stored by
 `dyngs export --format dyngs`. `parts` compares pruning alone, masks alone and both, with and without fine-tuning (one
-step); `scores` compares the scores. Pruning does not back off here. Overrides (prune.share=0.8, ...) hold for all
-rows. Printed as a table in Markdown: Gaussians, PSNR of 20 training views and of the whole test split, how
+step); `scores` compares the scores. Pruning does not back off here. Overrides (prune.mask_times=6, ...) hold
+for all rows. Printed as a table in Markdown: Gaussians, PSNR of 20 training views and of the whole test split, how
 many times as fast it draws as RUN, MB as float32 and as stored.
 """
 
@@ -14,10 +14,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dyngs.api.prune import Cost, compared, prune_run
 from dyngs.evaluate.report import evaluate_run
-from dyngs.api.prune import Cost, prune_run, compared
-from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.export.scene_file import write_scene_file
+from dyngs.runs.checkpoint import checkpoint_paths
 
 ONCE = "prune.steps=1"
 NO_MASKS, NO_PRUNING = "prune.mask_times=0", "prune.share=0"

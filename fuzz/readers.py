@@ -155,8 +155,8 @@ def read_splats(root: Path) -> object:
 
 def read_a_run(root: Path) -> object:
     """Read a run, and render it at two times."""
-    from dyngs.scene import render_options
     from dyngs.runs.checkpoint import load_run, seconds_at
+    from dyngs.scene import render_options
 
     run = load_run(root)
     return seconds_at(root, 7), run.info, played(run.scene, render_options(run.config.model))
@@ -164,8 +164,8 @@ def read_a_run(root: Path) -> object:
 
 def read_a_person(root: Path) -> object:
     """Read an avatar and render it."""
-    from dyngs.scene import render_options
     from dyngs.export.avatar import read_avatar
+    from dyngs.scene import render_options
 
     run = read_avatar(only(root))
     return run.info, played(run.scene, render_options(run.config.model))
@@ -199,12 +199,12 @@ def read_a_path(root: Path) -> object:
 
 
 def read_a_point(root: Path) -> object:
-    """Read a measured point and make its row of the report."""
+    """The measurement and its row of the report."""
     from dyngs.tradeoff.measurements import read_measurement
-    from dyngs.tradeoff.report import rows_of
+    from dyngs.tradeoff.table import table_rows
 
-    point = read_measurement(only(root))
-    return rows_of([point]), point
+    measurement = read_measurement(only(root))
+    return table_rows([measurement]), measurement
 
 
 def read_option_values(root: Path) -> object:

@@ -200,7 +200,7 @@ def test_every_command_is_parsed_with_its_configuration(
 
 @pytest.mark.parametrize(
     "words",
-    ["eval runs/a --splt test", "train static data.root=x trian.steps=2", "prune r --out o prune.pruen=0.1"],
+    ["eval runs/a --splt test", "train static data.root=x trian.steps=2", "prune r --out o prune.shrae=0.1"],
 )
 def test_a_misspelt_option_or_key_is_noticed(words: str, parsed: list[argparse.Namespace]) -> None:
     command = Command("nowhere.md", tuple(words.split()))

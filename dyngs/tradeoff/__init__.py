@@ -1,1 +1,1 @@
-"""What each knob of a run costs in quality and brings in speed and size, measured; and the best run within limits."""
+"""Quality, speed and size of a run with other settings, measured, and the best run that meets requirements."""

@@ -1,6 +1,6 @@
-"""Several processes that share the work of one sweep, as ``torchrun`` starts them.
+"""The processes that share a sweep, as started by ``torchrun``.
 
-They may run on several machines that see the same folder: all that they tell each other is in files.
+They may run on several machines that share a file system: they exchange results through files.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from dyngs.api.train import num_cores
 from dyngs.errors import DyngsError
 from dyngs.tradeoff.variants import Variant
 
-PATIENCE = timedelta(days=30)
-"""That one process waits for the others, which may be training."""
+TIMEOUT = timedelta(days=30)
+"""A process may have to wait while others train."""
 
 
 @dataclass(frozen=True)
 class ProcessGroup:
-    """This process among all.
+    """This process and the number of the others.
 
     Attributes:
-        rank: its number; the first, 0, also measures speed and writes the report.
-        size: how many there are.
-        here: how many of them are on this machine.
+        rank: number of this process; rank 0 also measures speed and writes the report.
+        size: number of processes.
+        local_size: number of processes on this machine.
     """
 
     rank: int = 0
     size: int = 1
-    here: int = 1
+    local_size: int = 1
 
     @staticmethod
     def from_environment() -> ProcessGroup:
-        """What ``torchrun`` says; one process without it.
+        """Return the group that ``torchrun`` describes in environment variables; a single process without it.
 
         Raises:
-            DyngsError: a variable of torchrun's is no number.
+            DyngsError: one of the variables is not a number.
         """
         names = ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")
         if any(name not in os.environ for name in (*names, "MASTER_ADDR", "MASTER_PORT")):
@@ -51,34 +51,34 @@ class ProcessGroup:
 
     @property
     def is_first(self) -> bool:
-        """This process is the first."""
+        """Whether this process has rank 0."""
         return self.rank == 0
 
     @property
     def cores(self) -> int:
-        """This process' share of the machine's, at least 1."""
-        return max(1, num_cores() // self.here)
+        """Cores for this process if all on this machine get the same number, at least 1."""
+        return max(1, num_cores() // self.local_size)
 
     def share(self, variants: Sequence[Variant]) -> list[Variant]:
-        """Those that this process measures; what is made together, or one from the other, stays together."""
+        """Return the variants for this process; variants that are made from one another stay together."""
         owners: dict[Variant, int] = {}
         for variant in variants:
-            owners.setdefault(_made_with(variant), len(owners) % self.size)
-        return [variant for variant in variants if owners[_made_with(variant)] == self.rank]
+            owners.setdefault(_longest_stage(variant), len(owners) % self.size)
+        return [variant for variant in variants if owners[_longest_stage(variant)] == self.rank]
 
     def wait(self) -> None:
-        """Until all are here."""
+        """Block until all processes are here."""
         if self.size == 1:
             return
         if not torch.distributed.is_initialized():
-            torch.distributed.init_process_group("gloo", timeout=PATIENCE)
+            torch.distributed.init_process_group("gloo", timeout=TIMEOUT)
         torch.distributed.barrier()
 
 
 SINGLE_PROCESS = ProcessGroup()
 
 
-def _made_with(variant: Variant) -> Variant:
-    """The part of a variant that takes longest to make: training, then pruning and masking, then the rest."""
-    compacted = replace(variant.stored, storage=None, field_step=1.0, sh_degree=None)
-    return next((part for part in (variant.trained, compacted, variant.stored) if part != Variant()), variant)
+def _longest_stage(variant: Variant) -> Variant:
+    """Return the part of a variant that takes longest to make: training, else pruning and masking, else the rest."""
+    pruned = replace(variant.stored, storage=None, field_step=1.0, sh_degree=None)
+    return next((part for part in (variant.trained, pruned, variant.stored) if part != Variant()), variant)

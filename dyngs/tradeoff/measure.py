@@ -1,4 +1,4 @@
-"""How good, how fast and how large what a variant draws is."""
+"""Quality and speed of variants, measured by rendering them."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from dyngs.tradeoff.variants import Variant
 
 @dataclass(frozen=True)
 class VariantRenderer:
-    """Draws a variant.
+    """Renders a variant.
 
     Attributes:
-        scene: its Gaussians.
-        options: how they are drawn.
+        scene: its scene.
+        options: how to render it.
         background: (3,) colour.
-        scale: sides of what is drawn over those of what comes out.
+        scale: width and height rendered, relative to those returned.
     """
 
     scene: Scene
@@ -42,20 +42,20 @@ class VariantRenderer:
 
     @torch.no_grad()
     def picture(self, cameras: Cameras, time: float | None) -> Tensor:
-        """(H, W, 3) what the one camera sees at ``time``; drawn smaller and enlarged bilinearly where ``scale`` < 1."""
-        smaller = scaled_cameras(cameras, self.scale)
-        seen = self.scene.render(smaller, time, options=self.options, background=self.background).rgb[0]
-        if seen.shape[:2] == (cameras.height, cameras.width):
-            return seen
+        """Return (H, W, 3), seen by one camera at ``time``; upscaled bilinearly if ``scale`` < 1."""
+        small = scaled_cameras(cameras, self.scale)
+        rgb = self.scene.render(small, time, options=self.options, background=self.background).rgb[0]
         size = (cameras.height, cameras.width)
-        return torch.nn.functional.interpolate(seen.permute(2, 0, 1)[None], size=size, mode="bilinear")[0].permute(
+        if rgb.shape[:2] == size:
+            return rgb
+        return torch.nn.functional.interpolate(rgb.permute(2, 0, 1)[None], size=size, mode="bilinear")[0].permute(
             1, 2, 0
         )
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Means over pictures; LPIPS is None where it cannot be had."""
+    """Means over pictures; LPIPS is None where it cannot be computed."""
 
     psnr: float
     ssim: float
@@ -63,7 +63,7 @@ class Quality:
 
 
 def with_render_settings(variant: Variant, model: SceneModel) -> SceneModel:
-    """The ``model`` of a run with how a variant of it is drawn."""
+    """Return the ``model`` section of a run with the render settings of a variant."""
     mode = None if variant.mode is None else RasterizeMode(variant.mode)
     changes = {
         "rasterize_mode": mode,
@@ -74,12 +74,12 @@ def with_render_settings(variant: Variant, model: SceneModel) -> SceneModel:
 
 
 def render_options_of(variant: Variant, model: SceneModel) -> RenderOptions:
-    """How a variant is drawn that changes a run of ``model``."""
+    """Return the render options of a variant of a run with ``model``."""
     return render_options(with_render_settings(variant, model))
 
 
 def scaled_cameras(cameras: Cameras, scale: float) -> Cameras:
-    """The same cameras with pictures whose sides are ``scale`` times as long, rounded to whole pixels."""
+    """Return the cameras with width and height times ``scale``, rounded to whole pixels."""
     if scale == 1:
         return cameras
     width, height = (max(1, round(scale * side)) for side in (cameras.width, cameras.height))
@@ -87,47 +87,49 @@ def scaled_cameras(cameras: Cameras, scale: float) -> Cameras:
     return Cameras(cameras.cam_from_world, factors[:, None] * cameras.intrinsics, width, height)
 
 
-def measure_quality(drawer: VariantRenderer, pictures: Iterable[Picture], lpips: Lpips) -> Quality:
-    """Means over the pictures, each at its own time.
+def measure_quality(renderer: VariantRenderer, pictures: Iterable[Picture], lpips: Lpips) -> Quality:
+    """Return mean metrics over pictures, each rendered at its own time.
 
     Raises:
-        DyngsError: a picture that holds NaN or Inf.
+        DyngsError: a render holds NaN or Inf.
     """
     psnrs, ssims, distances = [], [], []
     for picture in pictures:
-        drawn, truth = drawer.picture(picture.cameras, picture.time), picture.composite(drawer.background)
-        if not bool(drawn.isfinite().all()):
+        rendered, truth = renderer.picture(picture.cameras, picture.time), picture.composite(renderer.background)
+        if not bool(rendered.isfinite().all()):
             raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
-        psnrs.append(psnr(drawn, truth, picture.mask))
-        ssims.append(ssim(drawn, truth, picture.mask))
-        distances.append(lpips(drawn, truth, picture.mask).value)
+        psnrs.append(psnr(rendered, truth, picture.mask))
+        ssims.append(ssim(rendered, truth, picture.mask))
+        distances.append(lpips(rendered, truth, picture.mask).value)
     known = [x for x in distances if x is not None]
     return Quality(fmean(psnrs), fmean(ssims), fmean(known) if len(known) == len(distances) else None)
 
 
-def time_interleaved(drawers: Sequence[VariantRenderer], pictures: Sequence[Picture], rounds: int) -> list[Speed]:
-    """How fast each is, the first being the run itself: all draw each picture in turn, so that what else the machine
-    does hits all alike, and another one begins each time.
+def time_interleaved(renderers: Sequence[VariantRenderer], pictures: Sequence[Picture], rounds: int) -> list[Speed]:
+    """Return the speed of each renderer, relative to the first one.
+
+    All render each picture in turn, starting with another one each time, so that other load on the machine affects all
+    alike.
 
     Args:
-        drawers: at least one.
-        pictures: whose cameras and times are drawn.
-        rounds: how often.
+        renderers: at least one.
+        pictures: their cameras and times are rendered.
+        rounds: renders of each picture.
     """
-    seconds = np.zeros((len(drawers), rounds * len(pictures)))
-    for drawer in drawers:
-        drawer.picture(pictures[0].cameras, pictures[0].time)  # the warm-up
+    seconds = np.zeros((len(renderers), rounds * len(pictures)))
+    for renderer in renderers:
+        renderer.picture(pictures[0].cameras, pictures[0].time)  # warm-up
     for column in range(seconds.shape[1]):
         picture = pictures[column % len(pictures)]
-        for turn in range(len(drawers)):
-            row = (column + turn) % len(drawers)
+        for turn in range(len(renderers)):
+            row = (column + turn) % len(renderers)
             start = time.perf_counter()
-            drawers[row].picture(picture.cameras, picture.time)
+            renderers[row].picture(picture.cameras, picture.time)
             seconds[row, column] = time.perf_counter() - start
     return [Speed(ms=quartiles(1e3 * own), gain=quartiles(seconds[0] / own)) for own in seconds]
 
 
 def quartiles(values: np.ndarray) -> Quartiles:
-    """Median and quartiles."""
+    """Return median and quartiles."""
     low, high = np.percentile(values, [25, 75])
     return Quartiles(float(median(values)), float(low), float(high))

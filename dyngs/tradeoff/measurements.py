@@ -1,4 +1,4 @@
-"""What was measured of one variant, and its file: one per point, so that nothing is measured twice."""
+"""Measurements of variants, and their files: one per variant, so that nothing is measured twice."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dyngs.tradeoff.variants import Variant
 
 @dataclass(frozen=True)
 class Quartiles:
-    """A median and its quartiles."""
+    """Median, lower and upper quartile."""
 
     median: float
     low: float
@@ -25,11 +25,11 @@ class Quartiles:
 
 @dataclass(frozen=True)
 class Speed:
-    """How fast it is drawn, deformation and enlarging included.
+    """Rendering speed, with deformation and upscaling.
 
     Attributes:
-        ms: of one picture.
-        gain: how many times as fast as the run itself is, in pairs of pictures drawn one after the other.
+        ms: milliseconds per picture.
+        gain: speed relative to the run itself, over pairs of renders taken right after each other.
     """
 
     ms: Quartiles
@@ -38,16 +38,16 @@ class Speed:
 
 @dataclass(frozen=True)
 class Measurement:
-    """A variant of a run, measured.
+    """Quality, size and speed of a variant.
 
     Attributes:
-        variant: what it changes.
-        num_views: of the split, all of them.
-        psnr, ssim, lpips: means over them; LPIPS is None where it cannot be had.
+        variant: settings that differ from the run.
+        num_views: number of views of the split.
+        psnr, ssim, lpips: means over the views; LPIPS is None where it cannot be computed.
         num_gaussians: N.
-        mb: on disk, 1e6 bytes: the stored file, or 4 bytes for each value that drawing needs where nothing is rounded.
-        memory_mb: what a process grows by at most while it loads and draws it, 1e6 bytes; None where unknown.
-        speed: None as long as it is not measured.
+        mb: 1e6 bytes on disk: the .dyngs file, or 4 bytes per value needed for rendering where nothing is quantised.
+        memory_mb: largest growth of a process that loads and renders the variant, 1e6 bytes; None where unknown.
+        speed: None until it is measured.
     """
 
     variant: Variant
@@ -62,33 +62,33 @@ class Measurement:
 
     @property
     def gain(self) -> float:
-        """How many times as fast as the run itself; 1 as long as that is not measured."""
+        """Median speed relative to the run itself; 1 until it is measured."""
         return 1.0 if self.speed is None else self.speed.gain.median
 
 
-_POINT = TypeAdapter(Measurement)
+_MEASUREMENT = TypeAdapter(Measurement)
 
 
 def read_measurement(path: Path) -> Measurement:
-    """The point in a file.
+    """Read a measurement from its JSON file.
 
     Raises:
-        DyngsError: it is not one.
+        DyngsError: the file holds something else.
     """
-    with reading(path, "it is no measured point: remove it to have it measured again"):
+    with reading(path, "it is no measurement of a variant: remove it to have it measured again"):
         require_regular(path)
         stored = json.loads(path.read_text(encoding="utf-8"), parse_float=_finite, parse_constant=_finite)
-        variant, speed = Variant.from_json(stored.pop("variant")), stored.pop("speed")
+        variant, speed = Variant(**stored.pop("variant")), stored.pop("speed")
         if speed is not None:
             speed = Speed(Quartiles(**speed["ms"]), Quartiles(**speed["gain"]))
             if min(*speed.ms.__dict__.values(), *speed.gain.__dict__.values()) <= 0:
                 raise ValueError("a time that is not positive")
-        return _POINT.validate_python(asdict(Measurement(variant=variant, speed=speed, **stored)))
+        return _MEASUREMENT.validate_python(asdict(Measurement(variant=variant, speed=speed, **stored)))
 
 
-def write_measurement(path: Path, point: Measurement) -> None:
-    """Write it, atomically."""
-    values = asdict(point) | {"variant": point.variant.to_json()}
+def write_measurement(path: Path, measurement: Measurement) -> None:
+    """Write a measurement as JSON, atomically."""
+    values = asdict(measurement) | {"variant": measurement.variant.changes}
     write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
 
 

@@ -1,6 +1,6 @@
-"""How much memory drawing takes: measured in processes of their own, whose parent this module is when it is run.
+"""Memory needed for rendering, measured in child processes; run as a program, this module is their parent.
 
-A process never gives back all that it once had, so that in one process only the hungriest variant would show.
+The peak of a process never falls, so several variants measured in one process would all show that of the largest.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _STATUS = Path("/proc/self/status")
 
 
 class MemoryMeter:
-    """A process that measures; a context that ends it. On systems that do not tell (not Linux) nothing is measured.
+    """Context manager of a process that imports the renderer once and forks for every measurement.
 
-    It imports what drawing needs once, and forks for every measurement.
+    Nothing is measured where /proc is missing (systems other than Linux).
     """
 
     def __init__(self) -> None:
@@ -45,20 +45,20 @@ class MemoryMeter:
     def peak_megabytes(
         self, folder: Path, variant: Variant, pictures: Sequence[Picture], background: Tensor
     ) -> float | None:
-        """By how much a process grows at most, 1e6 bytes of resident memory, that loads a run and draws on one thread.
+        """Return the largest growth of resident memory, 1e6 bytes, while loading a run and rendering on one thread.
 
-        Counted from where the program is loaded and nothing is read. None where it cannot be measured.
+        Counted from the loaded program, before any file is read. None where it cannot be measured.
 
         Args:
-            folder: of the run.
-            variant: how it is drawn.
-            pictures: whose cameras and times are drawn; a person plays the clip of training.
-            background: (3,).
+            folder: run folder.
+            variant: its render settings are used.
+            pictures: their cameras and times are rendered; a person shows the training motion.
+            background: (3,) colour.
         """
         process = self._started()
         if process is None or process.stdin is None or process.stdout is None:
             return None
-        shots = [
+        views = [
             {
                 "pose": picture.cameras.cam_from_world.tolist(),
                 "intrinsics": picture.cameras.intrinsics.tolist(),
@@ -67,16 +67,16 @@ class MemoryMeter:
             }
             for picture in pictures
         ]
-        request = {"folder": str(folder.absolute()), "variant": variant.to_json(), "background": background.tolist()}
+        request = {"folder": str(folder.absolute()), "variant": variant.changes, "background": background.tolist()}
         try:
-            process.stdin.write(json.dumps(request | {"shots": shots}) + "\n")
+            process.stdin.write(json.dumps(request | {"views": views}) + "\n")
             process.stdin.flush()
             return float(process.stdout.readline())
         except (OSError, ValueError):
             return None
 
     def _started(self) -> subprocess.Popen[str] | None:
-        """The process, which the first measurement starts; Ctrl-C is none of its business."""
+        """Return the process, started by the first measurement; in a session of its own, so that Ctrl-C spares it."""
         if self._process is None and _STATUS.is_file():
             command, pipe = [sys.executable, "-m", "dyngs.tradeoff.memory"], subprocess.PIPE
             self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
@@ -84,7 +84,7 @@ class MemoryMeter:
 
 
 def main() -> int:
-    """Answer each line of stdin, which asks for a measurement, with megabytes."""
+    """Answer each request, a line of JSON on stdin, with a line of megabytes on stdout."""
     for line in sys.stdin:
         child = os.fork()
         if child == 0:
@@ -96,16 +96,19 @@ def main() -> int:
 
 
 def _measure(request: dict[str, Any]) -> None:
-    """Draw what is asked for and print the megabytes that it took."""
+    """Render the requested views and print the growth of memory in megabytes."""
     before = _kilobytes("VmRSS")
-    variant = Variant.from_json(request["variant"])
+    variant = Variant(**request["variant"])
     with kernel_threads(1):
         run = load_run(Path(request["folder"]))
-        options, background = render_options_of(variant, run.config.model), torch.tensor(request["background"])
-        drawer = VariantRenderer(run.scene, options, background, variant.scale)
-        for shot in request["shots"]:
-            pose, intrinsics = (torch.tensor(shot[name]) for name in ("pose", "intrinsics"))
-            drawer.picture(Cameras(pose, intrinsics, *shot["size"]), shot["time"])
+        options, background = (
+            render_options_of(variant, run.config.model),
+            torch.tensor(request["background"], device="cpu"),
+        )
+        renderer = VariantRenderer(run.scene, options, background, variant.scale)
+        for view in request["views"]:
+            pose, intrinsics = (torch.tensor(view[name], device="cpu") for name in ("pose", "intrinsics"))
+            renderer.picture(Cameras(pose, intrinsics, *view["size"]), view["time"])
     print(1024e-6 * (_kilobytes("VmHWM") - before), flush=True)
 
 

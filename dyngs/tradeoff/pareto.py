@@ -1,4 +1,4 @@
-"""Which points no other beats, what each knob costs per factor of two, and what to put together next."""
+"""The Pareto front of variants, the PSNR cost of each setting per factor of two, and combinations worth measuring."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from dataclasses import dataclass
 from dyngs.tradeoff.measurements import Measurement
 from dyngs.tradeoff.variants import SEVERAL, Variant
 
-NO_GAIN = 0.05
-"""Doublings below which nothing counts as gained: 3.5 %."""
-TOO_MUCH_DB = 6.0
-"""A single change that loses more is not put together with others."""
+MIN_DOUBLINGS = 0.05
+"""Smaller gains (3.5 %) count as none."""
+MAX_LOSS_DB = 6.0
+"""A single change that loses more is not combined with others."""
 
 
 @dataclass(frozen=True)
 class ExchangeRate:
-    """What one knob costs and brings.
+    """PSNR lost per gain in speed and size by one setting.
 
     Attributes:
-        knob: its name, "prune + finetune" where fine-tuned, "storage + field_step".
-        db_per_speed, db_per_size: PSNR lost per doubling of the speed, and per halving of the size; None where no value
-            of the knob brings any. Negative: it brings both.
-        speed, size: the most that a value brings, as factors.
+        setting: its name, "prune + finetune" if fine-tuned, "storage + field_step".
+        db_per_speed, db_per_size: PSNR lost per doubled speed and per halved size; None where no value of the setting
+            gains any. Negative: quality improves as well.
+        speed, size: largest gains of its values, as factors.
     """
 
-    knob: str
+    setting: str
     db_per_speed: float | None
     db_per_size: float | None
     speed: float
@@ -34,98 +34,97 @@ class ExchangeRate:
 
 
 def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
-    """Whether each of some points is beaten by none: no other is as good in all goals and better in one.
+    """Return which points are on the Pareto front: no other is as good in all goals and better in one.
 
     Args:
-        goals: per point, all to be as large as possible.
+        goals: values of each point, all to be maximised.
     """
-    return [not any(_beats(other, own) for other in goals) for own in goals]
+    return [not any(_dominates(other, own) for other in goals) for own in goals]
 
 
-def on_front(points: Sequence[Measurement]) -> list[bool]:
-    """Whether each is beaten by none in PSNR, speed and size together."""
-    return pareto_mask([(p.psnr, p.gain, -p.mb) for p in points])
+def on_front(measurements: Sequence[Measurement]) -> list[bool]:
+    """Return which variants are on the Pareto front of PSNR, speed and size."""
+    return pareto_mask([(m.psnr, m.gain, -m.mb) for m in measurements])
 
 
 def rate(loss: float, factor: float) -> float | None:
-    """dB lost per factor 2; None where less than 3.5 % is gained."""
+    """Return dB lost per factor 2; None if less than 3.5 % is gained."""
     doublings = math.log2(factor)
-    return None if doublings < NO_GAIN else loss / doublings
+    return None if doublings < MIN_DOUBLINGS else loss / doublings
 
 
 def slope(losses_and_factors: Iterable[tuple[float, float]]) -> float | None:
-    """dB lost per factor 2, the least-squares line through no loss at factor 1; None where nothing is gained."""
-    pairs = [(loss, math.log2(factor)) for loss, factor in losses_and_factors if math.log2(factor) >= NO_GAIN]
+    """Return dB lost per factor 2: the least-squares line through no loss at factor 1; None if nothing is gained."""
+    pairs = [(loss, math.log2(factor)) for loss, factor in losses_and_factors if math.log2(factor) >= MIN_DOUBLINGS]
     return sum(loss * x for loss, x in pairs) / sum(x * x for _, x in pairs) if pairs else None
 
 
-def exchange_rates(base: Measurement, points: Iterable[Measurement]) -> list[ExchangeRate]:
-    """For each knob what it costs and brings, from the points that turn it alone; in the order of their first points.
+def exchange_rates(base: Measurement, measurements: Iterable[Measurement]) -> list[ExchangeRate]:
+    """Return the exchange rate of each setting, from the variants that change it alone, in order of appearance.
 
     Args:
         base: the run itself.
-        points: any.
+        measurements: of any variants.
     """
     groups: dict[str, list[Measurement]] = {}
-    for point in points:
-        if point.variant.knob not in ("", SEVERAL):
-            groups.setdefault(point.variant.knob, []).append(point)
+    for m in measurements:
+        if m.variant.setting not in ("", SEVERAL):
+            groups.setdefault(m.variant.setting, []).append(m)
     return [
         ExchangeRate(
-            knob=knob,
-            db_per_speed=slope((base.psnr - p.psnr, p.gain) for p in group),
-            db_per_size=slope((base.psnr - p.psnr, base.mb / p.mb) for p in group),
-            speed=max(p.gain for p in group),
-            size=max(base.mb / p.mb for p in group),
+            setting=setting,
+            db_per_speed=slope((base.psnr - m.psnr, m.gain) for m in group),
+            db_per_size=slope((base.psnr - m.psnr, base.mb / m.mb) for m in group),
+            speed=max(m.gain for m in group),
+            size=max(base.mb / m.mb for m in group),
         )
-        for knob, group in groups.items()
+        for setting, group in groups.items()
     ]
 
 
 def combinations(base: Measurement, singles: Sequence[Measurement], count: int) -> list[Variant]:
-    """Variants worth measuring next: single changes put together, the cheapest first.
+    """Return combinations of single changes worth measuring next.
 
-    Three ways are gone from the run on: for speed, for size, and for both. Each adds the change that loses least PSNR
-    per factor 2, then the next; a stronger value of a knob takes the place of a weaker one. Ways end after ``count``
-    steps.
+    There are three greedy sequences: for speed, for size, and for both. Each starts at the run and adds the change that
+    loses the least PSNR per factor 2, then the next; a stronger value of a setting replaces a weaker one.
 
     Args:
         base: the run itself.
-        singles: points that turn one knob each; of one knob the stronger values come later.
-        count: steps of each way.
+        singles: variants that change one setting each; stronger values of a setting come later.
+        count: combinations per sequence.
     """
-    ways: list[list[tuple[float, Measurement]]] = [[], [], []]
-    for point in singles:
-        loss, smaller = base.psnr - point.psnr, base.mb / point.mb
-        if loss > TOO_MUCH_DB:
+    sequences: list[list[tuple[float, Measurement]]] = [[], [], []]
+    for m in singles:
+        loss, smaller = base.psnr - m.psnr, base.mb / m.mb
+        if loss > MAX_LOSS_DB:
             continue
-        for way, gain in zip(ways, (point.gain, smaller, point.gain * smaller), strict=True):
-            price = rate(loss, gain)
-            if price is not None:
-                way.append((price, point))
-    order = [point.variant for point in singles]
+        for sequence, gain in zip(sequences, (m.gain, smaller, m.gain * smaller), strict=True):
+            cost = rate(loss, gain)
+            if cost is not None:
+                sequence.append((cost, m))
+    order = [m.variant for m in singles]
     known = {base.variant, *order}
     found: dict[Variant, None] = {}
-    for way in ways:
-        way.sort(key=lambda priced: (priced[0], priced[1].variant.slug))
-        for variant in _way(base.variant, [point.variant for _, point in way], order)[:count]:
+    for sequence in sequences:
+        sequence.sort(key=lambda pair: (pair[0], pair[1].variant.slug))
+        for variant in _accumulated(base.variant, [m.variant for _, m in sequence], order)[:count]:
             if variant not in known:
                 found[variant] = None
     return list(found)
 
 
-def _way(start: Variant, changes: Iterable[Variant], order: Sequence[Variant]) -> list[Variant]:
-    """Combinations of two changes and more, each with one more than that before."""
+def _accumulated(start: Variant, changes: Iterable[Variant], order: Sequence[Variant]) -> list[Variant]:
+    """Return combinations of two and more changes, each with one change more than the one before."""
     steps, now = [], start
     strongest: dict[str, int] = {}
     for change in changes:
-        (knob,), strength = change.knobs, order.index(change)
-        if strength > strongest.get(knob, -1):
-            now, strongest[knob] = now.merged(change), strength
-            if len(now.knobs) > 1:
+        (setting,), strength = change.settings, order.index(change)
+        if strength > strongest.get(setting, -1):
+            now, strongest[setting] = now.merged(change), strength
+            if len(now.settings) > 1:
                 steps.append(now)
     return steps
 
 
-def _beats(a: Sequence[float], b: Sequence[float]) -> bool:
+def _dominates(a: Sequence[float], b: Sequence[float]) -> bool:
     return all(x >= y for x, y in zip(a, b, strict=True)) and any(x > y for x, y in zip(a, b, strict=True))

@@ -1,4 +1,4 @@
-"""The plot of a sweep: PSNR against speed and against size."""
+"""Plot of a sweep: PSNR against speed and against size."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from dyngs.tradeoff.pareto import pareto_mask
-from dyngs.tradeoff.requirements import Figures
+from dyngs.tradeoff.table import TableRow
 from dyngs.tradeoff.variants import SEVERAL
 from dyngs.tradeoff.vector_graphics import Circle, Drawing, Line, Shape, Text
 
 PANEL = (520, 400)
-"""Width and height, px."""
+"""Width and height of a panel, px."""
 LEFT, TOP, BOTTOM, RIGHT = 58, 34, 48, 16
 LEGEND_ROW = 18
 PER_ROW = 6
@@ -34,13 +34,13 @@ COLOURS = (
     "#0077bb",
     "#555555",
 )
-"""The run itself first."""
+"""Colour of the run itself first."""
 HEADROOM = 0.06
 
 
 @dataclass(frozen=True)
 class _Axis:
-    """Values to pixels, linear or logarithmic."""
+    """Map of values to pixels, linear or logarithmic."""
 
     low: float
     high: float
@@ -53,7 +53,7 @@ class _Axis:
         return self.start + (self.end - self.start) * (x - a) / (b - a)
 
     def ticks(self) -> list[float]:
-        """Round values inside: 1, 2, 5 times powers of ten; with few of them on a logarithmic axis, evenly spaced."""
+        """Return 1, 2, 5 times powers of ten; evenly spaced values if a logarithmic axis has fewer than 3 of those."""
         if self.logarithmic:
             powers = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
             found = [m * 10.0**p for p in powers for m in (1, 2, 5) if self.low <= m * 10.0**p <= self.high]
@@ -64,39 +64,41 @@ class _Axis:
         return [k * step for k in range(first, math.floor(self.high / step) + 1)]
 
 
-def plot(points: Sequence[Figures]) -> Drawing:
-    """Two panels side by side and a legend: a thin line joins the values of a knob, in order, with the run itself; the
-    thick grey one what nothing beats in both axes. Values that are not above 0 are left out of logarithmic axes.
+def plot(rows: Sequence[TableRow]) -> Drawing:
+    """Return two panels, PSNR against speed and against size, and a legend.
+
+    A thin line joins the run with the values of one setting in their order; the thick grey line is the Pareto front of
+    the two axes. Values that are not positive are left out of logarithmic axes.
 
     Args:
-        points: the run itself first.
+        rows: the run itself first.
     """
-    knobs = list(dict.fromkeys(p.variant.knob for p in points if p.variant.knob != SEVERAL))
-    colours = {knob: COLOURS[i % len(COLOURS)] for i, knob in enumerate(knobs)} | {SEVERAL: "#888888"}
-    if any(p.variant.knob == SEVERAL for p in points):
-        knobs.append(SEVERAL)
-    rows = math.ceil(len(knobs) / PER_ROW)
-    width, height = 2 * PANEL[0], PANEL[1] + rows * LEGEND_ROW + 8
+    settings = list(dict.fromkeys(p.variant.setting for p in rows if p.variant.setting != SEVERAL))
+    colours = {setting: COLOURS[i % len(COLOURS)] for i, setting in enumerate(settings)} | {SEVERAL: "#888888"}
+    if any(p.variant.setting == SEVERAL for p in rows):
+        settings.append(SEVERAL)
+    legend_rows = math.ceil(len(settings) / PER_ROW)
+    width, height = 2 * PANEL[0], PANEL[1] + legend_rows * LEGEND_ROW + 8
     shapes = [
-        *_panel(points, colours, 0, ("speed", "frames per second (more is better)", lambda p: p.fps), 1),
-        *_panel(points, colours, PANEL[0], ("size", "MB on disk (less is better)", lambda p: p.mb), -1),
+        *_panel(rows, colours, 0, ("speed", "frames per second (more is better)", lambda p: p.fps), 1),
+        *_panel(rows, colours, PANEL[0], ("size", "MB on disk (less is better)", lambda p: p.mb), -1),
     ]
-    for i, knob in enumerate(knobs):
+    for i, setting in enumerate(settings):
         x, y = LEFT + (i % PER_ROW) * (width - LEFT) / PER_ROW, PANEL[1] + 12 + LEGEND_ROW * (i // PER_ROW)
-        shapes += [Circle(x, y - 4, 5, colours[knob]), Text(x + 10, y, knob or "the run itself")]
+        shapes += [Circle(x, y - 4, 5, colours[setting]), Text(x + 10, y, setting or "the run itself")]
     return Drawing(width, height, shapes)
 
 
 def _panel(
-    points: Sequence[Figures],
+    rows: Sequence[TableRow],
     colours: dict[str, str],
     left: float,
-    what: tuple[str, str, Callable[[Figures], float]],
+    axis: tuple[str, str, Callable[[TableRow], float]],
     sign: int,
 ) -> list[Shape]:
-    """One plot; ``sign``: of the goal along x."""
-    title, label, value = what
-    shown = [p for p in points if value(p) > 0]
+    """Return one panel; ``sign`` is 1 if larger x is better, -1 otherwise."""
+    title, label, value = axis
+    shown = [p for p in rows if value(p) > 0]
     if not shown:
         return []
     low, high = _wider([value(p) for p in shown], logarithmic=True)
@@ -106,18 +108,18 @@ def _panel(
     best = pareto_mask([(p.psnr, sign * value(p)) for p in shown])
     front = sorted({places[p.variant] for p, is_best in zip(shown, best, strict=True) if is_best})
     shapes = [*_frame(across, up, f"PSNR and {title}", label), Line(tuple(front), "#d4d4d4", 5)]
-    for knob, colour in colours.items():
-        if knob not in ("", SEVERAL):
-            turned = tuple(places[p.variant] for p in shown if p.variant.knob in ("", knob))
+    for setting, colour in colours.items():
+        if setting not in ("", SEVERAL):
+            turned = tuple(places[p.variant] for p in shown if p.variant.setting in ("", setting))
             shapes.append(Line(turned, colour, 0.75))
-    for p in reversed(shown):  # the run itself on top
+    for p in reversed(shown):  # draws the run itself on top
         tip = f"{p.variant.name}: {p.psnr:.2f} dB, {p.fps:.1f} fps, {p.mb:.2f} MB"
-        shapes.append(Circle(*places[p.variant], 6.5 if not p.variant.knob else 5, colours[p.variant.knob], tip))
+        shapes.append(Circle(*places[p.variant], 6.5 if not p.variant.setting else 5, colours[p.variant.setting], tip))
     return shapes
 
 
 def _frame(across: _Axis, up: _Axis, title: str, label: str) -> list[Shape]:
-    """Grid, numbers and words around a panel."""
+    """Return grid, tick labels, title and axis label."""
     shapes: list[Shape] = [Text(across.start, 20, title, size=13, bold=True), Text(across.start - 44, TOP - 8, "dB")]
     for tick in across.ticks():
         x = across.at(tick)
@@ -132,7 +134,7 @@ def _frame(across: _Axis, up: _Axis, title: str, label: str) -> list[Shape]:
 
 
 def _wider(values: Sequence[float], *, logarithmic: bool) -> tuple[float, float]:
-    """Limits around the values with some room, never empty."""
+    """Return limits with some margin around the values, never empty."""
     low, high = min(values), max(values)
     if logarithmic:
         room = max((high / low) ** HEADROOM, 1.05)
@@ -142,6 +144,6 @@ def _wider(values: Sequence[float], *, logarithmic: bool) -> tuple[float, float]
 
 
 def _round_step(step: float) -> float:
-    """1, 2 or 5 times a power of ten, at least ``step``."""
+    """Return 1, 2, 5 or 10 times a power of ten that is at least ``step``."""
     power = 10.0 ** math.floor(math.log10(step))
     return next(m * power for m in (1, 2, 5, 10) if m * power >= step * (1 - 1e-9))

@@ -1,4 +1,4 @@
-"""The files of a sweep: a table for programs, the same for people, and a plot."""
+"""The report of a sweep: tables as .csv, .json and .html, and a plot."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
 
 from dyngs.files.write import write_image, write_text
 from dyngs.tradeoff.measurements import Measurement
-from dyngs.tradeoff.pareto import ExchangeRate, exchange_rates, on_front
+from dyngs.tradeoff.pareto import ExchangeRate, exchange_rates
 from dyngs.tradeoff.plot import plot
-from dyngs.tradeoff.sweep import figures_of
+from dyngs.tradeoff.table import TableRow, table_rows
 
 STEM = "tradeoff"
 _STYLE = """\
@@ -24,97 +24,71 @@ td, th { padding: 2px 10px; text-align: right; border-bottom: 1px solid #ddd; }
 td:first-child, th:first-child { text-align: left; }
 .front { background: #eef5ff; }
 """
+_HEAD = (
+    "changed",
+    "PSNR dB",
+    "SSIM",
+    "LPIPS",
+    "fps",
+    "times as fast (quartiles)",
+    "MB",
+    "memory MB",
+    "Gaussians",
+)
+EXCHANGE_HEAD = (
+    "setting",
+    "dB lost per doubled speed",
+    "dB lost per halved size",
+    "most speed, times",
+    "most size, times",
+)
 
 
-@dataclass(frozen=True)
-class Row:
-    """A point in the table; the fields are the columns of the .csv.
+def write_report(out: Path, measurements: Sequence[Measurement]) -> list[Path]:
+    """Write ``tradeoff.csv``, ``.json``, ``.svg``, ``.html`` and ``.png``; return their paths.
 
-    Attributes:
-        name: what is changed.
-        psnr, ssim, lpips: means over the split.
-        fps: of the run itself, times ``gain``.
-        gain, gain_low, gain_high: how many times as fast as the run: median and quartiles of pairs drawn in turn.
-        ms: median of one picture, as it was measured.
-        mb, memory_mb, gaussians: see ``Measurement``.
-        on_front: no other point is as good in PSNR, speed and size.
-    """
-
-    name: str
-    psnr: float
-    ssim: float
-    lpips: float | None
-    fps: float
-    gain: float
-    gain_low: float
-    gain_high: float
-    ms: float
-    mb: float
-    memory_mb: float | None
-    gaussians: int
-    on_front: bool
-
-
-def rows_of(points: Sequence[Measurement]) -> list[Row]:
-    """One per point that was timed, in their order."""
-    rows = []
-    for point, figures, front in zip(points, figures_of(points), on_front(points), strict=True):
-        if point.speed is not None:
-            gain = point.speed.gain
-            rows.append(
-                Row(
-                    name=point.variant.name,
-                    psnr=point.psnr,
-                    ssim=point.ssim,
-                    lpips=point.lpips,
-                    fps=figures.fps,
-                    gain=gain.median,
-                    gain_low=gain.low,
-                    gain_high=gain.high,
-                    ms=point.speed.ms.median,
-                    mb=point.mb,
-                    memory_mb=point.memory_mb,
-                    gaussians=point.num_gaussians,
-                    on_front=front,
-                )
-            )
-    return rows
-
-
-def write_report(out: Path, points: Sequence[Measurement]) -> list[Path]:
-    """``tradeoff.csv``, ``.json``, ``.svg``, ``.html`` and ``.png`` in ``out``.
-
-    The page needs nothing beside it, and no network.
+    The page needs no other files and no network.
 
     Args:
-        out: folder.
-        points: timed, the run itself first.
+        out: output folder.
+        measurements: with speed, the run itself first.
     """
-    rows, found = rows_of(points), exchange_rates(points[0], points)
-    drawing = plot(figures_of(points))
+    rows, rates = table_rows(measurements), exchange_rates(measurements[0], measurements)
+    svg = plot(rows)
     table = io.StringIO()
-    writer = csv.DictWriter(table, list(asdict(rows[0])), lineterminator="\n")
+    writer = csv.DictWriter(table, list(rows[0].columns), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
+    writer.writerows(row.columns for row in rows)
     values = {
-        "points": [asdict(row) | {"changes": p.variant.to_json()} for row, p in zip(rows, points, strict=True)],
-        "exchange_rates": [asdict(exchange) for exchange in found],
-        "num_views": points[0].num_views,
+        "points": [row.columns | {"changes": row.variant.changes} for row in rows],
+        "exchange_rates": [asdict(rate) for rate in rates],
+        "num_views": measurements[0].num_views,
     }
     texts = {
         "csv": table.getvalue(),
         "json": json.dumps(values, indent=2, allow_nan=False) + "\n",
-        "svg": drawing.svg(),
-        "html": _page(rows, found, drawing.svg()),
+        "svg": svg.svg(),
+        "html": _page(rows, rates, svg.svg()),
     }
     for suffix, text in texts.items():
         write_text(out / f"{STEM}.{suffix}", text)
-    write_image(out / f"{STEM}.png", drawing.pixels())
+    write_image(out / f"{STEM}.png", svg.pixels())
     return [out / f"{STEM}.{suffix}" for suffix in (*texts, "png")]
 
 
-def _table_cells(row: Row) -> tuple[str, ...]:
-    """What people read of a row, below ``_TABLE_HEAD``."""
+def exchange_cells(rate: ExchangeRate) -> tuple[str, ...]:
+    """Return the cells of an exchange rate below ``EXCHANGE_HEAD``."""
+    costs = (rate.db_per_speed, rate.db_per_size)
+    return (
+        rate.setting,
+        *("no gain" if cost is None else f"{cost:+.2f}" for cost in costs),
+        f"{rate.speed:.2f}",
+        f"{rate.size:.2f}",
+    )
+
+
+def _cells(row: TableRow) -> tuple[str, ...]:
+    """Return the cells of a row below ``_HEAD``."""
     return (
         row.name,
         f"{row.psnr:.2f}",
@@ -128,53 +102,20 @@ def _table_cells(row: Row) -> tuple[str, ...]:
     )
 
 
-_TABLE_HEAD = (
-    "changed",
-    "PSNR dB",
-    "SSIM",
-    "LPIPS",
-    "fps",
-    "times as fast (quartiles)",
-    "MB",
-    "memory MB",
-    "Gaussians",
-)
-
-
-def exchange_cells(exchange: ExchangeRate) -> tuple[str, ...]:
-    """What people read of an exchange rate, below ``EXCHANGE_HEAD``."""
-    prices = (exchange.db_per_speed, exchange.db_per_size)
-    return (
-        exchange.knob,
-        *("no gain" if price is None else f"{price:+.2f}" for price in prices),
-        f"{exchange.speed:.2f}",
-        f"{exchange.size:.2f}",
-    )
-
-
-EXCHANGE_HEAD = (
-    "knob",
-    "dB lost per doubled speed",
-    "dB lost per halved size",
-    "most speed, times",
-    "most size, times",
-)
-
-
-def _page(rows: Sequence[Row], found: Sequence[ExchangeRate], picture: str) -> str:
-    body = [_line("th", _TABLE_HEAD), *(_line("td", _table_cells(row), front=row.on_front) for row in rows)]
-    prices = [_line("th", EXCHANGE_HEAD), *(_line("td", exchange_cells(exchange)) for exchange in found)]
+def _page(rows: Sequence[TableRow], rates: Sequence[ExchangeRate], svg: str) -> str:
+    rate_lines = [_line("th", EXCHANGE_HEAD), *(_line("td", exchange_cells(rate)) for rate in rates)]
+    lines = [_line("th", _HEAD), *(_line("td", _cells(row), front=row.on_front) for row in rows)]
     return "\n".join(
         [
             '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Tradeoff</title>',
-            f"<style>{_STYLE}</style></head><body><h1>What each knob costs and brings</h1>",
-            picture,
-            "<p>The thick lines join what nothing beats in both axes, thin ones the values of a knob in their order. "
-            "Rest the pointer on a point for its name.</p>",
-            "<h2>Knobs, each alone</h2><table>",
-            *prices,
-            "</table><h2>Points</h2><p>Shaded: beaten by no other in PSNR, speed and size together.</p><table>",
-            *body,
+            f"<style>{_STYLE}</style></head><body><h1>Quality, speed and size</h1>",
+            svg,
+            "<p>Thick lines: Pareto fronts of the two axes. Thin lines: the values of one setting in their order. "
+            "Hover over a point for its name.</p>",
+            "<h2>Each setting alone</h2><table>",
+            *rate_lines,
+            "</table><h2>All variants</h2><p>Shaded: Pareto front of PSNR, speed and size.</p><table>",
+            *lines,
             "</table></body></html>",
         ]
     )

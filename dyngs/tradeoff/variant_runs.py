@@ -1,4 +1,4 @@
-"""The run folders of variants: trained, pruned, masked, cut off, rounded as they say; none is made twice."""
+"""Run folders of variants: trained, pruned, masked, quantised as they say. None is made twice."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ from dyngs.tradeoff.measure import with_render_settings
 from dyngs.tradeoff.variants import RunSettings, Variant
 
 FIELD_SIZE = {"control_nodes": "nodes", "hexplane": "channels", "mlp": "width", "trajectory": "fourier"}
-"""What the size of a field is, by its kind: a key of its section."""
+"""The key that sets the size of a field, by its kind."""
 
 NO_BUDGET = tuple(f"budget.{name}=null" for name in BudgetConfig.model_fields)
-"""Variants are what they are: a limit of the run that they come from would change them again."""
+"""Limits of the run would change its variants again."""
 
 
 @dataclass(frozen=True)
 class VariantRuns:
-    """Where the run and its variants lie.
+    """The run folders of a run and of its variants.
 
     Attributes:
         run_dir: the run, with a checkpoint.
-        out: folder of all that is made.
-        threads: for training, drawing and pruning; 0 = all cores.
+        out: output folder.
+        threads: for training, rendering and pruning; 0 = all cores.
     """
 
     run_dir: Path
@@ -56,11 +56,11 @@ class VariantRuns:
     threads: int = 0
 
     def folder(self, variant: Variant) -> Path:
-        """A folder that ``load_run`` reads, with what of the variant lies on disk; made if it is not there.
+        """Return the run folder of a variant without its render settings; it is made if it does not exist.
 
         Raises:
             DyngsError: training or pruning fails.
-            KeyboardInterrupt: after Ctrl-C while training; the next call goes on with it.
+            KeyboardInterrupt: after Ctrl-C while training; the next call continues.
         """
         wanted = variant.stored
         if wanted == Variant():
@@ -83,13 +83,13 @@ class VariantRuns:
             _write(folder, latest_checkpoint(trained), load_resolved(trained), trained)
         elif wanted.prune or wanted.mask_times:
             source = self.folder(wanted.trained)
-            _write(folder, *self._compacted(source, wanted), source)
+            _write(folder, *self._pruned(source, wanted), source)
         else:
             trained = self._trained(wanted)
             _write(folder, latest_checkpoint(trained), load_resolved(trained), trained, whole=True)
 
     def _trained(self, wanted: Variant) -> Path:
-        """The run trained anew with other colours or another field."""
+        """Train the run from scratch with other colours or another field."""
         out = self.out / "training" / wanted.slug
         changes = [*field_changes(load_resolved(self.run_dir), wanted)]
         if wanted.colour is not None:
@@ -102,13 +102,13 @@ class VariantRuns:
         if checkpoint_paths(out):
             return finished(load_resolved(out), out)
         steps = [*NO_BUDGET, f"prune.steps={wanted.finetune}", f"run.threads={self.threads}"]
-        return prune_run(source, out, [*_compaction(wanted, load_resolved(source).prune), *steps])
+        return prune_run(source, out, [*_pruning_overrides(wanted, load_resolved(source).prune), *steps])
 
-    def _compacted(self, source: Path, wanted: Variant) -> tuple[Checkpoint, Config]:
-        """Pruned and masked, and nothing trained after it."""
+    def _pruned(self, source: Path, wanted: Variant) -> tuple[Checkpoint, Config]:
+        """Return the checkpoint after pruning and masking, without fine-tuning."""
         checkpoint = latest_checkpoint(source)
         changes = [f"train.steps={checkpoint.info.step}", *NO_BUDGET]
-        config = load_resolved(source, [*changes, *_compaction(wanted, load_resolved(source).prune)])
+        config = load_resolved(source, [*changes, *_pruning_overrides(wanted, load_resolved(source).prune)])
         with kernel_threads(self.threads or num_cores()):
             trainer = assemble(config, restored=True)
             trainer.restore(checkpoint)
@@ -117,18 +117,18 @@ class VariantRuns:
 
 
 def finished(config: Config, out: Path) -> Path:
-    """The run folder ``out``, trained to its end from wherever it is."""
+    """Train the run in folder ``out`` to its end, from its last checkpoint if there is one; return ``out``."""
     return train(config, resume_from=out if checkpoint_paths(out) else None)
 
 
 def run_settings(run_dir: Path) -> RunSettings:
-    """What knobs depend on.
+    """Return the settings of a run.
 
     Raises:
-        DyngsError: no run that can be varied.
+        DyngsError: the run cannot be varied.
     """
     if has_only_scene_file(run_dir):
-        raise DyngsError(f"{run_dir}: only {SCENE_FILE} is there; give the run that it was made from")
+        raise DyngsError(f"{run_dir}: only {SCENE_FILE} is there; give the run that it was exported from")
     config = load_resolved(run_dir)
     if network_of(config) is not None:
         raise DyngsError(f"{run_dir}: a network, not a scene; vary what it predicts")
@@ -146,16 +146,16 @@ def run_settings(run_dir: Path) -> RunSettings:
 
 
 def megabytes_on_disk(folder: Path) -> float:
-    """1e6 bytes of the stored file, or 4 bytes for each value that drawing needs of a checkpoint."""
+    """Return the size of the .dyngs file, or of what rendering needs of a checkpoint as float32, in 1e6 bytes."""
     if has_only_scene_file(folder):
         return 1e-6 * (folder / SCENE_FILE).stat().st_size
     return 1e-6 * num_bytes_exact(load_run(folder).scene)
 
 
 def write_chosen(models: VariantRuns, variant: Variant) -> Path:
-    """The folder of a run that is drawn as the variant says, by every command: what was made, and its configuration.
+    """Write a run folder that every command renders with the settings of the variant; return it.
 
-    Pictures that are drawn smaller are so by ``data.downscale`` and ``data.longest_side``.
+    A ``scale`` below 1 becomes a larger ``data.downscale`` and a smaller ``data.longest_side``.
     """
     made, out = models.folder(variant), models.out / "chosen" / variant.slug
     config = load_resolved(made)
@@ -172,14 +172,14 @@ def write_chosen(models: VariantRuns, variant: Variant) -> Path:
     return out
 
 
-def _compaction(wanted: Variant, own: PruneConfig) -> Sequence[str]:
-    """Overrides of the last stage; masks are the run's ``own`` where no others are wanted."""
+def _pruning_overrides(wanted: Variant, own: PruneConfig) -> Sequence[str]:
+    """Return overrides of the pruning stage; masks are those of the run where the variant has none."""
     masks = (f"prune.mask_times={wanted.mask_times or own.mask_times}", f"prune.mask_below={own.mask_below}")
     return (f"prune.share={wanted.prune}", f"prune.max_loss={MAX_PSNR}", *masks)
 
 
 def field_changes(config: Config, wanted: Variant) -> Iterator[str]:
-    """Overrides that make a field of another kind, which moves the same attributes, or of another size."""
+    """Yield overrides for a field of another kind, which moves the same attributes, or of another size."""
     field = field_of(config)
     if field is None:
         return
@@ -196,7 +196,7 @@ def field_changes(config: Config, wanted: Variant) -> Iterator[str]:
 
 
 def _with_degree(source: Path, degree: int) -> tuple[Checkpoint, Config]:
-    """Harmonics above ``degree`` left out."""
+    """Return checkpoint and configuration without the spherical harmonics above ``degree``."""
     checkpoint, config = latest_checkpoint(source), load_resolved(source)
     sh = checkpoint.tensors["gaussians.sh"][:, : num_sh_terms(degree)]
     cut = replace(checkpoint, tensors=checkpoint.tensors | {"gaussians.sh": sh.contiguous()})
@@ -204,9 +204,9 @@ def _with_degree(source: Path, degree: int) -> tuple[Checkpoint, Config]:
 
 
 def _write(folder: Path, checkpoint: Checkpoint, config: Config, source: Path, *, whole: bool = False) -> None:
-    """A run folder for drawing; its configuration, which comes last, says that it is complete.
+    """Write a run folder; the configuration comes last and marks it as complete.
 
-    ``whole``: training can go on from it; otherwise optimizer, sampler and random state are left out.
+    ``whole``: training can be resumed; otherwise optimizer, sampler and random state are left out.
     """
     tensors = checkpoint.tensors
     if not whole:

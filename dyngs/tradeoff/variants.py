@@ -1,37 +1,36 @@
-"""What of a run is varied: a variant says what it changes, a knob what may be changed and how far."""
+"""Variants of a run: the settings that can be varied, and what one variant changes."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
 
 from dyngs.errors import DyngsError, printable
 
 Value = float | int | str
 SEVERAL = "several"
-"""In place of a knob's name, of combinations."""
+"""Stands for the setting of a variant that changes more than one."""
 AUTO = "auto"
-"""Storage as coarse as ``dyngs export --format dyngs`` takes it by itself."""
+"""Storage with the default quantisation of ``dyngs export --format dyngs``."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """What is changed of a run; the defaults change nothing.
+    """Changes of a run; the defaults change nothing.
 
     Attributes:
-        colour: ``colour.kind`` that it is trained anew with.
-        field: ``model.deform.kind`` that it is trained anew with.
-        field_size: how many times as many nodes, channels, neurons or frequencies the field has, trained anew.
+        colour: ``colour.kind`` to train with.
+        field: ``model.deform.kind`` to train with.
+        field_size: factor on the nodes, channels, neurons or frequencies of the field to train with.
         prune: share of the Gaussians removed, by ``sensitivity``.
-        mask_times: key times of the masks of what is seen.
-        finetune: training steps after these two.
-        sh_degree: harmonics above it are dropped.
-        storage: how much pictures may change by rounding, grey levels of 255, or "auto"; None: exact, float32.
-        field_step: how many times as coarsely the field is rounded as ``storage`` has it.
-        mode, alpha_min, transmittance_min: ``model.rasterize_mode`` and so on that it is drawn with.
-        scale: sides of the pictures drawn over those shown.
+        mask_times: key times of visibility masks.
+        finetune: training steps after pruning and masking.
+        sh_degree: higher spherical harmonics are dropped.
+        storage: allowed change of pictures by quantisation, grey levels of 255, or "auto"; None: float32.
+        field_step: factor on the quantisation steps of the field.
+        mode, alpha_min, transmittance_min: ``model.rasterize_mode`` and so on to render with.
+        scale: width and height rendered, relative to those shown.
     """
 
     colour: str | None = None
@@ -50,69 +49,57 @@ class Variant:
 
     @property
     def changes(self) -> dict[str, Value]:
-        """What is not as in the run."""
+        """The fields that differ from the run; ``Variant(**changes)`` is the variant again."""
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
 
     @property
     def name(self) -> str:
-        """For people."""
-        words = (f"{key}={value:g}" if isinstance(value, float) else f"{key}={value}" for key, value in self._items())
+        """Name for tables and plots."""
+        words = (f"{k}={value:g}" if isinstance(value, float) else f"{k}={value}" for k, value in self.changes.items())
         return " ".join(words) or "as it is"
 
     @property
     def slug(self) -> str:
-        """For files; different for different variants."""
-        exact = (f"{key}-{value!r}" if isinstance(value, float) else f"{key}-{value}" for key, value in self._items())
+        """File name, different for different variants."""
+        exact = (f"{k}-{value!r}" if isinstance(value, float) else f"{k}-{value}" for k, value in self.changes.items())
         return "_".join(exact) or "as_it_is"
 
     @property
-    def knobs(self) -> tuple[str, ...]:
-        """Names of the knobs that are turned; fine-tuning and the field's steps belong to those before them."""
-        return tuple(key for key, _ in self._items() if key not in ("finetune", "field_step"))
+    def settings(self) -> tuple[str, ...]:
+        """Names of the changed settings; ``finetune`` and ``field_step`` belong to the ones before them."""
+        return tuple(name for name in self.changes if name not in ("finetune", "field_step"))
 
     @property
-    def knob(self) -> str:
-        """The one knob that is turned, with what belongs to it; "" of the run itself, ``SEVERAL`` of combinations."""
-        return SEVERAL if len(self.knobs) > 1 else " + ".join(self.changes)
+    def setting(self) -> str:
+        """The changed setting with what belongs to it; "" for the run itself, ``SEVERAL`` for combinations."""
+        return SEVERAL if len(self.settings) > 1 else " + ".join(self.changes)
 
     @property
     def stored(self) -> Variant:
-        """The part that decides what lies on disk."""
+        """The variant without the changes that only concern rendering."""
         return replace(self, mode=None, alpha_min=None, transmittance_min=None, scale=1.0)
 
     @property
     def trained(self) -> Variant:
-        """The part that is a training from the start."""
+        """The variant with only the changes that need training from scratch."""
         return Variant(colour=self.colour, field=self.field, field_size=self.field_size)
 
     def merged(self, other: Variant) -> Variant:
-        """This one with what ``other`` changes, too."""
+        """Return this variant with the changes of ``other`` on top."""
         return replace(self, **other.changes)
-
-    def to_json(self) -> dict[str, Value]:
-        """What ``from_json`` reads."""
-        return self.changes
-
-    @staticmethod
-    def from_json(changes: dict[str, Any]) -> Variant:
-        """The variant with these changes. Raises TypeError where one is unknown."""
-        return Variant(**changes)
-
-    def _items(self) -> list[tuple[str, Value]]:
-        return list(self.changes.items())
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Something that can be varied.
+    """A setting that can be varied.
 
     Attributes:
         name: a field of ``Variant``.
         values: tried by default, stronger ones later.
-        low, high: of numbers, both allowed; none at all where ``low > high``.
+        low, high: range of numbers, inclusive; no numbers if ``low > high``.
         words: allowed beside numbers.
-        whole: numbers are whole.
-        trains: every value but the run's own is a training from the start.
+        whole: numbers are integers.
+        trains: every value but that of the run needs training from scratch.
     """
 
     name: str
@@ -125,16 +112,16 @@ class Setting:
 
     @property
     def allowed(self) -> str:
-        """For messages."""
+        """The allowed values, for messages."""
         kind = "a whole number" if self.whole else "a number"
         number = [f"{kind} from {self.low:g} to {self.high:g}"] if self.low <= self.high else []
         return " or ".join([*number, *self.words])
 
     def parsed(self, text: str) -> Value:
-        """The value that is written.
+        """Return the value of a text.
 
         Raises:
-            DyngsError: not allowed.
+            DyngsError: it is not allowed.
         """
         if text in self.words:
             return text
@@ -166,22 +153,22 @@ SETTINGS = (
 
 @dataclass(frozen=True)
 class Variation:
-    """A knob and the values that are to be tried."""
+    """A setting and the values to try."""
 
-    knob: Setting
+    setting: Setting
     values: tuple[Value, ...]
 
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What a run is like, as far as knobs depend on it.
+    """The settings of the run that is varied.
 
     Attributes:
-        sh_degree: of its harmonics, 0 where a network colours it.
-        mode, alpha_min, transmittance_min: it is drawn with.
-        mask_times: key times that it has.
+        sh_degree: degree of its spherical harmonics, 0 if a network colours it.
+        mode, alpha_min, transmittance_min: it is rendered with.
+        mask_times: number of key times of its visibility masks.
         colour: kind.
-        field: kind of what moves something; None: nothing moves.
+        field: kind of the deformation field; None: nothing moves.
     """
 
     sh_degree: int
@@ -192,61 +179,62 @@ class RunSettings:
     colour: str
     field: str | None
 
-    def allows(self, knob: Setting, value: Value) -> bool:
-        """The value makes sense and is not the run's own."""
-        if knob.name == "sh_degree":
+    def allows(self, setting: Setting, value: Value) -> bool:
+        """Whether a value applies to the run and differs from its own."""
+        if setting.name == "sh_degree":
             return value < self.sh_degree  # pyright: ignore[reportOperatorIssue]
-        if knob.name in ("mask_times", "field", "field_size", "field_step") and self.field is None:
+        if setting.name in ("mask_times", "field", "field_size", "field_step") and self.field is None:
             return False
         own = asdict(self) | {"scale": 1.0, "field_size": 1.0, "field_step": 1.0}
-        return own.get(knob.name) != value
+        return own.get(setting.name) != value
 
 
 def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Variation, ...]:
-    """What ``--vary`` asks for: KNOB, or KNOB=VALUE,VALUE; without any all knobs with their default values.
+    """Return the variations of ``--vary SETTING`` or ``--vary SETTING=VALUE,VALUE``; without any, all with defaults.
 
     Args:
         words: one per ``--vary``.
-        trains: knobs that need training from the start are among all.
+        trains: settings that need training from scratch are allowed.
 
     Raises:
-        DyngsError: an unknown knob, one twice, or a value that is not allowed.
+        DyngsError: an unknown setting, one given twice, or a value that is not allowed.
     """
     if not words:
-        return tuple(Variation(knob, knob.values) for knob in SETTINGS if trains or not knob.trains)
+        return tuple(Variation(setting, setting.values) for setting in SETTINGS if trains or not setting.trains)
     found: dict[str, Variation] = {}
     for word in words:
         name, equals, listed = word.partition("=")
-        knob = next((k for k in SETTINGS if k.name == name), None)
-        if knob is None:
-            raise DyngsError(
-                f"--vary {printable(word, 60)}: no such knob; there are {', '.join(k.name for k in SETTINGS)}"
-            )
-        if knob.trains and not trains:
-            raise DyngsError(f"--vary {printable(word, 60)}: this trains the run anew, several times; add --train")
+        setting = next((s for s in SETTINGS if s.name == name), None)
+        if setting is None:
+            names = ", ".join(s.name for s in SETTINGS)
+            raise DyngsError(f"--vary {printable(word, 60)}: no such setting; there are {names}")
+        if setting.trains and not trains:
+            raise DyngsError(f"--vary {printable(word, 60)}: each value needs training from scratch; add --train")
         if name in found:
             raise DyngsError(f"--vary {name} is given twice; write --vary {name}=VALUE,VALUE")
-        values = tuple(knob.parsed(text) for text in re.split(r"\s*,\s*", listed.strip())) if equals else knob.values
-        found[name] = Variation(knob, tuple(dict.fromkeys(values)))
+        texts = re.split(r"\s*,\s*", listed.strip())
+        values = tuple(setting.parsed(text) for text in texts) if equals else setting.values
+        found[name] = Variation(setting, tuple(dict.fromkeys(values)))
     return tuple(found.values())
 
 
-def single_changes(settings: Sequence[Variation], traits: RunSettings, finetune: int) -> list[Variant]:
-    """One variant per knob and value that makes sense for a run; what is pruned or masked also with fine-tuning.
+def single_changes(variations: Sequence[Variation], run: RunSettings, finetune: int) -> list[Variant]:
+    """Return one variant per setting and value that applies to a run; pruned and masked ones also with fine-tuning.
 
     Args:
-        settings: knobs and values.
-        traits: of the run.
-        finetune: steps; 0: without.
+        variations: settings and values.
+        run: settings of the run.
+        finetune: steps; 0: no fine-tuning.
     """
     variants = []
-    for setting in settings:
-        for value in setting.values:
-            if traits.allows(setting.knob, value):
-                variant = Variant(**{setting.knob.name: value})  # pyright: ignore[reportArgumentType]
-                if setting.knob.name == "field_step":
+    for variation in variations:
+        name = variation.setting.name
+        for value in variation.values:
+            if run.allows(variation.setting, value):
+                variant = Variant(**{name: value})  # pyright: ignore[reportArgumentType]
+                if name == "field_step":
                     variant = replace(variant, storage=AUTO)
                 variants.append(variant)
-                if finetune and setting.knob.name in ("prune", "mask_times"):
+                if finetune and name in ("prune", "mask_times"):
                     variants.append(replace(variant, finetune=finetune))
     return variants

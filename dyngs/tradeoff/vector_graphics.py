@@ -1,4 +1,4 @@
-"""Drawings of lines, dots and words: as SVG, and as pixels."""
+"""Drawings made of lines, circles and text, as SVG and as pixels."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ if TYPE_CHECKING:
     from PIL import ImageDraw
 
 PIXELS = 2
-"""Of a picture per unit of a drawing."""
-FINER = 2
-"""Pictures are drawn so many times as large and reduced, which smooths their edges."""
+"""Pixels per unit of a drawing."""
+SUPERSAMPLING = 2
+"""Pictures are drawn larger by this factor and reduced, which smooths their edges."""
 _ANCHORS = {"start": "ls", "middle": "ms", "end": "rs"}
 _INK = "#222222"
 
 
 @dataclass(frozen=True)
 class Line:
-    """Through ``points``, (x, y) from the upper left."""
+    """A line through ``points``, (x, y) from the upper left."""
 
     points: tuple[tuple[float, float], ...]
     colour: str
@@ -31,7 +31,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Circle:
-    """A disc with a white rim; ``tip`` is shown where the pointer rests on it."""
+    """A filled circle with a white rim; ``tip`` is its tooltip."""
 
     x: float
     y: float
@@ -42,7 +42,7 @@ class Circle:
 
 @dataclass(frozen=True)
 class Text:
-    """Words whose baseline starts, ends or has its middle at (x, y)."""
+    """A line of text whose baseline starts, ends or is centred at (x, y)."""
 
     x: float
     y: float
@@ -57,29 +57,29 @@ Shape = Line | Circle | Text
 
 @dataclass(frozen=True)
 class Drawing:
-    """Shapes on white, later ones above earlier ones."""
+    """Shapes on a white background, later ones on top."""
 
     width: int
     height: int
     shapes: Sequence[Shape]
 
     def svg(self) -> str:
-        """The text of an SVG file."""
+        """Return the drawing as an SVG file."""
         size = f'viewBox="0 0 {self.width} {self.height}" width="{self.width}" height="{self.height}"'
         head = f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" fill="{_INK}">'
         paper = f'<rect width="{self.width}" height="{self.height}" fill="white"/>'
         return "\n".join([head, paper, *(_element(shape) for shape in self.shapes), "</svg>"]) + "\n"
 
     def pixels(self) -> np.ndarray:
-        """(2 height, 2 width, 3) uint8."""
+        """Return the drawing as (2 height, 2 width, 3) uint8."""
         from PIL import Image, ImageDraw
 
-        scale = PIXELS * FINER
+        scale = PIXELS * SUPERSAMPLING
         image = Image.new("RGB", (scale * self.width, scale * self.height), "white")
         pen = ImageDraw.Draw(image)
         for shape in self.shapes:
             _draw(pen, shape, scale)
-        return np.asarray(image.reduce(FINER))
+        return np.asarray(image.reduce(SUPERSAMPLING))
 
 
 def _element(shape: Shape) -> str:
@@ -96,7 +96,7 @@ def _element(shape: Shape) -> str:
 
 
 def _draw(pen: ImageDraw.ImageDraw, shape: Shape, scale: int) -> None:
-    """Draw one shape ``scale`` times as large."""
+    """Draw one shape, magnified by ``scale``."""
     from PIL import ImageFont
 
     if isinstance(shape, Line):

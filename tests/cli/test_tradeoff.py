@@ -21,14 +21,14 @@ def test_a_table_files_and_a_chosen_run(tmp_path: Path, capsys: pytest.CaptureFi
     words = ["tradeoff", run, "--out", str(out), "--vary", "scale=0.5", "--vary", "storage=2", "--rounds", "1"]
     assert main([*words, "--threads", "1", "--require", "fps>=0.001,mb<=1", "--minimize", "mb"]) == 0
     text = capsys.readouterr().out
-    for word in ("as it is", "scale=0.5", "storage=2", "each knob alone", "tradeoff.csv", "chosen:"):
+    for word in ("as it is", "scale=0.5", "storage=2", "each setting alone", "tradeoff.csv", "chosen:"):
         assert word in text
     assert max(len(line) for line in text.splitlines() if str(out) not in line) <= 100
     assert {f.name for f in out.iterdir()} >= {f"tradeoff.{suffix}" for suffix in ("csv", "json", "svg", "html", "png")}
     (chosen,) = (out / "chosen").iterdir()
     assert len(load_run(chosen).scene) == 5
     error = error_line(capsys, *words, "--require", "mb<=0.000001")
-    assert "no measured point has mb<=1e-06; mb<=1e-06 binds" in error
+    assert "no measured variant has mb<=1e-06; mb<=1e-06 is too strict" in error
 
 
 @pytest.mark.parametrize(
@@ -37,9 +37,9 @@ def test_a_table_files_and_a_chosen_run(tmp_path: Path, capsys: pytest.CaptureFi
         ("nowhere", "nowhere: no such preset"),
         ("nowhere", "nor is it the folder of a run"),
         ("static data.root=x", "give --out DIR"),
-        (". --vary prun", "no such knob"),
+        (". --vary prun", "no such setting"),
         (". --require psnr>30", "is no condition"),
-        (". --minimize size", "no such figure"),
+        (". --minimize size", "no such metric"),
         (". --rounds 0", "--rounds 0: give a whole number from 1 on"),
         (". ", "not a run folder"),
         (". --minimize mb --maximize psnr", "not allowed with"),

@@ -1,4 +1,4 @@
-"""What is measured is what is drawn."""
+"""Renders of variants, their quality and their speed."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 BLACK = torch.zeros(3)
 
 
-def picture_of(drawer: VariantRenderer, time: float = 0.0) -> Picture:
-    """What a drawer sees, as a true picture."""
-    return Picture("view", camera(), drawer.picture(camera(), time).clamp(0, 1), None, None, time)
+def picture_of(renderer: VariantRenderer, time: float = 0.0) -> Picture:
+    """A render, as a ground-truth picture."""
+    return Picture("view", camera(), renderer.picture(camera(), time).clamp(0, 1), None, None, time)
 
 
 def test_options_are_those_of_the_run_but_for_what_is_changed() -> None:
@@ -50,8 +50,8 @@ def test_a_shrunk_camera_sees_the_same() -> None:
 
 
 def test_a_small_drawing_comes_out_at_full_size_and_in_its_place() -> None:
-    drawers = [VariantRenderer(still_scene(1), RenderOptions(), BLACK + 1, scale) for scale in (1.0, 0.5)]
-    pictures = [1 - drawer.picture(camera(40, 28), None).mean(2) for drawer in drawers]
+    renderers = [VariantRenderer(still_scene(1), RenderOptions(), BLACK + 1, scale) for scale in (1.0, 0.5)]
+    pictures = [1 - renderer.picture(camera(40, 28), None).mean(2) for renderer in renderers]
     assert [tuple(x.shape) for x in pictures] == [(28, 40), (28, 40)]
     assert not torch.equal(*pictures)
     across = [float((x.sum(0) * torch.arange(40)).sum() / x.sum()) for x in pictures]
@@ -72,23 +72,23 @@ def test_quality_compares_each_view_at_its_time() -> None:
 
 
 def test_lpips_is_the_mean_where_it_can_be_had() -> None:
-    drawer = VariantRenderer(still_scene(), RenderOptions(), BLACK)
+    renderer = VariantRenderer(still_scene(), RenderOptions(), BLACK)
     distance = Lpips("alex", None, lambda a, b: (a - b).abs().mean() + 0.25)
-    assert measure_quality(drawer, [picture_of(drawer)] * 2, distance).lpips == pytest.approx(0.25)
+    assert measure_quality(renderer, [picture_of(renderer)] * 2, distance).lpips == pytest.approx(0.25)
 
 
 def test_all_draw_every_picture_in_turn() -> None:
     scenes = [moving_scene(Sliding()), moving_scene(Sliding())]
-    drawers = [VariantRenderer(scene, RenderOptions(), BLACK) for scene in scenes]
-    views = [picture_of(drawers[0], 0.5)] * 3
+    renderers = [VariantRenderer(scene, RenderOptions(), BLACK) for scene in scenes]
+    views = [picture_of(renderers[0], 0.5)] * 3
     before = [scene.field.calls for scene in scenes if isinstance(scene.field, Sliding)]
-    speeds = time_interleaved(drawers, views, rounds=2)
+    speeds = time_interleaved(renderers, views, rounds=2)
     after = [scene.field.calls for scene in scenes if isinstance(scene.field, Sliding)]
     assert [b - a for a, b in zip(before, after, strict=True)] == [7, 7]  # a warm-up, and twice three views
     assert speeds[0].gain.low == speeds[0].gain.median == speeds[0].gain.high == 1.0
     assert all(s.ms.low <= s.ms.median <= s.ms.high for s in speeds)
 
 
-def test_a_spread() -> None:
+def test_quartiles() -> None:
     found = quartiles(np.array([4.0, 1.0, 2.0, 3.0, 100.0]))
     assert (found.low, found.median, found.high) == (2.0, 3.0, 4.0)

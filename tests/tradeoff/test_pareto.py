@@ -13,12 +13,12 @@ from dyngs.tradeoff.variants import Variant
 GOALS = st.lists(st.tuples(*[st.integers(0, 5)] * 3), min_size=1, max_size=12)
 
 
-def point(variant: Variant, psnr: float, gain: float = 1.0, mb: float = 8.0) -> Measurement:
+def measurement(variant: Variant, psnr: float, gain: float = 1.0, mb: float = 8.0) -> Measurement:
     speed = Speed(Quartiles(10 / gain, 9 / gain, 11 / gain), Quartiles(gain, gain, gain))
     return Measurement(variant, 4, psnr, 0.9, None, 100, mb, None, speed)
 
 
-BASE = point(Variant(), 30.0)
+BASE = measurement(Variant(), 30.0)
 
 
 @given(GOALS)
@@ -39,7 +39,7 @@ def test_the_front_does_not_depend_on_the_order(goals: list[tuple[int, ...]]) ->
 
 
 def test_speed_size_and_quality_count() -> None:
-    points = [BASE, point(Variant(prune=0.5), 29.0, 2.0, 4.0), point(Variant(scale=0.5), 28.0, 2.0, 8.0)]
+    points = [BASE, measurement(Variant(prune=0.5), 29.0, 2.0, 4.0), measurement(Variant(scale=0.5), 28.0, 2.0, 8.0)]
     assert on_front(points) == [True, True, False]
 
 
@@ -60,42 +60,42 @@ def test_no_gain_has_no_price() -> None:
     assert rate(1.0, 4.0) == 0.5
 
 
-def test_exchange_rates_are_those_of_single_knobs() -> None:
+def test_exchange_rates_are_those_of_single_settings() -> None:
     points = [
         BASE,
-        point(Variant(prune=0.5), 29.0, 2.0, 4.0),
-        point(Variant(prune=0.75), 28.0, 4.0, 2.0),
-        point(Variant(storage="auto"), 30.0, 1.0, 1.0),
-        point(Variant(storage="auto", prune=0.5), 20.0, 2.0, 0.5),
+        measurement(Variant(prune=0.5), 29.0, 2.0, 4.0),
+        measurement(Variant(prune=0.75), 28.0, 4.0, 2.0),
+        measurement(Variant(storage="auto"), 30.0, 1.0, 1.0),
+        measurement(Variant(storage="auto", prune=0.5), 20.0, 2.0, 0.5),
     ]
     prune, storage = exchange_rates(BASE, points)
-    assert (prune.knob, prune.db_per_speed, prune.db_per_size) == ("prune", pytest.approx(1.0), pytest.approx(1.0))
+    assert (prune.setting, prune.db_per_speed, prune.db_per_size) == ("prune", pytest.approx(1.0), pytest.approx(1.0))
     assert (prune.speed, prune.size) == (4.0, 4.0)
-    assert (storage.knob, storage.db_per_speed, storage.db_per_size) == ("storage", None, pytest.approx(0.0))
+    assert (storage.setting, storage.db_per_speed, storage.db_per_size) == ("storage", None, pytest.approx(0.0))
 
 
 def test_what_is_cheapest_is_put_together_first() -> None:
     singles = [
-        point(Variant(prune=0.5), 29.0, 2.0, 4.0),
-        point(Variant(prune=0.75), 26.0, 4.0, 2.0),
-        point(Variant(storage="auto"), 29.9, 1.0, 1.0),
-        point(Variant(alpha_min=0.01), 29.8, 1.5),
-        point(Variant(scale=0.5), 20.0, 4.0),  # too dear for any company
+        measurement(Variant(prune=0.5), 29.0, 2.0, 4.0),
+        measurement(Variant(prune=0.75), 26.0, 4.0, 2.0),
+        measurement(Variant(storage="auto"), 29.9, 1.0, 1.0),
+        measurement(Variant(alpha_min=0.01), 29.8, 1.5),
+        measurement(Variant(scale=0.5), 20.0, 4.0),  # loses too much to be combined
     ]
     found = combinations(BASE, singles, 9)
     assert Variant(prune=0.5, alpha_min=0.01) in found
     assert Variant(prune=0.75, alpha_min=0.01) in found
     assert Variant(prune=0.5, storage="auto") in found
     assert found.index(Variant(prune=0.5, alpha_min=0.01)) < found.index(Variant(prune=0.75, alpha_min=0.01))
-    assert all(len(v.knobs) > 1 and v.scale == 1 for v in found)
+    assert all(len(v.settings) > 1 and v.scale == 1 for v in found)
     assert len(set(found)) == len(found)
     assert combinations(BASE, singles, 0) == []
 
 
 def test_a_weaker_value_never_replaces_a_stronger_one() -> None:
     singles = [
-        point(Variant(prune=0.3), 28.0, 1.5),
-        point(Variant(prune=0.6), 29.9, 2.0),
-        point(Variant(alpha_min=0.01), 29.9, 1.5),
+        measurement(Variant(prune=0.3), 28.0, 1.5),
+        measurement(Variant(prune=0.6), 29.9, 2.0),
+        measurement(Variant(alpha_min=0.01), 29.9, 1.5),
     ]
     assert all(v.prune != 0.3 for v in combinations(BASE, singles, 9))

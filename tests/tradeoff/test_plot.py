@@ -6,41 +6,41 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.tradeoff.plot import plot
-from dyngs.tradeoff.requirements import Figures
+from dyngs.tradeoff.table import TableRow
 from dyngs.tradeoff.variants import Variant
 from dyngs.tradeoff.vector_graphics import Circle, Line, Text
 
 
-def figures(variant: Variant, psnr: float, fps: float, mb: float) -> Figures:
-    return Figures(variant, psnr, 0.9, None, fps, mb, None, 10)
+def row(variant: Variant, psnr: float, fps: float, mb: float) -> TableRow:
+    return TableRow(variant, psnr, 0.9, None, fps, 1.0, 1.0, 1.0, 1e3 / fps, mb, None, 10, True)
 
 
 @settings(deadline=None)  # the first call imports
 @given(st.lists(st.tuples(st.floats(-10, 100), st.floats(1e-3, 1e5), st.floats(1e-4, 1e4)), min_size=1, max_size=8))
 def test_every_point_lies_inside(values: list[tuple[float, float, float]]) -> None:
-    points = [figures(Variant(prune=i / 10), *v) for i, v in enumerate(values)]
-    drawing = plot(points)
+    rows = [row(Variant(prune=i / 10), *v) for i, v in enumerate(values)]
+    drawing = plot(rows)
     dots = [shape for shape in drawing.shapes if isinstance(shape, Circle) and shape.tip]
-    assert len(dots) == 2 * len(points)
+    assert len(dots) == 2 * len(rows)
     assert all(0 < dot.x < drawing.width and 0 < dot.y < drawing.height for dot in dots)
 
 
 def test_points_have_names() -> None:
-    points = [figures(Variant(), 30, 10, 5), figures(Variant(alpha_min=0.01), 29, 15, 5)]
-    assert "alpha_min=0.01: 29.00 dB, 15.0 fps, 5.00 MB" in plot(points).svg()
-    labels = [shape.text for shape in plot(points).shapes if isinstance(shape, Text)]
+    rows = [row(Variant(), 30, 10, 5), row(Variant(alpha_min=0.01), 29, 15, 5)]
+    assert "alpha_min=0.01: 29.00 dB, 15.0 fps, 5.00 MB" in plot(rows).svg()
+    labels = [shape.text for shape in plot(rows).shapes if isinstance(shape, Text)]
     assert {"the run itself", "alpha_min"} <= set(labels)
 
 
-def test_lines_join_the_front_and_the_values_of_a_knob() -> None:
+def test_lines_join_the_front_and_the_values_of_a_setting() -> None:
     """Pruning is faster and smaller; the smaller picture is neither, but a line leads there, too."""
-    points = [
-        figures(Variant(), 30, 10, 5),
-        figures(Variant(prune=0.5), 29, 20, 2),
-        figures(Variant(prune=0.7), 28, 30, 1),
-        figures(Variant(scale=0.5), 28, 5, 9),
+    rows = [
+        row(Variant(), 30, 10, 5),
+        row(Variant(prune=0.5), 29, 20, 2),
+        row(Variant(prune=0.7), 28, 30, 1),
+        row(Variant(scale=0.5), 28, 5, 9),
     ]
-    lines = [shape for shape in plot(points).shapes if isinstance(shape, Line)]
+    lines = [shape for shape in plot(rows).shapes if isinstance(shape, Line)]
     lengths = [len(line.points) for line in lines if line.width > 1]
     assert lengths == [3, 3]
     assert sorted(len(line.points) for line in lines if line.width < 1) == [2, 2, 3, 3]

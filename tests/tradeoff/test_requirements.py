@@ -7,15 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dyngs.errors import DyngsError
-from dyngs.tradeoff.requirements import Figures, Goal, Requirement, choose, parse_goal, parse_requirements
+from dyngs.tradeoff.requirements import Goal, Requirement, choose, parse_goal, parse_requirements
+from dyngs.tradeoff.table import TableRow
 from dyngs.tradeoff.variants import Variant
 
 
-def figures(prune: float, psnr: float, fps: float, mb: float) -> Figures:
-    return Figures(Variant(prune=prune), psnr, 0.9, None, fps, mb, 100.0, 1000)
+def row(prune: float, psnr: float, fps: float, mb: float) -> TableRow:
+    return TableRow(Variant(prune=prune), psnr, 0.9, None, fps, 1.0, 1.0, 1.0, 1e3 / fps, mb, 100.0, 1000, True)
 
 
-POINTS = [figures(0.0, 32.0, 5.0, 9.0), figures(0.5, 30.5, 18.0, 4.5), figures(0.8, 27.0, 40.0, 2.0)]
+ROWS = [row(0.0, 32.0, 5.0, 9.0), row(0.5, 30.5, 18.0, 4.5), row(0.8, 27.0, 40.0, 2.0)]
 
 
 def test_conditions() -> None:
@@ -39,8 +40,8 @@ def test_what_is_printed_is_read_again(name: str, at_most: bool, bound: float) -
         ("psnr>30", "is no condition"),
         ("psnr>=30,,mb<=5", "is no condition"),
         ("psnr=30", "is no condition"),
-        ("speed>=3", "no such figure; there are psnr, ssim, lpips, fps"),
-        ("variant>=3", "no such figure"),
+        ("speed>=3", "no such metric; there are psnr, ssim, lpips, fps"),
+        ("variant>=3", "no such metric"),
         ("psnr>=thirty", "'thirty' is not a number"),
         ("psnr>=nan", "'nan' is not a number"),
         ("psnr>=__import__('os')", "is not a number"),
@@ -53,41 +54,43 @@ def test_what_is_no_condition_is_refused(text: str, message: str) -> None:
 
 def test_goals() -> None:
     assert parse_goal("mb", smallest=True) == Goal("mb", True)
-    with pytest.raises(DyngsError, match="--maximize size: no such figure"):
+    with pytest.raises(DyngsError, match="--maximize size: no such metric"):
         parse_goal("size", smallest=False)
 
 
 def test_the_best_of_what_qualifies() -> None:
     asked = parse_requirements("psnr>=30")
-    assert choose(POINTS, asked, Goal("mb", True)) == POINTS[1]
-    assert choose(POINTS, asked, Goal("psnr", False)) == POINTS[0]
-    assert choose(POINTS, (), Goal("fps", False)) == POINTS[2]
+    assert choose(ROWS, asked, Goal("mb", True)) == ROWS[1]
+    assert choose(ROWS, asked, Goal("psnr", False)) == ROWS[0]
+    assert choose(ROWS, (), Goal("fps", False)) == ROWS[2]
 
 
 def test_the_binding_requirement_is_named() -> None:
-    with pytest.raises(DyngsError, match=r"fps>=20 binds: with the others 18 \(prune=0.5\)") as caught:
-        choose(POINTS, parse_requirements("psnr>=30,fps>=20,mb<=5"), Goal("mb", True))
-    assert "psnr>=30 binds: with the others 27 (prune=0.8)" in str(caught.value)
-    assert "mb<=5 binds" not in str(caught.value)
+    with pytest.raises(
+        DyngsError, match=r"fps>=20 is too strict: with the others met the best is 18 \(prune=0.5\)"
+    ) as caught:
+        choose(ROWS, parse_requirements("psnr>=30,fps>=20,mb<=5"), Goal("mb", True))
+    assert "psnr>=30 is too strict: with the others met the best is 27 (prune=0.8)" in str(caught.value)
+    assert "mb<=5 is too strict" not in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_without_a_single_binding_one_the_best_of_each_is_named() -> None:
     with pytest.raises(DyngsError, match="psnr>=50 alone: the best is 32; fps>=90 alone: the best is 40"):
-        choose(POINTS, parse_requirements("psnr>=50,fps>=90"), Goal("psnr", False))
+        choose(ROWS, parse_requirements("psnr>=50,fps>=90"), Goal("psnr", False))
 
 
 def test_what_is_not_known_does_not_qualify() -> None:
     with pytest.raises(DyngsError, match=r"lpips<=0\.5 alone: not measured here"):
-        choose(POINTS, parse_requirements("lpips<=0.5"), Goal("psnr", False))
+        choose(ROWS, parse_requirements("lpips<=0.5"), Goal("psnr", False))
 
 
 @given(st.floats(20, 40), st.floats(1, 60), st.floats(1, 10))
 def test_a_choice_meets_everything_and_nothing_that_does_is_better(psnr: float, fps: float, mb: float) -> None:
     asked = (Requirement("psnr", False, psnr), Requirement("fps", False, fps), Requirement("mb", True, mb))
-    fitting = [p for p in POINTS if p.psnr >= psnr and p.fps >= fps and p.mb <= mb]
+    fitting = [p for p in ROWS if p.psnr >= psnr and p.fps >= fps and p.mb <= mb]
     if fitting:
-        assert choose(POINTS, asked, Goal("mb", True)).mb == min(p.mb for p in fitting)
+        assert choose(ROWS, asked, Goal("mb", True)).mb == min(p.mb for p in fitting)
     else:
-        with pytest.raises(DyngsError, match="no measured point has"):
-            choose(POINTS, asked, Goal("mb", True))
+        with pytest.raises(DyngsError, match="no measured variant has"):
+            choose(ROWS, asked, Goal("mb", True))

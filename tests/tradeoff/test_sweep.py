@@ -20,7 +20,8 @@ from dyngs.runs.checkpoint import is_compact, load_run
 from dyngs.tradeoff.measure import render_options_of
 from dyngs.tradeoff.measurements import Measurement, read_measurement
 from dyngs.tradeoff.report import write_report
-from dyngs.tradeoff.sweep import Plan, figures_of, sweep
+from dyngs.tradeoff.sweep import Plan, sweep
+from dyngs.tradeoff.table import table_rows
 from dyngs.tradeoff.variant_runs import VariantRuns, field_changes, run_settings, write_chosen
 from dyngs.tradeoff.variants import Variant, parse_variations
 
@@ -36,13 +37,13 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def models(run_dir: Path) -> VariantRuns:
+def runs(run_dir: Path) -> VariantRuns:
     return VariantRuns(run_dir, run_dir / "tradeoff", 1)
 
 
 @pytest.fixture(scope="module")
-def points(models: VariantRuns) -> list[Measurement]:
-    return sweep(models, PLAN, lambda line: None)
+def points(runs: VariantRuns) -> list[Measurement]:
+    return sweep(runs, PLAN, lambda line: None)
 
 
 def named(points: list[Measurement], variant: Variant) -> Measurement:
@@ -57,7 +58,7 @@ def test_the_run_itself_is_what_eval_says(points: list[Measurement], run_dir: Pa
     assert base.gain == 1.0
 
 
-def test_every_knob_does_what_it_says(points: list[Measurement]) -> None:
+def test_every_setting_does_what_it_says(points: list[Measurement]) -> None:
     base, pruned = points[0], named(points, Variant(prune=0.5))
     assert pruned.num_gaussians == base.num_gaussians / 2
     assert pruned.mb < 0.75 * base.mb  # what moves is worth more and holds more numbers
@@ -74,53 +75,53 @@ def test_every_knob_does_what_it_says(points: list[Measurement]) -> None:
 
 
 def test_combinations_are_measured_too(points: list[Measurement]) -> None:
-    together = [p for p in points if p.variant.knob == "several"]
+    together = [p for p in points if p.variant.setting == "several"]
     assert 0 < len(together) <= 3 * PLAN.combine
 
 
-def test_finished_points_are_not_measured_again(points: list[Measurement], models: VariantRuns) -> None:
+def test_finished_points_are_not_measured_again(points: list[Measurement], runs: VariantRuns) -> None:
     said: list[str] = []
-    files = sorted((models.out / "points").iterdir())
+    files = sorted((runs.out / "points").iterdir())
     times = [file.stat().st_mtime_ns for file in files]
-    assert sweep(models, PLAN, said.append) == points
+    assert sweep(runs, PLAN, said.append) == points
     assert said == []
     assert [file.stat().st_mtime_ns for file in files] == times
     assert [read_measurement(file).variant.slug for file in files] == [file.stem for file in files]
 
 
-def test_points_of_something_else_do_not_mix(points: list[Measurement], models: VariantRuns, tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="points of another run, checkpoint or split"):
-        sweep(models, replace(PLAN, split="train"), lambda line: None)
+def test_points_of_something_else_do_not_mix(points: list[Measurement], runs: VariantRuns, tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="measurements of another run, checkpoint or split"):
+        sweep(runs, replace(PLAN, split="train"), lambda line: None)
     with pytest.raises(DyngsError, match="no views"):
-        sweep(VariantRuns(models.run_dir, tmp_path, 1), replace(PLAN, split="val"), lambda line: None)
+        sweep(VariantRuns(runs.run_dir, tmp_path, 1), replace(PLAN, split="val"), lambda line: None)
 
 
-def test_the_report_has_every_point(points: list[Measurement], models: VariantRuns) -> None:
-    table, values, picture, page, pixels = write_report(models.out, points)
+def test_the_report_has_every_point(points: list[Measurement], runs: VariantRuns) -> None:
+    table, values, picture, page, pixels = write_report(runs.out, points)
     assert pixels.read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert [row["name"] for row in rows] == [p.variant.name for p in points]
-    assert float(rows[0]["fps"]) == pytest.approx(figures_of(points)[0].fps)
+    assert float(rows[0]["fps"]) == pytest.approx(table_rows(points)[0].fps)
     stored = json.loads(values.read_text())
-    assert [Variant.from_json(p["changes"]) for p in stored["points"]] == [p.variant for p in points]
-    knobs = {e["knob"] for e in stored["exchange_rates"]}
-    assert knobs >= {"prune", "prune + finetune", "storage", "storage + field_step"}
+    assert [Variant(**p["changes"]) for p in stored["points"]] == [p.variant for p in points]
+    settings = {e["setting"] for e in stored["exchange_rates"]}
+    assert settings >= {"prune", "prune + finetune", "storage", "storage + field_step"}
     assert picture.read_text() in page.read_text()
     assert "src=" not in page.read_text()
 
 
-def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Measurement], models: VariantRuns) -> None:
+def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Measurement], runs: VariantRuns) -> None:
     variant = Variant(prune=0.5, mask_times=3, storage=2.0, mode="antialiased", alpha_min=0.02, scale=0.5)
-    folder = write_chosen(models, variant)
+    folder = write_chosen(runs, variant)
     chosen = load_run(folder)
     assert is_compact(folder)
     assert len(chosen.scene) == points[0].num_gaussians / 2
-    assert chosen.config.data.downscale == 2 * load_resolved(models.run_dir).data.downscale
+    assert chosen.config.data.downscale == 2 * load_resolved(runs.run_dir).data.downscale
     assert isinstance(chosen.scene, TrainedScene)
     assert chosen.scene.masks is not None
-    assert render_options(chosen.config.model) == render_options_of(variant, load_resolved(models.run_dir).model)
+    assert render_options(chosen.config.model) == render_options_of(variant, load_resolved(runs.run_dir).model)
     for single in (Variant(sh_degree=0), Variant(alpha_min=0.02), Variant(storage=2.0)):
-        folder = write_chosen(models, single)
+        folder = write_chosen(runs, single)
         assert evaluate_run(folder, "test", threads=1).psnr == pytest.approx(named(points, single).psnr)
 
 
@@ -145,8 +146,8 @@ def test_another_field_moves_the_same(
     assert changed.deform.move_rotations
 
 
-def test_masks_that_a_run_has_stay(points: list[Measurement], models: VariantRuns, tmp_path: Path) -> None:
-    masked = VariantRuns(models.out / "training" / Variant(mask_times=3, finetune=2).slug, tmp_path, 1)
+def test_masks_that_a_run_has_stay(points: list[Measurement], runs: VariantRuns, tmp_path: Path) -> None:
+    masked = VariantRuns(runs.out / "training" / Variant(mask_times=3, finetune=2).slug, tmp_path, 1)
     assert run_settings(masked.run_dir).mask_times == 3
     for variant in (Variant(prune=0.5), Variant(prune=0.5, finetune=1)):
         scene = load_run(masked.folder(variant)).scene
@@ -155,15 +156,15 @@ def test_masks_that_a_run_has_stay(points: list[Measurement], models: VariantRun
         assert len(scene.masks.times) == 3
 
 
-def test_what_cannot_be_varied_is_named(models: VariantRuns) -> None:
+def test_what_cannot_be_varied_is_named(runs: VariantRuns) -> None:
     said: list[str] = []
-    sweep(models, replace(PLAN, settings=parse_variations(["sh_degree=3"], trains=False), combine=0), said.append)
+    sweep(runs, replace(PLAN, variations=parse_variations(["sh_degree=3"], trains=False), combine=0), said.append)
     assert said == ["nothing to vary in this run: sh_degree"]
 
 
-def test_a_stored_run_cannot_be_varied(points: list[Measurement], models: VariantRuns) -> None:
-    with pytest.raises(DyngsError, match=r"only scene\.dyngs is there; give the run that it was made from"):
-        run_settings(models.folder(Variant(storage=2.0)))
+def test_a_stored_run_cannot_be_varied(points: list[Measurement], runs: VariantRuns) -> None:
+    with pytest.raises(DyngsError, match=r"only scene\.dyngs is there; give the run that it was exported from"):
+        run_settings(runs.folder(Variant(storage=2.0)))
 
 
 def test_a_damaged_point_says_what_to_do(tmp_path: Path) -> None:
@@ -179,5 +180,5 @@ def test_a_damaged_point_says_what_to_do(tmp_path: Path) -> None:
     ]
     for text in ("", "[]", "{}", '{"variant": {"prine": 1}, "speed": null}', *bad):
         path.write_text(text)
-        with pytest.raises(DyngsError, match=r"x\.json: .* no measured point: remove it"):
+        with pytest.raises(DyngsError, match=r"x\.json: .* no measurement of a variant: remove it"):
             read_measurement(path)

@@ -1,4 +1,4 @@
-"""Variants say what they change; knobs refuse what they cannot be."""
+"""Variants say what they change; settings refuse what they cannot be."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dyngs.errors import DyngsError
-from dyngs.tradeoff.variants import SETTINGS, RunSettings, Variant, parse_variations, single_changes
+from dyngs.tradeoff.variants import SETTINGS, RunSettings, Setting, Variant, parse_variations, single_changes
 
 VARIANTS = st.builds(
     Variant,
@@ -39,7 +39,7 @@ DYNAMIC = RunSettings(
 
 @given(VARIANTS)
 def test_a_variant_survives_its_file(variant: Variant) -> None:
-    assert Variant.from_json(json.loads(json.dumps(variant.to_json()))) == variant
+    assert Variant(**json.loads(json.dumps(variant.changes))) == variant
 
 
 @given(VARIANTS, VARIANTS)
@@ -64,13 +64,13 @@ def test_what_lies_on_disk_does_not_depend_on_drawing() -> None:
     assert replace(drawn, colour="sh", field="mlp", prune=0.5).trained == Variant(colour="sh", field="mlp")
 
 
-def test_the_knob_of_a_variant() -> None:
-    assert Variant().knob == ""
+def test_the_setting_of_a_variant() -> None:
+    assert Variant().setting == ""
     assert Variant().name == "as it is"
-    assert Variant(prune=0.5).knob == "prune"
-    assert Variant(prune=0.5, finetune=9).knob == "prune + finetune"
-    assert Variant(storage="auto", field_step=4.0).knob == "storage + field_step"
-    assert Variant(prune=0.5, sh_degree=0).knob == "several"
+    assert Variant(prune=0.5).setting == "prune"
+    assert Variant(prune=0.5, finetune=9).setting == "prune + finetune"
+    assert Variant(storage="auto", field_step=4.0).setting == "storage + field_step"
+    assert Variant(prune=0.5, sh_degree=0).setting == "several"
     assert Variant(sh_degree=0).name == "sh_degree=0"
 
 
@@ -87,15 +87,15 @@ def test_single_changes_leave_out_what_a_run_is_already() -> None:
 
 
 def test_own_values_are_the_start() -> None:
-    settings = parse_variations(["alpha_min=0.008,0.016"], trains=False)
-    assert single_changes(settings, replace(DYNAMIC, alpha_min=0.008), 0) == [Variant(alpha_min=0.016)]
-    settings = parse_variations(["mask_times=6,16"], trains=False)
-    assert single_changes(settings, replace(DYNAMIC, mask_times=6), 0) == [Variant(mask_times=16)]
+    variations = parse_variations(["alpha_min=0.008,0.016"], trains=False)
+    assert single_changes(variations, replace(DYNAMIC, alpha_min=0.008), 0) == [Variant(alpha_min=0.016)]
+    variations = parse_variations(["mask_times=6,16"], trains=False)
+    assert single_changes(variations, replace(DYNAMIC, mask_times=6), 0) == [Variant(mask_times=16)]
 
 
 def test_steps_of_the_field_are_those_of_storage() -> None:
-    settings = parse_variations(["field_step=4"], trains=False)
-    assert single_changes(settings, DYNAMIC, 0) == [Variant(storage="auto", field_step=4.0)]
+    variations = parse_variations(["field_step=4"], trains=False)
+    assert single_changes(variations, DYNAMIC, 0) == [Variant(storage="auto", field_step=4.0)]
 
 
 def test_fine_tuning_comes_in_addition() -> None:
@@ -103,15 +103,15 @@ def test_fine_tuning_comes_in_addition() -> None:
     assert found == [Variant(prune=0.5), Variant(prune=0.5, finetune=7), Variant(scale=0.5)]
 
 
-def test_settings_keep_the_order_of_their_values() -> None:
-    (setting,) = parse_variations(["storage=auto, 2,0.5,2"], trains=False)
-    assert setting.values == ("auto", 2.0, 0.5)
+def test_variations_keep_the_order_of_their_values() -> None:
+    (variation,) = parse_variations(["storage=auto, 2,0.5,2"], trains=False)
+    assert variation.values == ("auto", 2.0, 0.5)
 
 
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("prun", "no such knob; there are prune, mask_times, sh_degree"),
+        ("prun", "no such setting; there are prune, mask_times, sh_degree"),
         ("prune=1.5", "--vary prune=1.5: give a number from 0.01 to 0.99"),
         ("prune=", "give a number"),
         ("prune=nan", "give a number"),
@@ -126,14 +126,11 @@ def test_what_cannot_be_varied_is_refused(word: str, message: str) -> None:
         parse_variations([word], trains=False)
 
 
-def test_a_knob_twice_is_refused() -> None:
+def test_a_setting_twice_is_refused() -> None:
     with pytest.raises(DyngsError, match="twice"):
         parse_variations(["scale=0.5", "scale=0.7"], trains=False)
 
 
-@pytest.mark.parametrize("knob", SETTINGS, ids=lambda knob: knob.name)
-def test_defaults_of_knobs_are_allowed(knob: object) -> None:
-    from dyngs.tradeoff.variants import Setting
-
-    assert isinstance(knob, Setting)
-    assert [knob.parsed(str(value)) for value in knob.values] == list(knob.values)
+@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: setting.name)
+def test_defaults_of_settings_are_allowed(setting: Setting) -> None:
+    assert [setting.parsed(str(value)) for value in setting.values] == list(setting.values)
