@@ -442,7 +442,7 @@ def test_times_where_nothing_moves(run_dir: Path, tmp_path: Path, capsys: Captur
     assert main(["export", str(run_dir), "--out", str(ply), "--time", "0.5"]) == 0
     assert "note: nothing moves in this run" in capsys.readouterr().out
     for words in (["--time", "0"], ["--times", "0:1:2"], ["--view", "0"]):
-        assert "holds one moment and no views" in error_line(capsys, "render", ply, "--out", tmp_path, *words)
+        assert "holds one time and no views" in error_line(capsys, "render", ply, "--out", tmp_path, *words)
     for words in (["--dynamic"], ["--dynamic", "--format", "tracks"]):
         assert "nothing moves in this run" in error_line(capsys, "export", run_dir, *words)
 

@@ -1,1 +1,1 @@
-"""What people look at: camera paths, videos, contact sheets."""
+"""Camera paths, render jobs, and the pictures, videos and contact sheets that they become."""

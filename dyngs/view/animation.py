@@ -1,11 +1,9 @@
-"""A trained person in another motion than that of training."""
+"""A trained person in another motion or in the rest pose."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-import torch
 
 from dyngs.config import HumanModel
 from dyngs.config.kinds import person_of
@@ -19,20 +17,20 @@ from dyngs.runs.checkpoint import LoadedRun
 
 @dataclass(frozen=True)
 class AnimatedRun:
-    """A run whose scene plays something else, and how fast, in frames per second."""
+    """A run whose person performs another motion, and the frame rate of the motion."""
 
     run: LoadedRun
     fps: float
 
 
 def with_motion(run: LoadedRun, path: Path) -> AnimatedRun:
-    """The person of ``run`` in the motion of a file (AMASS, BVH or glTF).
+    """Return the run with its person in the motion of a file (AMASS, BVH or glTF).
 
-    A file with ``scale`` is a fit to this person and has its world; any other motion is brought to the person's size,
-    place and up.
+    A file with ``scale`` is a fit to this person in the world of the capture; any other motion is adapted to the size,
+    place and up direction of the person.
 
     Raises:
-        DyngsError: the run is not one of a person, or the file cannot be read.
+        DyngsError: the run is not of a person, or the file cannot be read.
     """
     from dyngs.human.motion.read import read_motion  # late: scipy's rotations, which no other drawing needs
 
@@ -42,17 +40,17 @@ def with_motion(run: LoadedRun, path: Path) -> AnimatedRun:
         motion = motion.for_joints(len(scene.skeleton.joints))
     clip = motion_clip(motion)
     if bool((motion.scale != 1).any()):
-        clip = replace(clip, trans=clip.trans - torch.tensor(run.info.world_offset))
+        clip = replace(clip, trans=clip.trans - clip.trans.new_tensor(run.info.world_offset))
     else:
         clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
     return AnimatedRun(replace(run, scene=scene.playing(clip)), motion.fps)
 
 
-def at_rest(run: LoadedRun) -> LoadedRun:
-    """The person of ``run`` in the pose of the template, upright on the floor.
+def in_rest_pose(run: LoadedRun) -> LoadedRun:
+    """Return the run with its person in the rest pose of the template, upright on the floor.
 
     Raises:
-        DyngsError: the run is not one of a person.
+        DyngsError: the run is not of a person.
     """
     scene, _ = _avatar(run, "--pose rest")
     rest = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)

@@ -1,4 +1,4 @@
-"""Camera paths for rendering: orbits, spirals, and a JSON file of one's own (see docs/camera_paths.md)."""
+"""Camera paths for rendering: orbits, spirals, and JSON files (docs/camera_paths.md)."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from dyngs.files.write import write_text
 from dyngs.view.keyframes import Keyframes, interpolate_keyframes
 
 _MAX_FRAMES = 100_000
-"""More pictures than this are taken for a slip of the pen."""
+"""A longer path is taken for a typing mistake."""
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Cameras in the order in which they are shown.
+    """Cameras in the order of the frames.
 
     Attributes:
         cameras: F cameras.
-        fps: pictures per second.
+        fps: frames per second.
         times: (F,) scene times in [0, 1], or None for a still scene.
-        warnings: lines for people, about what was changed in what they gave.
+        warnings: messages about changed input.
     """
 
     cameras: Cameras
@@ -44,7 +44,7 @@ class CameraPath:
 
 
 def with_times(path: CameraPath, times: Sequence[float]) -> CameraPath:
-    """The same cameras at other scene times.
+    """Return the path with other scene times.
 
     Args:
         path: F cameras.
@@ -60,24 +60,24 @@ def with_times(path: CameraPath, times: Sequence[float]) -> CameraPath:
 
 
 def static_path(camera: Cameras, times: Sequence[float], fps: float = 30.0) -> CameraPath:
-    """One camera that stands still while the scene moves.
+    """Return the path of one fixed camera at many scene times.
 
     Args:
         camera: one camera.
         times: F >= 1 scene times, as in ``with_times``.
-        fps: pictures per second.
+        fps: frames per second.
     """
     if len(camera) != 1:
-        raise ValueError(f"a frozen path is seen by one camera, got {len(camera)}")
+        raise ValueError(f"a static path needs one camera, got {len(camera)}")
     poses, intrinsics = (x.expand(len(times), *x.shape[1:]).clone() for x in (camera.cam_from_world, camera.intrinsics))
     return with_times(CameraPath(Cameras(poses, intrinsics, camera.width, camera.height), fps), times)
 
 
 def parse_times(text: str) -> tuple[float, ...]:
-    """The scene times of ``START:STOP:COUNT``: COUNT of them, evenly spaced, with both ends; one is START.
+    """Return COUNT evenly spaced times from ``START:STOP:COUNT``, both ends included; a single one is START.
 
     Raises:
-        DyngsError: if ``text`` is anything else.
+        DyngsError: ``text`` is anything else.
     """
     wanted = "write START:STOP:COUNT, for instance 0:1:60 for 60 evenly spaced times"
     shown = printable(repr(text), 60)
@@ -93,15 +93,15 @@ def parse_times(text: str) -> tuple[float, ...]:
 
 
 def orbit_path(cameras: Cameras, num_frames: int, turns: float = 1.0) -> Cameras:
-    """``num_frames`` cameras on a level circle around the point that ``cameras`` look at.
+    """Return cameras on a level circle around the point that the given ``cameras`` look at.
 
-    Radius and height are the means of the given cameras; up is their mean up; intrinsics are the first camera's. A ring
-    of cameras gives the ring itself; cameras that all face one way a circle through the side from which they look.
+    Radius, height and up direction are means over the given cameras; intrinsics are those of the first. A ring of
+    cameras gives the ring itself; cameras that all face one way give a circle through their side of the scene.
 
     Args:
-        cameras: V >= 1 cameras, those of training for instance.
-        num_frames: F; the first one is at the azimuth of the first camera.
-        turns: of the whole circle; negative turns the other way.
+        cameras: V >= 1 cameras, usually those of training.
+        num_frames: F; frame 0 is at the azimuth of the first camera.
+        turns: number of full circles; negative: in the other direction.
     """
     poses = _world_from_cam(cameras)
     centers, up = poses[:, :3, 3], mean_up(cameras)
@@ -113,19 +113,20 @@ def orbit_path(cameras: Cameras, num_frames: int, turns: float = 1.0) -> Cameras
     first = level[np.argmax(np.linalg.norm(level, axis=1) > 1e-6)]
     axis_x = _unit(first) if np.linalg.norm(first) > 1e-6 else _perpendicular(up)
     radius = max(radius, 0.1 * float(np.linalg.norm(offsets, axis=1).mean()), 1e-6)
-    return _circle(center + heights.mean() * up, center, up, axis_x * radius, _Shot(cameras, num_frames, turns))
+    return _circle(center + heights.mean() * up, center, up, axis_x * radius, _Frames(cameras, num_frames, turns))
 
 
 def spiral_path(cameras: Cameras, num_frames: int, turns: float = 2.0, zoom: float = 0.5) -> Cameras:
-    """``num_frames`` cameras that wind before a scene seen from one side, as in LLFF; a closed loop.
+    """Return cameras on a closed spiral in front of a scene seen from one side, as in LLFF.
 
-    Around the mean camera, as wide as 90% of the given cameras stray from it, all looking at the same point.
+    The spiral is centred on the mean camera and as wide as the 90% quantile of the distances of the given cameras from
+    it; all cameras look at the same point.
 
     Args:
         cameras: V >= 1 cameras, roughly facing one way.
         num_frames: F.
-        turns: sideways rounds per loop.
-        zoom: how far the spiral goes along the viewing axis, as a share of the cameras' stray.
+        turns: circles per loop.
+        zoom: extent along the viewing axis, relative to the width of the spiral.
     """
     poses = _world_from_cam(cameras)
     centers, target, up = poses[:, :3, 3], look_at_point(cameras), mean_up(cameras)
@@ -144,19 +145,19 @@ def spiral_path(cameras: Cameras, num_frames: int, turns: float = 2.0, zoom: flo
 def frame_orbit_for_points(
     means: np.ndarray, num_frames: int, size: tuple[int, int] = (960, 720), up: tuple[float, float, float] = (0, 0, 1)
 ) -> Cameras:
-    """An orbit for a bare set of points, without any camera: the robust extent of the points fills the picture.
+    """Return an orbit around a set of points whose robust extent fills the picture.
 
-    The centre is the median; the extent the sphere around it that holds 99% of the points within the 1st to 99th
-    percentile of every axis, so that a few stray points do no harm.
+    The centre is the median. The extent is the sphere around it that holds 99% of the points within the 1st to 99th
+    percentile of every axis, so that outliers have no effect.
 
     Args:
-        means: (N, 3) points in world units; those that are not finite are ignored.
+        means: (N, 3) points in world units; non-finite ones are ignored.
         num_frames: F.
         size: width and height in pixels.
-        up: world direction; many captures with COLMAP have (0, -1, 0).
+        up: up direction of the world; (0, -1, 0) for many COLMAP captures.
 
     Raises:
-        DyngsError: no finite point, or an up of no length.
+        DyngsError: no finite point, or a zero up direction.
     """
     points = np.asarray(means, np.float64).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
@@ -173,21 +174,22 @@ def frame_orbit_for_points(
     half_fov = math.radians(25.0)
     focal = 0.5 * max(width, height) / math.tan(half_fov)
     narrow = math.atan(0.5 * min(width, height) / focal)
-    intrinsics = torch.tensor([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]], dtype=torch.float32)
+    matrix = [[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]]
+    intrinsics = torch.tensor(matrix, dtype=torch.float32, device="cpu")
     distance = 0.85 * extent / math.sin(narrow)
     axis_z = _unit(np.asarray(up, np.float64))
     elevation = math.radians(20.0)
-    template = Cameras(torch.eye(4)[None], intrinsics[None], width, height)
+    template = Cameras(torch.eye(4, device="cpu")[None], intrinsics[None], width, height)
     eye_height = center + distance * math.sin(elevation) * axis_z
     arm = distance * math.cos(elevation) * _perpendicular(axis_z)
-    return _circle(eye_height, center, axis_z, arm, _Shot(template, num_frames, 1.0))
+    return _circle(eye_height, center, axis_z, arm, _Frames(template, num_frames, 1.0))
 
 
 def look_at_point(cameras: Cameras) -> np.ndarray:
-    """(3,) float64 point nearest to all optical axes, in the least-squares sense, and before the cameras.
+    """Return the point (3,) float64 nearest to all optical axes in the least-squares sense, in front of the cameras.
 
-    Where the axes are (nearly) parallel, the point is undetermined along them: then it lies before the mean camera, at
-    the cameras' spread (at least 1) times three.
+    (Nearly) parallel axes do not determine it: then it lies in front of the mean camera, at three times the spread of
+    the cameras (1 if they coincide).
     """
     poses = _world_from_cam(cameras)
     centers, axes = poses[:, :3, 3], poses[:, :3, 2]
@@ -202,14 +204,14 @@ def look_at_point(cameras: Cameras) -> np.ndarray:
 
 
 def mean_up(cameras: Cameras) -> np.ndarray:
-    """(3,) unit vector: the mean of the cameras' up directions (minus y), the first camera's where they cancel."""
+    """Return the mean up direction (minus y) of the cameras, (3,); that of the first camera if they cancel."""
     ups = -_world_from_cam(cameras)[:, :3, 1]
     total = ups.mean(axis=0)
     return _unit(total) if np.linalg.norm(total) > 1e-3 else ups[0]
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """(4, 4) OpenCV camera-to-world pose at ``eye``, z towards ``target``, y away from ``up``."""
+    """Return the OpenCV camera-to-world pose (4, 4) at ``eye``, z towards ``target``, y away from ``up``."""
     forward = target - eye
     forward = _unit(forward) if np.linalg.norm(forward) > 1e-12 else _perpendicular(up)
     right = np.cross(forward, up)
@@ -220,7 +222,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def write_path(file: Path, path: CameraPath, world_offset: np.ndarray | None = None) -> None:
-    """Write ``path`` as JSON in the format of ``read_path``, atomically; ``world_offset`` as there."""
+    """Write a path as JSON in the format of ``read_path``, atomically; ``world_offset`` as there."""
     cameras = path.cameras
     poses = _rebased(cameras.cam_from_world.detach().cpu().double().numpy(), world_offset, sign=-1.0)
     frames = []
@@ -236,12 +238,12 @@ def write_path(file: Path, path: CameraPath, world_offset: np.ndarray | None = N
 
 
 def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
-    """The camera path in a JSON file, float32.
+    """Read a camera path from a JSON file; cameras are float32 on the CPU.
 
     Args:
         file: see docs/camera_paths.md.
-        world_offset: (3,) the capture's offset (``Capture.world_offset``): the file's coordinates are the capture's,
-            the cameras returned are in the rebased world.
+        world_offset: (3,) ``Capture.world_offset``: the file is in the coordinates of the capture, the returned cameras
+            are in the rebased world.
 
     Raises:
         DyngsError: names the file, the frame and the key that is missing or wrong.
@@ -275,37 +277,37 @@ def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
 
 
 @dataclass(frozen=True)
-class _Shot:
-    """What a circle of cameras takes from outside: intrinsics, number of frames, part of the circle."""
+class _Frames:
+    """Intrinsics of a circle of cameras, number of frames and of turns."""
 
     cameras: Cameras
     num_frames: int
     turns: float
 
 
-def _circle(hub: np.ndarray, target: np.ndarray, up: np.ndarray, arm: np.ndarray, shot: _Shot) -> Cameras:
-    """Cameras around ``hub`` that look at ``target``, the first one at ``hub + arm``."""
-    angles = 2 * np.pi * shot.turns * np.arange(shot.num_frames) / max(shot.num_frames, 1)
+def _circle(hub: np.ndarray, target: np.ndarray, up: np.ndarray, arm: np.ndarray, frames: _Frames) -> Cameras:
+    """Return cameras around ``hub`` that look at ``target``, the first one at ``hub + arm``."""
+    angles = 2 * np.pi * frames.turns * np.arange(frames.num_frames) / max(frames.num_frames, 1)
     eyes = hub + np.cos(angles)[:, None] * arm + np.sin(angles)[:, None] * np.cross(up, arm)
-    return _with_poses(shot.cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
+    return _with_poses(frames.cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
 
 
 def _with_poses(cameras: Cameras, world_from_cam: np.ndarray) -> Cameras:
-    """Cameras at new poses with the first camera's intrinsics, dtype and device."""
+    """Return cameras at new poses with intrinsics, dtype and device of the first of ``cameras``."""
     cam_from_world = torch.from_numpy(np.linalg.inv(world_from_cam)).to(cameras.cam_from_world)
     intrinsics = cameras.intrinsics[:1].expand(len(cam_from_world), 3, 3).clone()
     return Cameras(cam_from_world, intrinsics, cameras.width, cameras.height)
 
 
 def _world_from_cam(cameras: Cameras) -> np.ndarray:
-    """(V, 4, 4) float64 poses."""
+    """Return camera-to-world poses (V, 4, 4), float64."""
     if not len(cameras):
-        raise ValueError("a camera path needs at least one camera to go by")
+        raise ValueError("a camera path is placed by at least one camera")
     return np.linalg.inv(cameras.cam_from_world.detach().cpu().double().numpy())
 
 
 def _rebased(cam_from_world: np.ndarray, world_offset: np.ndarray | None, sign: float) -> np.ndarray:
-    """(F, 4, 4) poses that see points less (sign 1) or plus (sign -1) the offset as the given ones see the points."""
+    """Return poses (F, 4, 4) for a world shifted by minus (sign 1) or plus (sign -1) the offset."""
     moved = cam_from_world.copy()
     if world_offset is not None:
         moved[:, :3, 3] += sign * moved[:, :3, :3] @ world_offset
@@ -315,7 +317,7 @@ def _rebased(cam_from_world: np.ndarray, world_offset: np.ndarray | None, sign: 
 def _read_cameras(
     document: dict[str, Any], name: str, size: tuple[int, int], file: Path
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """(F, 4, 4) world-to-camera poses, (F, 3, 3) intrinsics and (F,) times, if any, of the list ``name``."""
+    """Return world-to-camera poses (F, 4, 4), intrinsics (F, 3, 3) and times (F,), if any, of the list ``name``."""
     poses, matrices = [], []
     for i, frame in enumerate(document[name]):
         where = f"{file}: {name}[{i}]"
@@ -330,7 +332,7 @@ def _read_cameras(
 def _numbers_of_all(
     document: dict[str, Any], name: str, key: str, limits: tuple[float, float], file: Path
 ) -> np.ndarray | None:
-    """(F,) the numbers at ``key`` in each object of the list ``name``; None if none has it."""
+    """Return the numbers (F,) at ``key`` in each object of the list ``name``; None if none has it."""
     frames = document[name]
     without = [i for i, frame in enumerate(frames) if key not in frame]
     if without and len(without) < len(frames):
@@ -343,7 +345,7 @@ def _numbers_of_all(
 
 
 def _read_keyframes(document: dict[str, Any], keys: Keyframes, fps: float, file: Path) -> tuple[Keyframes, int]:
-    """``keys`` with their seconds and period, and the number of frames, from 'at', 'num_frames', 'seconds', 'loop'."""
+    """Return keyframes with seconds and period, and the number of frames, by 'at', 'num_frames', 'seconds', 'loop'."""
     loop, count = document.get("loop", False), len(keys.cam_from_world)
     if not isinstance(loop, bool):
         raise DyngsError(f"{file}: 'loop' is {loop!r}; it must be true or false")
@@ -370,9 +372,9 @@ def _read_keyframes(document: dict[str, Any], keys: Keyframes, fps: float, file:
 
 
 def _read_num_frames(document: dict[str, Any], fps: float, file: Path) -> int | None:
-    """The number of frames by 'num_frames' or 'seconds'; None where neither is given."""
+    """Return the number of frames by 'num_frames' or 'seconds'; None if neither is given."""
     if "num_frames" in document and "seconds" in document:
-        raise DyngsError(f"{file}: 'num_frames' and 'seconds' both say how long the video is; give one of them")
+        raise DyngsError(f"{file}: 'num_frames' and 'seconds' both set the length of the video; give one of them")
     if "seconds" in document:
         return max(1, round(_number(document, "seconds", str(file), low=1e-3, high=1e6) * fps))
     if "num_frames" not in document:
@@ -384,7 +386,7 @@ def _read_num_frames(document: dict[str, Any], fps: float, file: Path) -> int | 
 
 
 def _clamped(times: Sequence[float], where: str) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """``times`` within [0, 1], and a line about it if any was not."""
+    """Return the times clamped to [0, 1], and a warning if any was outside."""
     if not all(math.isfinite(t) for t in times):
         raise DyngsError(f"{where}: scene times must be finite numbers in [0, 1]")
     outside = [t for t in times if not 0 <= t <= 1]
@@ -396,7 +398,11 @@ def _clamped(times: Sequence[float], where: str) -> tuple[tuple[float, ...], tup
 
 
 def _read_pose(frame: dict[str, Any], where: str) -> np.ndarray:
-    """(4, 4) world-to-camera pose of a frame, checked to be rigid."""
+    """Return the world-to-camera pose (4, 4) of a frame.
+
+    Raises:
+        DyngsError: it is missing or not rigid.
+    """
     given = [key for key in ("cam_from_world", "transform_matrix") if key in frame]
     if len(given) != 1:
         raise DyngsError(f"{where} needs exactly one of 'cam_from_world' and 'transform_matrix'")
@@ -409,7 +415,7 @@ def _read_pose(frame: dict[str, Any], where: str) -> np.ndarray:
 
 
 def _read_intrinsics(document: dict[str, Any], frame: dict[str, Any], size: tuple[int, int], where: str) -> np.ndarray:
-    """(3, 3) intrinsics from 'fl_x' [fl_y, cx, cy] or 'camera_angle_x', in pixels; the frame's keys go first."""
+    """Return intrinsics (3, 3) in pixels from 'fl_x' [fl_y, cx, cy] or 'camera_angle_x'; keys of the frame first."""
     width, height = size
     focal_keys = {"fl_x", "fl_y", "camera_angle_x"}
     own_focal = not focal_keys.isdisjoint(frame)
@@ -429,7 +435,7 @@ def _read_intrinsics(document: dict[str, Any], frame: dict[str, Any], size: tupl
 def _number(
     keys: dict[str, Any], key: str, where: str, *, low: float, high: float, default: float | None = None
 ) -> float:
-    """The number at ``key``, checked to lie in [low, high]."""
+    """Return the number at ``key``. Raises DyngsError unless it is in [low, high]."""
     value = keys.get(key, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         problem = "is missing" if value is None else f"is {printable(repr(value), 60)}"
@@ -442,6 +448,6 @@ def _unit(a: np.ndarray) -> np.ndarray:
 
 
 def _perpendicular(a: np.ndarray) -> np.ndarray:
-    """A unit vector at right angles to ``a``."""
+    """Return a unit vector perpendicular to ``a``."""
     other = np.eye(3)[np.abs(a).argmin()]
     return _unit(np.cross(a, other))

@@ -1,4 +1,4 @@
-"""Pictures for people: contact sheets of truth, render and error, and coloured depth."""
+"""Contact sheets of ground truth, render and error, and coloured depth maps."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyngs.files.write import to_uint8, write_image
-
-__all__ = ["SheetRow", "color_map", "contact_sheet", "depth_limits", "depth_to_rgb", "write_image"]
+from dyngs.files.write import to_uint8
 
 GAP = 6
 LABEL_HEIGHT = 22
-PAPER = 32
+BACKGROUND = 32
 
 
 @dataclass(frozen=True)
@@ -21,8 +19,8 @@ class SheetRow:
     """One view of a contact sheet.
 
     Attributes:
-        label: the text above it, say its name and PSNR.
-        truth, rendered: (H, W, 3), uint8 or floats in [0, 1], of one size.
+        label: text above it, such as name and PSNR.
+        truth, rendered: (H, W, 3), uint8 or float in [0, 1], of the same size.
     """
 
     label: str
@@ -31,7 +29,7 @@ class SheetRow:
 
 
 def contact_sheet(rows: Sequence[SheetRow], error_gain: float = 5.0, panel_width: int = 480) -> np.ndarray:
-    """(H', W', 3) uint8 sheet: truth, render and error side by side, one view per row, a label above each.
+    """Return a sheet (H', W', 3) uint8 with truth, render and error side by side, one labelled view per row.
 
     The error is the mean absolute difference of the channels times ``error_gain``, in magma colours (black = equal).
     Pictures wider than ``panel_width`` are shrunk, after the difference was taken.
@@ -50,14 +48,14 @@ def contact_sheet(rows: Sequence[SheetRow], error_gain: float = 5.0, panel_width
         panels = (truth, rendered, color_map(error_gain * difference, "magma"))
         bands.append(_band(row.label, f"error x{error_gain:g}", [_shrink(panel, panel_width) for panel in panels]))
     width = max(band.shape[1] for band in bands)
-    padded = [np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=PAPER) for b in bands]
-    return np.pad(np.concatenate(padded), ((0, GAP), (0, 0), (0, 0)), constant_values=PAPER)
+    padded = [np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=BACKGROUND) for b in bands]
+    return np.pad(np.concatenate(padded), ((0, GAP), (0, 0), (0, 0)), constant_values=BACKGROUND)
 
 
 def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
-    """Near and far for ``depth_to_rgb``: the 1st and 99th percentile of ``depth`` where ``alpha`` is at least a half.
+    """Return near and far for ``depth_to_rgb``: the 1st and 99th percentile of depth where alpha is at least 0.5.
 
-    Any equal shapes, so limits can be shared by the frames of a video. (0, 1) where nothing is opaque.
+    Any equal shapes, so that the frames of a video can share limits. (0, 1) if nothing is opaque.
     """
     seen = depth[(alpha >= 0.5) & np.isfinite(depth)]
     if not seen.size:
@@ -67,12 +65,12 @@ def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
 
 
 def depth_to_rgb(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None) -> np.ndarray:
-    """(H, W, 3) uint8: near is red, far is blue (turbo), darkened to black where ``alpha`` is 0.
+    """Return depth as colours (H, W, 3) uint8: near is red, far is blue (turbo), darkened to black where alpha is 0.
 
     Args:
-        depth: (H, W) expected depth in world units; what is not finite is drawn as far.
+        depth: (H, W) expected depth in world units; non-finite values count as far.
         alpha: (H, W) in [0, 1].
-        limits: near and far; ``depth_limits`` of this picture where None.
+        limits: near and far; None: ``depth_limits`` of this picture.
     """
     near, far = limits or depth_limits(depth, alpha)
     share = (far - np.nan_to_num(depth, nan=far, posinf=far, neginf=near)) / max(far - near, 1e-12)
@@ -81,7 +79,7 @@ def depth_to_rgb(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, floa
 
 
 def color_map(values: np.ndarray, name: str) -> np.ndarray:
-    """(H, W, 3) uint8 colours of ``values`` (H, W) in [0, 1], by OpenImageIO's map ``name`` (magma, turbo...)."""
+    """Return colours (H, W, 3) uint8 of values (H, W) in [0, 1], by a colour map of OpenImageIO (magma, turbo...)."""
     import OpenImageIO as oiio
 
     source = oiio.ImageBuf(np.ascontiguousarray(np.clip(values, 0.0, 1.0)[..., None], dtype=np.float32))
@@ -95,9 +93,9 @@ def color_map(values: np.ndarray, name: str) -> np.ndarray:
 
 
 def _band(label: str, error_name: str, panels: list[np.ndarray]) -> np.ndarray:
-    """A labelled row of panels on paper."""
+    """Return a labelled row of panels."""
     height, width = panels[0].shape[:2]
-    band = np.full((LABEL_HEIGHT + height, GAP + len(panels) * (width + GAP), 3), PAPER, np.uint8)
+    band = np.full((LABEL_HEIGHT + height, GAP + len(panels) * (width + GAP), 3), BACKGROUND, np.uint8)
     for i, panel in enumerate(panels):
         left = GAP + i * (width + GAP)
         band[LABEL_HEIGHT:, left : left + width] = panel
@@ -109,17 +107,17 @@ def _band(label: str, error_name: str, panels: list[np.ndarray]) -> np.ndarray:
 
 
 def _write_text(strip: np.ndarray, text: str) -> None:
-    """Write ``text`` into ``strip`` (H, W, 3) in place, as much as fits; nothing where no font is installed."""
+    """Write text into ``strip`` (H, W, 3) in place, cut off at its edge; nothing if no font is installed."""
     import OpenImageIO as oiio
 
-    canvas = oiio.ImageBuf(np.ascontiguousarray(strip))
+    picture = oiio.ImageBuf(np.ascontiguousarray(strip))
     ink = (0.85, 0.85, 0.85)
-    if oiio.ImageBufAlgo.render_text(canvas, 2, LABEL_HEIGHT - 7, text, 14, textcolor=ink):
-        strip[:] = canvas.get_pixels(oiio.UINT8)
+    if oiio.ImageBufAlgo.render_text(picture, 2, LABEL_HEIGHT - 7, text, 14, textcolor=ink):
+        strip[:] = picture.get_pixels(oiio.UINT8)
 
 
 def _shrink(rgb: np.ndarray, width: int) -> np.ndarray:
-    """The picture (H, W, 3) uint8, area-filtered to at most ``width`` columns."""
+    """Return the picture (H, W, 3) uint8, area-filtered to at most ``width`` columns."""
     if rgb.shape[1] <= width:
         return rgb
     from skimage.transform import resize_local_mean

@@ -1,4 +1,4 @@
-"""Rendered pictures written to files: the frames of a job, or the views of a split beside their ground truth."""
+"""Render to picture and video files: the frames of a job, or the views of a split beside their ground truth."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _DEPTH_SAMPLES = 8
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What is written besides the colour pictures.
+    """Files to write besides the colour pictures.
 
     Attributes:
         depth: ``NAME_depth.png`` (colours) and ``NAME_depth.exr`` (float32, world units along the optical axis).
         alpha: ``NAME_alpha.png``, white = opaque.
         video: MP4 of the colour pictures in order.
-        fps: of the video.
+        fps: frames per second of the video.
     """
 
     depth: bool = False
@@ -46,42 +46,42 @@ class OutputOptions:
     fps: float = 30.0
 
 
-def write_job_images(shot: RenderJob, out_dir: Path | None, output: OutputOptions = OutputOptions()) -> list[Path]:
-    """Paths of the files written for a shot: ``frame_0000.png`` and so on, and the video if one is asked for.
+def write_job_images(job: RenderJob, out_dir: Path | None, output: OutputOptions = OutputOptions()) -> list[Path]:
+    """Render a job to ``frame_0000.png`` and so on, and to a video if asked for; return the paths.
 
     Args:
-        shot: F >= 1 cameras and times, in the order of the video.
+        job: F >= 1 cameras and times, in the order of the video.
         out_dir: folder for the pictures; None writes only the video.
-        output: depth, alpha, video. The colours of depth share one range over the whole path.
+        output: depth, alpha, video. Depth colours share one range over the whole path.
 
     Raises:
         DyngsError: no cameras, nothing to write, or a file cannot be written.
     """
-    if len(shot.path) == 0:
+    if len(job.path) == 0:
         raise DyngsError("the camera path has no cameras")
     if out_dir is None and output.video is None:
         raise DyngsError("nothing to write: give a folder for the pictures or a video file")
-    shot = replace(shot, options=_with_depth(shot.options, output))
+    job = replace(job, options=_with_depth(job.options, output))
     limits = None
     if output.depth and out_dir is not None:
-        limits = _shared_depth_limits(job_frames(replace(shot, path=_sample(shot.path))))
-    digits = max(4, len(str(len(shot.path) - 1)))
-    with _FrameWriter(out_dir, output, shot.kept, limits) as writer:
-        for i, frame in enumerate(job_frames(shot)):
+        limits = _shared_depth_limits(job_frames(replace(job, path=_sample(job.path))))
+    digits = max(4, len(str(len(job.path) - 1)))
+    with _FrameWriter(out_dir, output, job.protected, limits) as writer:
+        for i, frame in enumerate(job_frames(job)):
             writer.write(f"frame_{i:0{digits}d}", frame)
     return writer.written
 
 
 def write_split_images(run_dir: Path, split: str, out_dir: Path, output: OutputOptions = OutputOptions()) -> list[Path]:
-    """Paths of the files written for a split of a run: ``NAME.png`` per view, and ``sheet.png`` (truth, render, error).
+    """Render a split of a run to ``NAME.png`` per view and ``sheet.png`` (truth, render, error); return the paths.
 
-    The sheet shows at most 12 views, evenly spread, with their PSNR, black where a mask leaves pixels out. The
-    background is that of training, black where that was random.
+    The sheet shows at most 12 views, evenly spread, with their PSNR; masked pixels are black. The background is that
+    of training, black if that was random.
 
     Args:
-        run_dir: folder of a run with at least one checkpoint.
+        run_dir: run folder with at least one checkpoint.
         split: "test", "val" or "train".
-        out_dir: folder for the pictures; the names are the views' (``file_stems``).
+        out_dir: folder for the pictures, which are named after the views (``file_stems``).
         output: depth, alpha, video (views of one size only).
 
     Raises:
@@ -110,23 +110,23 @@ def write_split_images(run_dir: Path, split: str, out_dir: Path, output: OutputO
 
 
 def files_of(capture: Capture) -> frozenset[Path]:
-    """The pictures and masks of a capture, without links in their paths."""
+    """Return the paths of the pictures and masks of a capture, with symbolic links resolved."""
     views = [view for split in capture.splits.values() for view in split]
     files = (path for view in views for path in (view.image_path, view.mask_path) if path is not None)
     return frozenset(path.resolve() for path in files)
 
 
 def _sheet_row(label: str, truth: Tensor, rendered: Tensor, mask: Tensor | None) -> SheetRow:
-    """A row of the sheet; pixels that do not count are black on both sides, so that they show no error."""
+    """Return a row of the sheet; masked pixels are black on both sides, so that they show no error."""
     counts = 1.0 if mask is None else mask[..., None]
     return SheetRow(label, to_uint8((truth * counts).numpy()), to_uint8((rendered * counts).numpy()))
 
 
 def file_stems(names: Sequence[str]) -> list[str]:
-    """File names for views, without suffix: safe, unique, in order.
+    """Return safe and unique file names, without suffix, for the names of views.
 
-    Folders that all names share are dropped, other folders become a prefix (``left/0001`` is ``left_0001``); parts such
-    as ``..`` and characters that file systems dislike are replaced, so that no name leaves the output folder.
+    Folders that all names share are dropped, other folders become a prefix (``left/0001`` is ``left_0001``). Parts
+    such as ``..`` and special characters are replaced, so that no name leaves the output folder.
     """
     parts = [[_safe(part) for part in name.replace("\\", "/").split("/") if part.strip(". ")] for name in names]
     parts = [p or ["view"] for p in parts]
@@ -146,17 +146,17 @@ def file_stems(names: Sequence[str]) -> list[str]:
 
 
 class _FrameWriter:
-    """A context that writes frames as pictures and into a video; ``written`` lists the files."""
+    """Context manager that writes frames to pictures and a video; ``written`` lists the files."""
 
     def __init__(
         self,
         out_dir: Path | None,
         output: OutputOptions,
-        kept: frozenset[Path],
+        protected: frozenset[Path],
         limits: tuple[float, float] | None = None,
     ) -> None:
         self.written: list[Path] = []
-        self._kept = kept
+        self._protected = protected
         self._out_dir, self._output, self._limits = out_dir, output, limits
         self._stack = ExitStack()
         self._video: VideoWriter | None = None
@@ -191,8 +191,8 @@ class _FrameWriter:
             self.write_picture(self._out_dir / f"{stem}_depth.exr", frame.depth)
 
     def write_picture(self, path: Path, pixels: np.ndarray) -> None:
-        if self._kept and path.resolve() in self._kept:
-            raise DyngsError(f"{path}: is a picture of the capture, which would be replaced; give another --out")
+        if self._protected and path.resolve() in self._protected:
+            raise DyngsError(f"{path}: is a picture of the capture and would be overwritten; give another --out")
         write_image(path, pixels)
         self.written.append(path)
 
@@ -202,21 +202,22 @@ def _with_depth(options: RenderOptions, output: OutputOptions) -> RenderOptions:
 
 
 def _sample(path: CameraPath) -> CameraPath:
-    """At most 8 of the frames, evenly spread."""
-    index = torch.linspace(0, len(path) - 1, min(len(path), _DEPTH_SAMPLES)).round().long()
+    """Return at most 8 of the frames, evenly spread."""
+    count, device = min(len(path), _DEPTH_SAMPLES), path.cameras.cam_from_world.device
+    index = torch.linspace(0, len(path) - 1, count, device=device).round().long()
     poses, intrinsics = path.cameras.cam_from_world[index], path.cameras.intrinsics[index]
     cameras = replace(path.cameras, cam_from_world=poses, intrinsics=intrinsics)
     return replace(path, cameras=cameras, times=path.times and tuple(path.times[i] for i in index.tolist()))
 
 
 def _shared_depth_limits(frames: Iterator[Frame]) -> tuple[float, float]:
-    """Near and far that suit all of the frames."""
+    """Return near and far over all of the frames."""
     seen = [(frame.depth.ravel(), frame.alpha.ravel()) for frame in frames if frame.depth is not None]
     return depth_limits(np.concatenate([d for d, _ in seen]), np.concatenate([a for _, a in seen]))
 
 
 def _files(stem: str) -> set[str]:
-    """What may be written for a view, in lower case as some file systems see it."""
+    """Return the file names of a view, in lower case because some file systems ignore case."""
     return {f"{stem}{suffix}".lower() for suffix in ("", "_depth", "_alpha")}
 
 

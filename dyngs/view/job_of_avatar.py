@@ -1,4 +1,4 @@
-"""What a camera path shows of an avatar file: the person at rest or in a motion, and cameras around it."""
+"""Render jobs for avatar files: a person in the rest pose or in a motion."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from dyngs.view.animation import with_motion
 from dyngs.view.camera_paths import CameraPath, frame_orbit_for_points, read_path, spiral_path, static_path, with_times
 from dyngs.view.render_job import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJob, RenderJobOptions, path_file, resize_cameras
 
-_MOMENTS = 8
-"""Of a motion, at which the camera must see the person."""
+_SAMPLED_TIMES = 8
+"""Times of a motion at which the person must be in view."""
 _RING = 24
 
 
 def job_of_avatar(file: Path, options: RenderJobOptions) -> RenderJob:
-    """The person of a file along a path around it, or before one camera that stands in front of it.
+    """Return the job of rendering an avatar file along a path, or from one fixed camera in front of the person.
 
     Raises:
-        DyngsError: no avatar file, a broken path or motion, a view, or times that do not fit the frames.
+        DyngsError: not an avatar file, an invalid path or motion, a view, or times that do not fit the frames.
     """
     if options.view is not None:
         raise DyngsError(f"{file}: an avatar file holds no views; leave out --view")
     run, fps = read_avatar(file), None
     if options.motion is not None:
-        played = with_motion(run, options.motion)
-        run, fps = played.run, played.fps
+        animated = with_motion(run, options.motion)
+        run, fps = animated.run, animated.fps
     scene = avatar_of(run.scene)
     if scene is None:
         raise DyngsError(f"{file}: holds no person; give a file of `dyngs export RUN --format avatar`")
@@ -49,7 +49,7 @@ def job_of_avatar(file: Path, options: RenderJobOptions) -> RenderJob:
 
 
 def _path(scene: HumanScene, world_offset: tuple[float, float, float], options: RenderJobOptions) -> CameraPath:
-    """The cameras that are asked for, and the moments of the clip that they see."""
+    """Return the cameras that are asked for, with their times in the motion."""
     times = scene.times if options.times is None else options.times
     if options.path is None:
         return static_path(_around(scene, options, 1), times)
@@ -68,8 +68,8 @@ def _path(scene: HumanScene, world_offset: tuple[float, float, float], options: 
 
 
 def _around(scene: HumanScene, options: RenderJobOptions, count: int) -> Cameras:
-    """An orbit around where the person is, a spiral before it, or without a path the one camera in front of it."""
-    moments = np.linspace(0, 1, 1 if scene.is_still else _MOMENTS)
+    """Return an orbit around the person, a spiral in front, or without a path one camera in front."""
+    moments = np.linspace(0, 1, 1 if scene.is_still else _SAMPLED_TIMES)
     means = torch.cat([scene.at(moment).means for moment in moments.tolist()]).numpy()
     x, y, z = up_direction(scene.clip).tolist()
     size = options.size or DEFAULT_SIZE

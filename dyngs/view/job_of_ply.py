@@ -1,4 +1,4 @@
-"""Render jobs for .ply files of Gaussians, which hold one moment and no cameras."""
+"""Render jobs for .ply files, which hold static Gaussians and no cameras."""
 
 from __future__ import annotations
 
@@ -20,13 +20,15 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 def job_of_ply(file: Path, options: RenderJobOptions) -> RenderJob:
-    """A path around the Gaussians of a .ply, placed by their extent; non-finite Gaussians are left out.
+    """Return the job of rendering a .ply along a path placed by the extent of its Gaussians.
+
+    Non-finite Gaussians are left out.
 
     Raises:
-        DyngsError: not a splat file, a broken path file, or times, which a file does not have.
+        DyngsError: not a splat file, an invalid path file, or options that a .ply does not support.
     """
     if options.path is None or options.times is not None or options.view is not None:
-        raise DyngsError(f"{file}: a .ply holds one moment and no views; leave out --time, --times and --view")
+        raise DyngsError(f"{file}: a .ply holds one time and no views; leave out --time, --times and --view")
     if options.motion is not None or options.at_rest:
         raise DyngsError(f"{file}: a .ply has no skeleton; give the run of a person for --motion and --pose")
     splat = read_ply(file, nonfinite="skip")
@@ -43,13 +45,13 @@ def job_of_ply(file: Path, options: RenderJobOptions) -> RenderJob:
 
 
 def splat_options(splat: SplatFile) -> RenderOptions:
-    """How a splat file wants to be drawn: its mode, and its low-pass where it names one."""
+    """Return the render options stated in the header of a splat file: its mode, and its low-pass filter if any."""
     options = RenderOptions(mode=splat.mode)
     return options if splat.eps2d is None else replace(options, eps2d=splat.eps2d)
 
 
 def _around_points(means: np.ndarray, options: RenderJobOptions) -> Cameras:
-    """An orbit around the points, or a spiral before the side that an orbit shows first."""
+    """Return an orbit around the points, or a spiral in front of the side that an orbit shows first."""
     axis = _AXES[options.up.lstrip("-")]
     sign = -1.0 if options.up.startswith("-") else 1.0
     up = (sign * axis[0], sign * axis[1], sign * axis[2])

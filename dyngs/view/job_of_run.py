@@ -1,4 +1,4 @@
-"""Render jobs for run folders: cameras placed by those of training, or one of these."""
+"""Render jobs for run folders: a path placed by the training cameras, or the camera of one view."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
 from dyngs.runs.checkpoint import LoadedRun, load_run
-from dyngs.view.animation import at_rest, with_motion
+from dyngs.view.animation import in_rest_pose, with_motion
 from dyngs.view.camera_paths import (
     CameraPath,
     orbit_path,
@@ -30,28 +30,28 @@ from dyngs.view.render_job import DEFAULT_FRAMES, RenderJob, RenderJobOptions, p
 
 
 def job_of_run(run_dir: Path, options: RenderJobOptions) -> RenderJob:
-    """The scene of a run along a path placed by its training cameras, or before one of its cameras.
+    """Return the job of rendering a run along a camera path, or from the fixed camera of one of its views.
 
     Raises:
-        DyngsError: no such run or view, its capture is gone, a broken path file, or times that do not fit its frames.
+        DyngsError: no such run or view, a missing capture, an invalid path file, or times that do not fit its frames.
     """
     run, fps = load_run(run_dir), None
     if options.motion is not None:
-        played = with_motion(run, options.motion)
-        run, fps = played.run, played.fps
+        animated = with_motion(run, options.motion)
+        run, fps = animated.run, animated.fps
     elif options.at_rest:
-        run = at_rest(run)
+        run = in_rest_pose(run)
     capture = read_capture(run.config.data)
     if options.split is not None and options.motion is None and not options.at_rest:
         run = replace(run, scene=scene_of_split(run, capture, options.split))
     _, background = evaluation_background(options.background or run.config.data.background, capture.has_alpha)
-    path = _standing_path(run, capture, options) if options.path is None else _moving_path(run, capture, options)
+    path = _fixed_camera_path(run, capture, options) if options.path is None else _moving_path(run, capture, options)
     notes: tuple[str, ...] = ()
     if run.scene.is_still and options.times is not None:
         notes = ("nothing moves in this run: it looks the same at all times",)
     elif not run.scene.is_still and path.times is None:
         path = with_times(path, np.linspace(0, 1, len(path)).tolist())
-        notes = ("time runs from 0 to 1 along the path; --time or --times choose other moments",)
+        notes = ("time runs from 0 to 1 along the path; --time or --times choose other times",)
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     if fps is not None:
@@ -60,21 +60,21 @@ def job_of_run(run_dir: Path, options: RenderJobOptions) -> RenderJob:
 
 
 def cameras_for_paths(capture: Capture, data: DataConfig) -> Cameras:
-    """The V training cameras, all with the first one's size and intrinsics as loaded (downscaled, undistorted)."""
+    """Return the V training cameras, all with size and intrinsics of the first (downscaled, undistorted)."""
     views = capture.splits["train"]
     (first,) = training_cameras(views[:1], data)
-    poses = torch.from_numpy(np.stack([view.cam_from_world for view in views])).float()
+    poses = torch.from_numpy(np.stack([view.cam_from_world for view in views])).to(first.cam_from_world)
     return Cameras(poses, first.intrinsics.expand(len(views), 3, 3).clone(), first.width, first.height)
 
 
 def view_to_show(capture: Capture, name: str | None = None, split: str | None = None) -> View:
-    """The view called ``name``, the first one by default.
+    """Return the view called ``name``, by default the first one.
 
     Args:
         capture: with at least one view.
-        name: a view's name, the name of its picture among those of ``dyngs render RUN``, or its number in the split,
-            from 0; a name goes before a number.
-        split: "test", "val" or "train"; None looks for a name in all of them, for a number in the first that has views.
+        name: name of a view, of its picture as written by ``dyngs render RUN``, or its number in the split, from 0;
+            names take precedence over numbers.
+        split: "test", "val" or "train"; None looks for a name in all, for a number in the first that has views.
 
     Raises:
         DyngsError: no such view, or no such split.
@@ -96,8 +96,8 @@ def view_to_show(capture: Capture, name: str | None = None, split: str | None = 
     )
 
 
-def _standing_path(run: LoadedRun, capture: Capture, options: RenderJobOptions) -> CameraPath:
-    """One camera of the capture at ``options.times``, or at its own time."""
+def _fixed_camera_path(run: LoadedRun, capture: Capture, options: RenderJobOptions) -> CameraPath:
+    """Return the path of one fixed camera of the capture at ``options.times``, or at the time of its view."""
     view = view_to_show(capture, options.view, options.split)
     (camera,) = training_cameras([view], run.config.data)
     times = run.scene.times if options.motion is not None else (view.time or 0.0,)
@@ -105,7 +105,7 @@ def _standing_path(run: LoadedRun, capture: Capture, options: RenderJobOptions) 
 
 
 def _moving_path(run: LoadedRun, capture: Capture, options: RenderJobOptions) -> CameraPath:
-    """The path that ``options`` name, with ``options.times`` if there are any."""
+    """Return the camera path that the options name, with ``options.times`` if there are any."""
     path = options.path or "orbit"
     file = path_file(path)
     if file is not None:

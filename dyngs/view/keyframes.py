@@ -1,4 +1,4 @@
-"""Cameras between key poses: smooth motion through all keys, at any second of a video."""
+"""Smooth interpolation of cameras between keyframes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_STEEPEST = 3.0
-"""How much faster than the slower of its two neighbouring stretches a camera may pass a key."""
+_MAX_TANGENT = 3.0
+"""Largest speed at a keyframe relative to the slower of its two neighbouring intervals."""
 
 
 @dataclass(frozen=True)
@@ -18,8 +18,8 @@ class Keyframes:
         cam_from_world: (K, 4, 4) rigid transforms, float64, OpenCV axes.
         intrinsics: (K, 3, 3) in pixels, positive focal lengths.
         seconds: (K,) strictly increasing.
-        times: (K,) scene times, or None for a still scene.
-        period: seconds after which a loop is back at the first key, more than the keys span; None where it ends.
+        times: (K,) scene times, or None for a static scene.
+        period: seconds after which a loop is back at the first keyframe, more than the keyframes span; None: no loop.
     """
 
     cam_from_world: np.ndarray
@@ -33,16 +33,16 @@ class Keyframes:
 
 
 def interpolate_keyframes(keys: Keyframes, seconds: np.ndarray) -> Keyframes:
-    """The camera and the scene time at each of ``seconds``; exactly the keys at the keys' seconds.
+    """Return camera and scene time at each of ``seconds``; exact at the keyframes.
 
-    Rotations turn evenly from key to key the shorter way (slerp: Shoemake 1985). Centres follow a cubic Hermite curve
-    with Catmull-Rom tangents for unevenly spaced keys, continuous in velocity; a tangent is shortened where the camera
-    (nearly) rests on one side of a key, so that equal keys give a still camera. Focal lengths change by equal ratios;
-    the principal point and the scene time linearly.
+    Rotations are interpolated the shorter way by slerp (Shoemake 1985). Centres follow a cubic Hermite curve with
+    Catmull-Rom tangents for non-uniform knots, with continuous velocity; a tangent is shortened where the camera
+    (nearly) rests on one side of a keyframe, so that equal keyframes give a fixed camera. Focal lengths are
+    interpolated geometrically, the principal point and the scene time linearly.
 
     Args:
-        keys: K >= 1 keys.
-        seconds: (F,) any; before the first and after the last key the camera rests there, a loop repeats.
+        keys: K >= 1 keyframes.
+        seconds: (F,) any; before the first and after the last keyframe the camera rests, a loop repeats.
 
     Returns:
         F cameras, without a period.
@@ -70,16 +70,16 @@ def interpolate_keyframes(keys: Keyframes, seconds: np.ndarray) -> Keyframes:
 
 
 def _hermite(knots: np.ndarray, points: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """(F, 3) the curve through (K, 3) ``points`` at K >= 2 ``knots``, evaluated at (F,) ``t`` within the knots."""
+    """Return the curve through points (K, 3) at K >= 2 knots, evaluated at (F,) ``t`` within the knots, as (F, 3)."""
     steps = np.diff(knots)[:, None]
     slopes = np.diff(points, axis=0) / steps
     tangents = np.empty_like(points)
     tangents[1:-1] = (slopes[:-1] * steps[1:] + slopes[1:] * steps[:-1]) / (steps[1:] + steps[:-1])
     speeds = np.linalg.norm(slopes, axis=1)
-    tangents[1:-1] = _shortened(tangents[1:-1], _STEEPEST * np.minimum(speeds[:-1], speeds[1:]))
+    tangents[1:-1] = _shortened(tangents[1:-1], _MAX_TANGENT * np.minimum(speeds[:-1], speeds[1:]))
     inner = (tangents[1], tangents[-2]) if len(points) > 2 else (slopes[0], slopes[0])
     ends = np.stack([2 * slopes[0] - inner[0], 2 * slopes[-1] - inner[1]])  # of the parabola with the inner tangent
-    tangents[[0, -1]] = _shortened(ends, _STEEPEST * speeds[[0, -1]])
+    tangents[[0, -1]] = _shortened(ends, _MAX_TANGENT * speeds[[0, -1]])
     i = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, len(steps) - 1)
     h = steps[i]
     u = (t[:, None] - knots[i, None]) / h
@@ -90,7 +90,7 @@ def _hermite(knots: np.ndarray, points: np.ndarray, t: np.ndarray) -> np.ndarray
 
 
 def _shortened(vectors: np.ndarray, longest: np.ndarray) -> np.ndarray:
-    """(K, 3) vectors no longer than (K,) ``longest``, in their directions."""
+    """Return vectors (K, 3) shortened to at most (K,) ``longest``."""
     length = np.linalg.norm(vectors, axis=1)
     scale = np.divide(longest, length, out=np.ones_like(length), where=length > longest)
     return vectors * scale[:, None]

@@ -1,4 +1,4 @@
-"""Render jobs: a scene, the cameras and times at which it is seen, and how it is drawn."""
+"""Render jobs: a scene, the cameras and times to render, and the render options."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Frame:
     Attributes:
         rgb: (H, W, 3), composited on the background, clamped to [0, 1].
         alpha: (H, W) in [0, 1].
-        depth: (H, W) expected depth, 0 where nothing was hit, or None where it was not asked for.
+        depth: (H, W) expected depth, 0 where nothing is hit; None if it was not rendered.
     """
 
     rgb: np.ndarray
@@ -38,15 +38,15 @@ class Frame:
 
 @dataclass(frozen=True)
 class RenderJob:
-    """A scene, and the cameras and times at which it is seen.
+    """A scene, and the cameras and times to render.
 
     Attributes:
-        scene: what is drawn.
-        path: F cameras in the order of the video; without times, all see time 0.
-        options: how the scene wants to be drawn.
+        scene: scene to render.
+        path: F cameras in the order of the video; without times, all at time 0.
+        options: render options of the scene.
         background: (3,) colour; None is black.
-        notes: lines for people, about what was chosen for them.
-        kept: files of the capture, which no picture replaces.
+        notes: messages about defaults that were chosen.
+        protected: files of the capture, which must not be overwritten.
     """
 
     scene: Scene
@@ -54,25 +54,25 @@ class RenderJob:
     options: RenderOptions = DEFAULT_OPTIONS
     background: Tensor | None = None
     notes: tuple[str, ...] = ()
-    kept: frozenset[Path] = frozenset()
+    protected: frozenset[Path] = frozenset()
 
 
 @dataclass(frozen=True)
 class RenderJobOptions:
-    """Which cameras to place, and when they look.
+    """Cameras and times to render.
 
     Attributes:
-        path: "orbit", "spiral", a JSON file of cameras (docs/camera_paths.md), or None: one camera that stands still.
-        num_frames: of orbit and spiral; None is as many as a motion has, else 120.
-        size: width and height in pixels; None keeps that of the pictures, of the JSON, or 960x720 for a bare file.
-        background: "white" or "black"; None is that of training, black for a bare file.
-        up: axis of a bare file's world that points up, for instance "z" or "-y".
-        times: scene times of the frames; a single one holds for all. None: those of the JSON; otherwise that of the
-            view for a camera that stands still, from 0 to 1 along a path.
-        view: whose camera it is that stands still: a view's name, the name of its picture, or its number from 0.
-        split: of that view; None is test, or val or train where there is none.
-        motion: file of the motion that the person of a run plays; None is that of training.
-        at_rest: the person is in the pose of the template.
+        path: "orbit", "spiral", a JSON file of cameras (docs/camera_paths.md), or None: one fixed camera.
+        num_frames: frames of orbit and spiral; None: as many as a motion has, else 120.
+        size: width and height in pixels; None: that of the pictures, of the JSON, or 960x720 for a .ply or avatar.
+        background: "white" or "black"; None: that of training, black for a .ply.
+        up: up axis of a .ply, such as "z" or "-y".
+        times: scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of the view
+            for a fixed camera, from 0 to 1 along a path.
+        view: the view of the fixed camera: its name, the name of its picture, or its number from 0.
+        split: split of that view; None: test, or val or train if there is none.
+        motion: motion file for the person of a run; None: the training motion.
+        at_rest: show the person in the rest pose of the template.
     """
 
     path: str | None = "orbit"
@@ -94,13 +94,13 @@ def render_frame(
     options: RenderOptions = DEFAULT_OPTIONS,
     background: Tensor | None = None,
 ) -> Frame:
-    """The picture that one camera sees, without gradients.
+    """Render one camera, without gradients.
 
     Args:
-        scene: what it looks at.
-        moment: of the scene.
+        scene: scene to render.
+        moment: the scene at one time.
         camera: one camera.
-        options: how to draw; ``depth`` other than "none" fills ``Frame.depth``.
+        options: render options; ``depth`` other than "none" fills ``Frame.depth``.
         background: (3,) colour; None is black.
     """
     with torch.no_grad():
@@ -109,23 +109,23 @@ def render_frame(
     return Frame(rendering.rgb[0].clamp(0, 1).cpu().numpy(), rendering.alpha[0].cpu().numpy(), depth)
 
 
-def job_frames(shot: RenderJob) -> Iterator[Frame]:
-    """The pictures of a shot, one at a time: memory does not grow with their number.
+def job_frames(job: RenderJob) -> Iterator[Frame]:
+    """Yield the frames of a job one by one, so that memory does not grow with their number.
 
-    The scene is deformed anew only where the time differs from that of the picture before.
+    The scene is deformed only where the time differs from that of the frame before.
     """
-    times = shot.path.times
+    times = job.path.times
     moment, moment_time = None, None
-    for i in range(len(shot.path)):
-        time = None if times is None or shot.scene.is_still else times[i]
+    for i in range(len(job.path)):
+        time = None if times is None or job.scene.is_still else times[i]
         if moment is None or time != moment_time:
             with torch.no_grad():
-                moment, moment_time = shot.scene.moment(time), time
-        yield render_frame(shot.scene, moment, shot.path.cameras.select(i), shot.options, shot.background)
+                moment, moment_time = job.scene.moment(time), time
+        yield render_frame(job.scene, moment, job.path.cameras.select(i), job.options, job.background)
 
 
 def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
-    """The cameras at another image size; all that was in the picture stays in it, pixels stay square."""
+    """Return the cameras at another image size: the whole picture stays visible, pixels stay square."""
     scale = min(width / cameras.width, height / cameras.height)
     intrinsics = cameras.intrinsics.clone()
     intrinsics[:, :2] *= scale
@@ -135,7 +135,7 @@ def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
 
 
 def path_file(path: str) -> Path | None:
-    """The JSON file that ``path`` names, None for a path with a name."""
+    """Return the JSON file that ``path`` names; None for orbit and spiral."""
     if path in ("orbit", "spiral"):
         return None
     if not path.endswith(".json"):

@@ -1,4 +1,4 @@
-"""Videos in and out: H.264 MP4 files through PyAV."""
+"""Writing H.264 MP4 videos with PyAV."""
 
 from __future__ import annotations
 
@@ -11,18 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.data.pictures.video import read_frames
 from dyngs.errors import DyngsError
 from dyngs.files.temporary import temporary_beside
 
-__all__ = ["VideoWriter", "read_frames"]
-
 
 class VideoWriter:
-    """A context that turns pictures into an MP4 which every player shows: H.264, yuv420p, BT.709, constant rate.
+    """Context manager that encodes pictures as MP4 for any player: H.264, yuv420p, BT.709, constant frame rate.
 
-    The file appears when the block ends well; after an error (or without any picture) there is none, and a former one
-    is left as it was. Pictures of odd width or height are padded by repeating the last column or row.
+    The file appears when the block ends without an error; otherwise (or without any picture) there is none, and an
+    earlier one stays. Pictures of odd width or height are padded by repeating the last column or row.
 
         with VideoWriter(Path("orbit.mp4"), fps=30) as video:
             video.add(rgb)
@@ -32,10 +29,10 @@ class VideoWriter:
         """Prepare a writer; nothing is written yet.
 
         Args:
-            path: where to; the suffix names the container, ``.mp4`` is what is tested.
-            fps: pictures per second, more than 0.
+            path: output file; its suffix chooses the container, only ``.mp4`` is tested.
+            fps: frames per second, more than 0.
             quality: x264's constant rate factor, 0 (lossless) to 51; 18 is visually lossless.
-            threads: of the encoder; other numbers give other bytes.
+            threads: of the encoder; the bytes depend on their number.
         """
         if not 0 < fps <= 1000:
             raise DyngsError(f"cannot write {path}: fps must be in (0, 1000], got {fps:g}")
@@ -50,7 +47,7 @@ class VideoWriter:
         return self
 
     def add(self, rgb: np.ndarray) -> None:
-        """Append a picture (H, W, 3) uint8; all must have the first one's size."""
+        """Append a picture (H, W, 3) uint8; all must have the size of the first."""
         if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
             raise ValueError(f"a video picture must be (H, W, 3) uint8, got {rgb.shape} {rgb.dtype}")
         if self._size is None:
@@ -104,7 +101,7 @@ class VideoWriter:
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
 
     def _encode(self, rgb: np.ndarray | None) -> None:
-        """Encode a picture, or flush at the end."""
+        """Encode a picture; None flushes the encoder."""
         import av
         from av.error import FFmpegError
 
@@ -128,7 +125,7 @@ class VideoWriter:
             container.close()
 
     def _discard(self) -> None:
-        """Leave nothing behind of a video that was not finished."""
+        """Remove an unfinished video."""
         with suppress(OSError):
             self._close()
         if self._temporary is not None:

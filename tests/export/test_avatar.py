@@ -25,7 +25,7 @@ from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.view.animation import at_rest, with_motion
+from dyngs.view.animation import in_rest_pose, with_motion
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def motion(tmp_path: Path) -> Path:
 
 def test_the_file_plays_as_the_run(run_dir: Path, file: Path, motion: Path) -> None:
     run, read = load_run(run_dir), read_avatar(file)
-    for one, other in ((with_motion(run, motion).run, with_motion(read, motion).run), (at_rest(run), read)):
+    for one, other in ((with_motion(run, motion).run, with_motion(read, motion).run), (in_rest_pose(run), read)):
         for time in (0.0, 0.7, 1.0):
             wanted, found = one.scene.at(time).tensors(), other.scene.at(time).tensors()
             for name, x in found.items():

@@ -9,7 +9,7 @@ from moving_scene import write_moving_run
 
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import load_run
-from dyngs.view.animation import at_rest, with_motion
+from dyngs.view.animation import in_rest_pose, with_motion
 
 
 def test_only_people_play_motions(tmp_path: Path) -> None:
@@ -17,4 +17,4 @@ def test_only_people_play_motions(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match=r"--motion walk.npz needs the run of a person \(model.kind=human\)"):
         with_motion(run, Path("walk.npz"))
     with pytest.raises(DyngsError, match="--pose rest needs the run of a person"):
-        at_rest(run)
+        in_rest_pose(run)

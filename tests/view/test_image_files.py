@@ -16,6 +16,7 @@ from two_balls import balls_job, cameras_around, two_balls
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.data.pictures.video import read_frames
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
@@ -24,7 +25,6 @@ from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.view.camera_paths import static_path
 from dyngs.view.image_files import OutputOptions, file_stems, files_of, write_job_images, write_split_images
 from dyngs.view.render_job import RenderJob, job_frames
-from dyngs.view.video import read_frames
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -101,8 +101,8 @@ def test_depth_colours_share_one_range_along_a_path(tmp_path) -> None:
 
 def test_depth_of_a_moving_path_shares_one_range(tmp_path) -> None:
     """Of 20 frames 8 are looked at beforehand, each at its own time."""
-    shot = RenderJob(moving_scene(Sliding()), static_path(camera(), np.linspace(0, 1, 20).tolist()))
-    written = write_job_images(shot, tmp_path, OutputOptions(depth=True))
+    job = RenderJob(moving_scene(Sliding()), static_path(camera(), np.linspace(0, 1, 20).tolist()))
+    written = write_job_images(job, tmp_path, OutputOptions(depth=True))
     assert len(written) == 60
 
 
@@ -145,9 +145,9 @@ def test_pictures_of_the_capture_are_not_replaced(tmp_path) -> None:
     for out in (folder, tmp_path / "link"):
         with pytest.raises(DyngsError, match=r"picture of the capture.*--out"):
             write_split_images(run_dir, "test", out)
-    shot = balls_job(cameras_around(1))
+    job = balls_job(cameras_around(1))
     with pytest.raises(DyngsError, match="picture of the capture"):
-        write_job_images(replace(shot, kept=frozenset({tmp_path / "new" / "frame_0000.png"})), tmp_path / "new")
+        write_job_images(replace(job, protected=frozenset({tmp_path / "new" / "frame_0000.png"})), tmp_path / "new")
     assert files_of(read_capture(load_resolved(run_dir).data)) >= {view.image_path.resolve() for view in views}
     assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
 

@@ -30,24 +30,24 @@ def some_gaussians(count: int = 50) -> Gaussians:
 @pytest.mark.parametrize("up", ["z", "-y", "x"])
 def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) -> None:
     file = write_ply(tmp_path / "a.ply", some_gaussians(), RasterizeMode.ANTIALIASED, eps2d=0.1)
-    shot = job_of_ply(file, RenderJobOptions(path, num_frames=5, size=(80, 60), up=up))
+    job = job_of_ply(file, RenderJobOptions(path, num_frames=5, size=(80, 60), up=up))
     axis = np.zeros(3)
     axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
-    means = torch.cat([shot.scene.gaussians.means, torch.ones(len(shot.scene), 1)], dim=1)
+    means = torch.cat([job.scene.gaussians.means, torch.ones(len(job.scene), 1)], dim=1)
     for i in range(5):
-        in_camera = (shot.path.cameras.cam_from_world[i] @ means.T).T[:, :3]
-        pixels = (shot.path.cameras.intrinsics[i] @ in_camera.T).T
+        in_camera = (job.path.cameras.cam_from_world[i] @ means.T).T[:, :3]
+        pixels = (job.path.cameras.intrinsics[i] @ in_camera.T).T
         pixels = pixels[:, :2] / pixels[:, 2:]
         inside = (in_camera[:, 2] > 0) & (pixels >= 0).all(dim=1) & (pixels <= torch.tensor([80, 60])).all(dim=1)
         assert inside.float().mean() > 0.9
-        picture_up = -shot.path.cameras.cam_from_world[i, 1, :3].numpy()
+        picture_up = -job.path.cameras.cam_from_world[i, 1, :3].numpy()
         assert picture_up @ axis > 0.5
-    assert shot.options.mode is RasterizeMode.ANTIALIASED
-    assert shot.options.eps2d == 0.1
-    assert shot.background is not None
-    assert torch.equal(shot.background, torch.zeros(3))
-    assert (shot.path.times, shot.notes) == (None, ())
-    assert shot.scene.is_still
+    assert job.options.mode is RasterizeMode.ANTIALIASED
+    assert job.options.eps2d == 0.1
+    assert job.background is not None
+    assert torch.equal(job.background, torch.zeros(3))
+    assert (job.path.times, job.notes) == (None, ())
+    assert job.scene.is_still
 
 
 def test_an_unknown_path_is_named(tmp_path: Path) -> None:
@@ -61,7 +61,7 @@ def test_an_unknown_path_is_named(tmp_path: Path) -> None:
 )
 def test_a_file_has_neither_times_nor_views(options: RenderJobOptions, tmp_path: Path) -> None:
     file = write_ply(tmp_path / "a.ply", some_gaussians())
-    with pytest.raises(DyngsError, match=r"a \.ply holds one moment and no views"):
+    with pytest.raises(DyngsError, match=r"a \.ply holds one time and no views"):
         job_of_ply(file, options)
 
 

@@ -34,13 +34,13 @@ def capture_of(run_dir: Path) -> Capture:
 
 @pytest.mark.parametrize("path", ["orbit", "spiral"])
 def test_time_runs_along_a_path_unless_told_otherwise(path: str, moving_run: Path, still_run: Path) -> None:
-    shot = job_of_run(moving_run, RenderJobOptions(path, 5))
-    assert shot.path.times == (0.0, 0.25, 0.5, 0.75, 1.0)
-    assert len(shot.notes) == 1
-    assert "from 0 to 1" in shot.notes[0]
+    job = job_of_run(moving_run, RenderJobOptions(path, 5))
+    assert job.path.times == (0.0, 0.25, 0.5, 0.75, 1.0)
+    assert len(job.notes) == 1
+    assert "from 0 to 1" in job.notes[0]
     frozen = job_of_run(moving_run, RenderJobOptions(path, 5, times=(0.4,)))
     assert frozen.path.times == (0.4,) * 5
-    assert torch.equal(frozen.path.cameras.cam_from_world, shot.path.cameras.cam_from_world)
+    assert torch.equal(frozen.path.cameras.cam_from_world, job.path.cameras.cam_from_world)
     together = job_of_run(moving_run, RenderJobOptions(path, 3, times=(1.0, 0.5, 0.0)))
     assert together.path.times == (1.0, 0.5, 0.0)
     assert (frozen.notes, together.notes) == ((), ())
@@ -49,9 +49,9 @@ def test_time_runs_along_a_path_unless_told_otherwise(path: str, moving_run: Pat
 
 
 def test_times_of_a_still_run_are_accepted_with_a_note(still_run: Path) -> None:
-    shot = job_of_run(still_run, RenderJobOptions("orbit", 3, times=(0.0, 0.5, 1.0)))
-    assert len(shot.path) == 3
-    assert "nothing moves" in shot.notes[0]
+    job = job_of_run(still_run, RenderJobOptions("orbit", 3, times=(0.0, 0.5, 1.0)))
+    assert len(job.path) == 3
+    assert "nothing moves" in job.notes[0]
 
 
 def test_times_outside_are_clamped_with_one_warning(moving_run: Path) -> None:
@@ -59,10 +59,10 @@ def test_times_outside_are_clamped_with_one_warning(moving_run: Path) -> None:
         RenderJobOptions("orbit", 3, times=(-1.0, 0.5, 9.0)),
         RenderJobOptions(None, times=(-1.0, 0.5, 9.0)),
     ):
-        shot = job_of_run(moving_run, options)
-        assert shot.path.times == (0.0, 0.5, 1.0)
-        assert len(shot.path.warnings) == 1
-        assert "clamped" in shot.path.warnings[0]
+        job = job_of_run(moving_run, options)
+        assert job.path.times == (0.0, 0.5, 1.0)
+        assert len(job.path.warnings) == 1
+        assert "clamped" in job.path.warnings[0]
 
 
 def test_times_of_a_file_are_overridden(moving_run: Path, tmp_path: Path) -> None:
@@ -82,12 +82,12 @@ def test_times_of_a_file_are_overridden(moving_run: Path, tmp_path: Path) -> Non
 def test_a_camera_that_stands_still(moving_run: Path) -> None:
     capture = capture_of(moving_run)
     wanted = PictureLoader(capture.splits["test"], DataConfig(root=capture.root))[1]
-    shot = job_of_run(moving_run, RenderJobOptions(None, times=(0.0, 0.5, 1.0), view="1"))
-    assert shot.path.times == (0.0, 0.5, 1.0)
-    assert (shot.path.cameras.width, shot.path.cameras.height) == (16, 16)
+    job = job_of_run(moving_run, RenderJobOptions(None, times=(0.0, 0.5, 1.0), view="1"))
+    assert job.path.times == (0.0, 0.5, 1.0)
+    assert (job.path.cameras.width, job.path.cameras.height) == (16, 16)
     for i in range(3):
-        torch.testing.assert_close(shot.path.cameras.cam_from_world[i], wanted.cameras.cam_from_world[0])
-        torch.testing.assert_close(shot.path.cameras.intrinsics[i], wanted.cameras.intrinsics[0])
+        torch.testing.assert_close(job.path.cameras.cam_from_world[i], wanted.cameras.cam_from_world[0])
+        torch.testing.assert_close(job.path.cameras.intrinsics[i], wanted.cameras.intrinsics[0])
     assert job_of_run(moving_run, RenderJobOptions(None, view="1")).path.times == (TEST_TIMES[1],)
     assert job_of_run(moving_run, RenderJobOptions(None, split="train", view="1")).path.times == (TRAIN_TIMES[1],)
     small = job_of_run(moving_run, RenderJobOptions(None, times=(0.5,), size=(8, 4))).path.cameras

@@ -72,8 +72,8 @@ def test_each_frame_shows_the_scene_at_its_time() -> None:
 
 def test_equal_times_deform_once() -> None:
     motion = Sliding()
-    shot = RenderJob(moving_scene(motion), static_path(camera(), (0.5, 0.5, 0.5, 0.7, 0.7)))
-    assert len(list(job_frames(shot))) == 5
+    job = RenderJob(moving_scene(motion), static_path(camera(), (0.5, 0.5, 0.5, 0.7, 0.7)))
+    assert len(list(job_frames(job))) == 5
     assert motion.calls == 2
 
 

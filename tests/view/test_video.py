@@ -12,8 +12,9 @@ from av.container import OutputContainer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dyngs.data.pictures.video import read_frames
 from dyngs.errors import DyngsError
-from dyngs.view.video import VideoWriter, read_frames
+from dyngs.view.video import VideoWriter
 
 
 def _picture(height: int, width: int, shift: int = 0) -> np.ndarray:

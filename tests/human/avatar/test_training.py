@@ -20,7 +20,7 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import load_run, save_checkpoint, stored_scene
-from dyngs.view.animation import at_rest, with_motion
+from dyngs.view.animation import in_rest_pose, with_motion
 
 BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.11)
 
@@ -179,7 +179,7 @@ def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> No
     assert len(own.run.scene.times) == 3
     first, again = run.scene.at(0.0), own.run.scene.at(0.0)
     torch.testing.assert_close(again.log_scales, first.log_scales, rtol=0, atol=1e-4)
-    rest = at_rest(run).scene
+    rest = in_rest_pose(run).scene
     assert rest.is_still
     spread = rest.at(None).means.amax(0) - rest.at(None).means.amin(0)
     assert float(spread[0]) > 1.5, "arms to the sides"
