@@ -1,4 +1,4 @@
-"""The demo: the whole of dyngs on an embedded moving scene, from pictures to a trained, measured, rendered model."""
+"""The demo: a built-in moving scene is trained, evaluated, rendered and exported."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ DEFAULT_OUT = Path("dyngs-demo")
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """How much the demo does.
+    """Size of the demo.
 
     Attributes:
-        steps: of training.
+        steps: training steps.
         threads: 0 = all cores.
         size: width and height of the pictures, pixels.
-        num_times: training pictures, one camera and one time each.
-        num_points: random points to start from.
-        num_frames: of the video.
+        num_times: number of training pictures, one camera and one time each.
+        num_points: number of random initial points.
+        num_frames: number of frames of the video.
     """
 
     steps: int = 3000
@@ -50,14 +50,14 @@ class DemoOptions:
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demo made.
+    """Results of the demo.
 
     Attributes:
-        folder: of everything below.
-        capture, run_dir, pictures: folders of the input, the model, the rendered test views.
-        sheet, video, ply: truth beside render, the flight around the scene, the model for other programs.
-        report: the metrics.
-        seconds: of everything.
+        folder: folder of everything below.
+        capture, run_dir, pictures: folders of the input, the run, and the rendered test views.
+        sheet, video, ply: contact sheet, orbit video, and the model for other programs.
+        report: metrics of the test views.
+        seconds: total time.
     """
 
     folder: Path
@@ -72,7 +72,7 @@ class DemoResult:
 
 
 def run_demo(out: Path = DEFAULT_OUT, options: DemoOptions = DemoOptions()) -> DemoResult:
-    """What was made in ``out``, or in ``out-2`` and so on where ``out`` holds something already.
+    """Run the demo in ``out``, or in ``out-2`` and so on if ``out`` is not empty.
 
     Raises:
         DyngsError: the folder cannot be written.
@@ -88,21 +88,21 @@ def _run_demo(folder: Path, options: DemoOptions, start: float) -> DemoResult:
     write_dynamic_capture("spin", capture, DynamicOptions(size=options.size, num_times=options.num_times, samples=3))
     print(f"[2/4] training {options.steps} steps into {run_dir}", flush=True)
     train(demo_config(capture, run_dir, options))
-    print("[3/4] measuring on pictures that were not trained on", flush=True)
+    print("[3/4] evaluating on held-out views", flush=True)
     report = evaluate_run(run_dir, threads=options.threads)
-    print("[4/4] rendering the test views and a flight around the moving scene", flush=True)
+    print("[4/4] rendering the test views and an orbit around the moving scene", flush=True)
     write_split_images(run_dir, "test", pictures)
-    shot = job_of_run(run_dir, RenderJobOptions("orbit", options.num_frames))
+    job = job_of_run(run_dir, RenderJobOptions("orbit", options.num_frames))
     video = folder / "orbit.mp4"
     output = OutputOptions(video=video)
-    write_job_images(shot, None, output)
+    write_job_images(job, None, output)
     ply = export_ply(run_dir, folder / "splats.ply")
     seconds = time.perf_counter() - start
     return DemoResult(folder, capture, run_dir, pictures, pictures / "sheet.png", video, ply, report, seconds)
 
 
 def demo_config(capture: Path, run_dir: Path, options: DemoOptions) -> Config:
-    """The packaged preset ``dynamic`` for the demo's capture and size."""
+    """Return the preset ``dynamic`` for the capture and size of the demo."""
     overrides = (
         "data.root=capture",
         f"init.num_random={options.num_points}",
@@ -118,7 +118,7 @@ def demo_config(capture: Path, run_dir: Path, options: DemoOptions) -> Config:
 
 
 def unused_folder(wanted: Path) -> Path:
-    """``wanted``, or ``wanted-2``, ``wanted-3``... : the first that does not exist or is empty; earlier results stay.
+    """Return the first of ``wanted``, ``wanted-2``, ``wanted-3``... that does not exist or is empty.
 
     Raises:
         DyngsError: a thousand are in use.
@@ -132,7 +132,7 @@ def unused_folder(wanted: Path) -> Path:
 
 @contextmanager
 def claimed_folder(wanted: Path) -> Iterator[Path]:
-    """An unused folder that no other demo takes while the block lasts."""
+    """Yield an unused folder, locked against other demos."""
     with ExitStack() as stack:
         for number in range(1, 1001):
             folder = unused_folder(wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}"))
@@ -152,7 +152,7 @@ def _is_unused(folder: Path) -> bool:
 
 
 def result_table(result: DemoResult) -> Table:
-    """What came out, in one row."""
+    """Return the results as a table with one row."""
     from rich.table import Table
 
     report = result.report
@@ -165,7 +165,7 @@ def result_table(result: DemoResult) -> Table:
         "MB": f"{report.model_mb:.1f}",
         "frames/s": f"{report.fps:.0f}",
         "training s": f"{report.seconds_train:.1f}",
-        "in all s": f"{result.seconds:.1f}",
+        "total s": f"{result.seconds:.1f}",
     }
     for name in cells:
         table.add_column(name, justify="right")

@@ -1,1 +1,1 @@
-"""Speed on this machine: the rasterizer alone, and the training steps of dynamic models."""
+"""Benchmarks: speed of the rasterizer and of training steps of dynamic models on this machine."""

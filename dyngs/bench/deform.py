@@ -1,4 +1,4 @@
-"""What a deformation field costs in training, and what the static split saves."""
+"""Benchmark of a deformation field in training, with and without the split into moving and static Gaussians."""
 
 from __future__ import annotations
 
@@ -24,19 +24,20 @@ from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
 from dyngs.training.trainer import Trainer
 
-VARIANTS = ("nothing moves", "what moves, moves", "everything moves")
+VARIANTS = ("no field", "moving Gaussians", "all Gaussians")
+"""What the field deforms: nothing, the moving Gaussians, or all of them (no static split)."""
 STEPS_PER_ROUND = 5
 FIELD_STAGES = ("field forward", "field backward", "field penalties", "field Adam")
 
 
 @dataclass(frozen=True)
 class DeformLoad:
-    """What is measured: a configuration, and which of its Gaussians move.
+    """A configuration to measure, and the share of its Gaussians that move.
 
     Attributes:
-        config: of a dynamic model.
-        run_dir: start from this run's checkpoint; None = untrained Gaussians.
-        moving_share: of an untrained load.
+        config: configuration of a dynamic model.
+        run_dir: run whose checkpoint to start from; None: untrained Gaussians.
+        moving_share: share of moving Gaussians without a run.
     """
 
     config: Config
@@ -46,12 +47,14 @@ class DeformLoad:
 
 @dataclass(frozen=True)
 class DeformReport:
-    """Medians, milliseconds, of whole training steps taken in turn, and of the field's own stages.
+    """Median times in milliseconds.
 
     Attributes:
-        steps: variant to the time of a step.
-        stages: stage to its time for the moving Gaussians alone.
-        field_share: of a step in which what moves, moves.
+        isa: instruction set of the kernels.
+        kind: kind of the field.
+        steps: time of a training step by variant, interleaved.
+        stages: time by stage of the field, for the moving Gaussians.
+        field_share: share of the field in a step with the moving Gaussians.
     """
 
     isa: str
@@ -69,7 +72,7 @@ class DeformReport:
 
 
 def load_of_run(run_dir: Path) -> DeformLoad:
-    """The load of a trained dynamic run. Raises DyngsError if it has no field."""
+    """Return the load of a trained dynamic run. Raises DyngsError if it has no field."""
     run = load_run(run_dir)
     if field_of(run.config) is None or run.scene.is_still:
         raise DyngsError(f"{run_dir}: nothing moves in this run; give one of a dynamic model, or none")
@@ -77,7 +80,7 @@ def load_of_run(run_dir: Path) -> DeformLoad:
 
 
 def synthetic_load(folder: Path, num_gaussians: int, moving_share: float, kind: str) -> DeformLoad:
-    """A load without a run: random Gaussians before a small room, which is written into ``folder``."""
+    """Return a load without a run: random Gaussians and a small room, which is written into ``folder``."""
     write_dynamic_capture("room", folder, DynamicOptions(size=200, num_times=4, num_cameras=3, samples=1))
     config = Config.model_validate(
         {
@@ -90,10 +93,10 @@ def synthetic_load(folder: Path, num_gaussians: int, moving_share: float, kind: 
 
 
 def bench_deform(load: DeformLoad, threads: int, rounds: int) -> DeformReport:
-    """Step times of the three variants, taken in turn so that noise hits them alike.
+    """Measure step times of the three variants, interleaved so that other load affects them alike.
 
     Raises:
-        DyngsError: the run's capture is gone.
+        DyngsError: the capture of the run is missing.
     """
     with kernel_threads(threads):
         trainers = {name: _trainer(load, name) for name in VARIANTS}
@@ -102,7 +105,7 @@ def bench_deform(load: DeformLoad, threads: int, rounds: int) -> DeformReport:
             for name, trainer in trainers.items():
                 for _ in range(STEPS_PER_ROUND):
                     seconds = _seconds(trainer.step)
-                    if number:  # the first round warms up
+                    if number:  # warm-up
                         samples[name].append(seconds)
         trainer = trainers[VARIANTS[1]]
         num_gaussians = trainer.num_gaussians
@@ -118,7 +121,7 @@ def bench_deform(load: DeformLoad, threads: int, rounds: int) -> DeformReport:
 
 
 def format_report(report: DeformReport) -> str:
-    """The report as text."""
+    """Return the report as text."""
     share = report.num_moving / max(report.num_gaussians, 1)
     lines = [
         f"{report.kind}: {report.num_gaussians:,} Gaussians, {report.num_moving:,} ({share:.1%}) move; "
@@ -135,7 +138,7 @@ def format_report(report: DeformReport) -> str:
 
 
 def write_report(report: DeformReport, path: Path) -> None:
-    """Write the figures as JSON."""
+    """Write the report as JSON."""
     write_text(path, json.dumps(asdict(report) | {"field_share": report.field_share}, indent=2) + "\n")
 
 
@@ -147,19 +150,21 @@ def _field(config: Config) -> DeformField:
 
 
 def _trainer(load: DeformLoad, variant: str) -> Trainer:
-    """Return a trainer at the end of its run, its schedules over, in which the right Gaussians move."""
+    """Return a trainer after the last step of its schedules, in which the Gaussians of the variant move."""
     trainer = assemble(load.config)
     if load.run_dir is not None:
         trainer.restore(latest_checkpoint(load.run_dir))
     trainer.done = load.config.train.steps
     scene = _dynamic(trainer)
+    device = scene.gaussians.means.device
     if variant == VARIANTS[0]:
         trainer.scene = replace(scene, field=None, moving=scene.moving[:0])
     elif variant == VARIANTS[2] or load.run_dir is None:
         share = 1.0 if variant == VARIANTS[2] else load.moving_share
-        rows = torch.arange(round(share * len(scene)))
-        setup = FieldSetup(torch.zeros(3), torch.ones(3), len(scene.times), len(rows), trainer.extent)
-        field = new_field(_field(load.config), setup, torch.Generator().manual_seed(0))
+        rows = torch.arange(round(share * len(scene)), device=device)
+        low, high = torch.zeros(3, device=device), torch.ones(3, device=device)
+        setup = FieldSetup(low, high, len(scene.times), len(rows), trainer.extent)
+        field = new_field(_field(load.config), setup, torch.Generator("cpu").manual_seed(0))
         trainer.scene = replace(scene, field=field, moving=rows)
     return trainer
 
@@ -173,7 +178,7 @@ def _dynamic(trainer: Trainer) -> DynamicScene:
 
 
 def _field_stages(trainer: Trainer, rounds: int) -> dict[str, float]:
-    """Milliseconds of the field's own stages."""
+    """Measure the stages of the field, in milliseconds."""
     scene = _dynamic(trainer)
     field = scene.field
     if field is None:

@@ -1,4 +1,4 @@
-"""How fast the kernels are on this machine, next to what its matrix product reaches."""
+"""Benchmark of the rasterizer, next to a matrix product on the same machine."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ STAGES = ("project", "bin + sort", "blend", "blend backward", "project backward"
 
 @dataclass(frozen=True)
 class Workload:
-    """Gaussians and one camera, as the kernels take them.
+    """Gaussians and one camera, as inputs of the kernels.
 
     Attributes:
         means, quats, scales: (N, 3), (N, 4), (N, 3).
@@ -52,12 +52,12 @@ class Workload:
 
 @dataclass(frozen=True)
 class StageTimes:
-    """Medians over the repeats, at one number of threads.
+    """Times over the repeats, at one number of threads.
 
     Attributes:
-        threads: of the kernels and of the matrix product.
-        milliseconds: stage name to time.
-        fastest: the same, best of the repeats.
+        threads: threads of the kernels and of the matrix product.
+        milliseconds: median time by stage.
+        fastest: shortest time by stage.
         sgemm_gflops: rate of a float32 matrix product of 2048 x 2048, measured between the repeats.
     """
 
@@ -73,12 +73,13 @@ class StageTimes:
 
 @dataclass(frozen=True)
 class RasterizeReport:
-    """What ``dyngs bench rasterize`` measured.
+    """Results of ``dyngs bench rasterize``.
 
     Attributes:
-        pairs: (pixel, Gaussian) pairs that were blended.
+        entries: number of (tile, Gaussian) pairs.
+        pairs: number of blended (pixel, Gaussian) pairs.
         lanes_used: share of the computed pairs that were blended.
-        entries: (tile, Gaussian) pairs.
+        runs: times per number of threads.
     """
 
     isa: str
@@ -93,7 +94,7 @@ class RasterizeReport:
 
 
 def garden_workload(path: Path) -> Workload:
-    """gsplat's benchmark: the points within 2 units of the origin, with random shapes and opacities, first camera.
+    """Read the workload of gsplat's benchmark: points within 2 units of the origin with random shapes, first camera.
 
     Raises:
         DyngsError: the file is missing or holds something else.
@@ -113,26 +114,28 @@ def garden_workload(path: Path) -> Workload:
 
 
 def random_workload(num_gaussians: int = 110_000) -> Workload:
-    """The same kind of load without a file: a plate of points seen at an angle."""
-    generator = torch.Generator().manual_seed(0)
-    means = (torch.rand(num_gaussians, 3, generator=generator) - 0.5) * torch.tensor([4.0, 4.0, 1.0])
-    view = torch.eye(4)
+    """Return a similar workload without a file: a plate of random points."""
+    generator = torch.Generator("cpu").manual_seed(0)
+    size = torch.tensor([4.0, 4.0, 1.0], device="cpu")
+    means = (torch.rand(num_gaussians, 3, generator=generator, device="cpu") - 0.5) * size
+    view = torch.eye(4, device="cpu")
     view[2, 3] = 3.0
-    intrinsics = torch.tensor([[480.0, 0, 324], [0, 480, 210], [0, 0, 1]])
-    colors = torch.rand(1, num_gaussians, 3, generator=generator)
+    intrinsics = torch.tensor([[480.0, 0, 324], [0, 480, 210], [0, 0, 1]], device="cpu")
+    colors = torch.rand(1, num_gaussians, 3, generator=generator, device="cpu")
     return _with_random_shapes(means, colors, Cameras(view[None], intrinsics[None], 648, 420))
 
 
 def _with_random_shapes(means: Tensor, colors: Tensor, cameras: Cameras) -> Workload:
-    generator = torch.Generator().manual_seed(42)
+    generator = torch.Generator("cpu").manual_seed(42)
     n = len(means)
-    scales = torch.rand(n, 3, generator=generator) * 0.02
-    quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=generator), dim=-1)
-    return Workload(means, quats, scales, torch.rand(n, generator=generator), colors.contiguous(), cameras)
+    scales = torch.rand(n, 3, generator=generator, device="cpu") * 0.02
+    quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=generator, device="cpu"), dim=-1)
+    opacities = torch.rand(n, generator=generator, device="cpu")
+    return Workload(means, quats, scales, opacities, colors.contiguous(), cameras)
 
 
 def bench_rasterize(load: Workload, threads: list[int], repeats: int) -> RasterizeReport:
-    """Times of every stage, all stages and thread counts taken in turn so that noise hits them alike."""
+    """Measure every stage, interleaved over thread counts so that other load affects them alike."""
     with torch.no_grad():
         projection = project(load.means, load.quats, load.scales, load.opacities, load.cameras, _LIMITS)
     opacities = load.opacities[None]
@@ -144,7 +147,7 @@ def bench_rasterize(load: Workload, threads: list[int], repeats: int) -> Rasteri
     for repeat in range(repeats + 2):
         for count in threads:
             taken = _time_stages(load, projection, entries, count)
-            if repeat >= 2:  # the first two warm caches and allocator
+            if repeat >= 2:  # the first two warm up caches and allocator
                 for name, seconds in taken.items():
                     samples[count][name].append(seconds)
     return RasterizeReport(
@@ -164,7 +167,7 @@ _LIMITS = ProjectionOptions(near=0.01)
 
 
 def _time_stages(load: Workload, projection: Projection, entries: TileEntries, threads: int) -> dict[str, float]:
-    """Seconds of each stage, once."""
+    """Run each stage once and return its seconds."""
     leaves = [x.clone().requires_grad_() for x in (load.means, load.quats, load.scales)]
     splats = [projection.means2d, projection.factors, load.opacities[None], load.colors]
     means2d, factors, opacities, colors = (x.clone().requires_grad_() for x in splats)
@@ -188,7 +191,7 @@ def _time_stages(load: Workload, projection: Projection, entries: TileEntries, t
 
 
 def _timed(work: Callable[[], T]) -> tuple[float, T]:
-    """Seconds that ``work`` took, and its result."""
+    """Run ``work``; return its seconds and its result."""
     start = time.perf_counter()
     result = work()
     return time.perf_counter() - start, result
@@ -197,8 +200,8 @@ def _timed(work: Callable[[], T]) -> tuple[float, T]:
 def _sgemm_seconds(threads: int) -> float:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
-    a = torch.ones(SGEMM_SIZE, SGEMM_SIZE)
-    _timed(lambda: a @ a)  # wakes the threads up
+    a = torch.ones(SGEMM_SIZE, SGEMM_SIZE, device="cpu")
+    _timed(lambda: a @ a)  # starts the threads
     seconds, _ = _timed(lambda: a @ a)
     torch.set_num_threads(before)
     return seconds
@@ -211,12 +214,12 @@ def _summary(threads: int, samples: dict[str, list[float]]) -> StageTimes:
 
 
 def write_report(report: RasterizeReport, path: Path) -> None:
-    """Write the figures as JSON."""
+    """Write the report as JSON."""
     write_text(path, json.dumps(asdict(report), indent=2) + "\n")
 
 
 def format_report(report: RasterizeReport) -> str:
-    """The report as text."""
+    """Return the report as text."""
     lines = [
         f"{report.num_gaussians:,} Gaussians, {report.num_visible:,} visible at {report.width}x{report.height}, "
         f"{report.entries:,} tile entries, {report.pairs / 1e6:.1f} M blended pairs, "

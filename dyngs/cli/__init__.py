@@ -1,4 +1,4 @@
-"""The ``dyngs`` command: one verb per module of this package.
+"""The ``dyngs`` command: one module of this package per subcommand.
 
 Every module offers ``add_parser(commands)`` and a ``run(arguments) -> int``. What is heavy (torch, the native core,
 readers) is imported inside ``run``, so that ``dyngs --help`` is instant.
@@ -34,7 +34,7 @@ _OVERRIDE = re.compile(r"[a-z]\w*(\.\w+)+=.*", re.DOTALL)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit code of the command line ``argv`` (default: the process's own arguments)."""
+    """Run the command line ``argv`` (default: ``sys.argv``) and return the exit code."""
     arguments, debug = _without_debug(list(sys.argv[1:] if argv is None else argv))
     _show_any_name()
     try:
@@ -58,14 +58,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _without_debug(arguments: list[str]) -> tuple[list[str], bool]:
-    """The arguments without ``--debug``, which may stand anywhere before a ``--``, and whether it was there."""
+    """Return the arguments without ``--debug``, which may stand anywhere before ``--``, and whether it was given."""
     end = arguments.index("--") if "--" in arguments else len(arguments)
     kept = [word for word in arguments[:end] if word != "--debug"]
     return kept + arguments[end:], len(kept) < end
 
 
 def _show_any_name() -> None:
-    """Let stdout show names of files that are no valid text as escapes, as stderr does."""
+    """Print file names that are not valid text with escapes on stdout, as stderr does."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 
@@ -88,7 +88,7 @@ def _dispatch(arguments: list[str]) -> int:
 
 
 def _parsed(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.Namespace:
-    """``arguments`` by their names; overrides may stand anywhere, also after options, where argparse takes none."""
+    """Parse arguments; overrides may stand anywhere, also after options, where argparse allows none."""
     parsed, rest = parser.parse_known_args(arguments)
     overrides = getattr(parsed, "overrides", None)
     unknown = [word for word in rest if overrides is None or not _OVERRIDE.fullmatch(word)]
@@ -100,21 +100,21 @@ def _parsed(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.N
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose complaints are one line."""
+    """A parser whose errors are one line."""
 
     def error(self, message: str) -> NoReturn:
         raise DyngsError(f"{printable(message, 400)} (see `{self.prog} --help`)")
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The parser of all commands."""
+    """Return the parser of all commands."""
     return _add_commands(
         _Parser(prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU.")
     )
 
 
 def _add_commands(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
-    parser.add_argument("--debug", action="store_true", help="before the line of an error, show where it comes from")
+    parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for module in (demo, train, prune, predict, evaluate, render, export, tradeoff, data, bench, doctor):
@@ -130,7 +130,7 @@ def _fail(message: str) -> int:
 
 
 def _abandon_if_broken(stream: TextIO) -> None:
-    """Point a stream to nowhere if it takes no more, because the interpreter would complain about that at its end."""
+    """Redirect a broken stream to the null device, because the interpreter would fail to flush it at exit."""
     try:
         stream.flush()
     except OSError:

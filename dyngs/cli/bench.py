@@ -1,4 +1,4 @@
-"""``dyngs bench``: how fast the kernels and the training steps are on this machine."""
+"""``dyngs bench``: speed of the kernels and of training steps on this machine."""
 
 from __future__ import annotations
 
@@ -13,22 +13,35 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = commands.add_parser("bench", help="measure the speed of the rasterizer or of a deformation field")
     stages = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
     raster = stages.add_parser("rasterize", help="projection, binning and blending, forward and backward")
-    raster.add_argument("--points", type=Path, metavar="NPZ", help="means3d, colors, viewmats, Ks, width, height")
-    raster.add_argument("--threads", type=int, nargs="+", metavar="N", help="default: 1 and all cores")
-    raster.add_argument("--repeats", type=int, default=30, metavar="N", help="medians are taken over (default 30)")
-    raster.set_defaults(run=run_rasterize)
-    deform = stages.add_parser("deform", help="the field's share of a training step, with and without the static split")
-    deform.add_argument("run_dir", type=Path, nargs="?", metavar="RUN", help="a dynamic run; default: random Gaussians")
-    deform.add_argument(
-        "--kind", choices=("hexplane", "mlp", "trajectory", "control_nodes"), default="hexplane", help="without RUN"
+    raster.add_argument(
+        "--points", type=Path, metavar="NPZ", help="points and cameras of gsplat's benchmark (default: random points)"
     )
-    deform.add_argument("--gaussians", type=int, default=50_000, metavar="N", help="without RUN (default 50000)")
-    deform.add_argument("--moving", type=float, default=0.1, metavar="SHARE", help="without RUN (default 0.1)")
-    deform.add_argument("--threads", type=int, metavar="N", help="default: all cores")
-    deform.add_argument("--repeats", type=int, default=10, metavar="N", help="rounds of five steps each (default 10)")
+    raster.add_argument(
+        "--threads", type=int, nargs="+", metavar="N", help="numbers of threads (default: 1 and all cores)"
+    )
+    raster.add_argument("--repeats", type=int, default=30, metavar="N", help="repetitions (default 30)")
+    raster.set_defaults(run=run_rasterize)
+    deform = stages.add_parser(
+        "deform", help="share of the field in a training step, with and without the static split"
+    )
+    deform.add_argument(
+        "run_dir", type=Path, nargs="?", metavar="RUN", help="run folder of a dynamic model (default: random Gaussians)"
+    )
+    deform.add_argument(
+        "--kind",
+        choices=("hexplane", "mlp", "trajectory", "control_nodes"),
+        default="hexplane",
+        help="field without RUN (default hexplane)",
+    )
+    deform.add_argument("--gaussians", type=int, default=50_000, metavar="N", help="number without RUN (default 50000)")
+    deform.add_argument(
+        "--moving", type=float, default=0.1, metavar="SHARE", help="moving share without RUN (default 0.1)"
+    )
+    deform.add_argument("--threads", type=int, metavar="N", help="number of threads (default: all cores)")
+    deform.add_argument("--repeats", type=int, default=10, metavar="N", help="repetitions of five steps (default 10)")
     deform.set_defaults(run=run_deform)
     for one in (raster, deform):
-        one.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
+        one.add_argument("--json", type=Path, metavar="FILE", help="write the results as JSON, too")
 
 
 def run_rasterize(arguments: argparse.Namespace) -> int:

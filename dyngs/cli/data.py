@@ -1,4 +1,4 @@
-"""``dyngs data``: look at a capture, estimate poses, convert a motion, make a synthetic capture."""
+"""``dyngs data``: inspect a capture, estimate poses, convert a motion, write a synthetic capture."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ SYNTHETIC_SCENES = ("still", "spin", "wave", "merge", "room", "human")
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``data`` and its own commands to the commands."""
-    parser = commands.add_parser("data", help="inspect a capture, estimate poses, convert a motion, synthesise")
+    parser = commands.add_parser(
+        "data", help="inspect a capture, estimate poses, convert a motion, write a synthetic capture"
+    )
     verbs = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_inspect(verbs)
     _add_sfm(verbs)
@@ -30,15 +32,17 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def _add_inspect(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "inspect",
-        help="what a capture holds and what is suspicious about it",
+        help="report what a capture holds and what is suspicious about it",
         description="Report views, sizes, intrinsics, times, points, masks, and everything suspicious.",
     )
     parser.add_argument("path", type=Path, metavar="PATH", help="capture folder")
-    parser.add_argument("overrides", nargs="*", metavar="data.key=value", help="such as data.follow_links=true")
+    parser.add_argument(
+        "overrides", nargs="*", metavar="data.key=value", help="keys of data, such as data.follow_links=true"
+    )
     formats = ("auto", "blender", "nerfstudio", "colmap", "nerfies", "llff", "camera_folders")
     people = ("body_json", "zju_mocap", "people_snapshot", "neuman")
     parser.add_argument("--format", choices=(*formats, *people), default="auto")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw cameras and points into this picture")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw cameras and points to this picture file")
     parser.add_argument("--deep", action="store_true", help="decode every picture in full (slow)")
     parser.set_defaults(run=run_inspect)
 
@@ -46,14 +50,16 @@ def _add_inspect(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "sfm",
-        help="estimate poses of photos or of a video",
-        description="Estimate camera poses with COLMAP's structure from motion; OUT can then be trained on.",
+        help="estimate camera poses of photos or a video",
+        description="Estimate camera poses with COLMAP's structure from motion. OUT is a capture for `dyngs train`.",
     )
     parser.add_argument("images", type=Path, metavar="IMAGES", help="folder of photos, or a video file")
     parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
-    parser.add_argument("--frames", type=int, default=100, metavar="N", help="taken from a video (default 100)")
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="0 = all cores")
+    parser.add_argument(
+        "--frames", type=int, default=100, metavar="N", help="number of frames to take from a video (default 100)"
+    )
+    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
     parser.add_argument("overrides", nargs="*", metavar="data.key=value", help="data.follow_links, data.max_megapixels")
     parser.set_defaults(run=run_sfm)
 
@@ -61,43 +67,43 @@ def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
 def _add_motion(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "motion",
-        help="convert a motion of AMASS, BVH or glTF into one of the body template",
-        description="Read how a body moves, retarget it to the template if it was made for another skeleton, and write "
-        "it as an .npz in the layout of AMASS SMPL-X, y up.",
+        help="convert an AMASS, BVH or glTF motion to the body template",
+        description="Read a motion, retarget it to the template if it has another skeleton, and write it as .npz in "
+        "the layout of AMASS SMPL-X, y up.",
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help="an AMASS .npz, a .bvh, a .glb or a .gltf")
+    parser.add_argument("file", type=Path, metavar="FILE", help="AMASS .npz, .bvh, .glb or .gltf")
     parser.add_argument("out", type=Path, metavar="OUT.npz", help="a new file")
     parser.add_argument("--fps", type=float, metavar="F", help="resample to F frames per second (default: as in FILE)")
     parser.add_argument("--up", choices=("auto", "y", "z"), default="auto", help="up axis of an .npz (default auto)")
-    parser.add_argument("--clip", metavar="NAME", help="animation of a glTF file that has several")
-    parser.add_argument("--body", type=Path, metavar="BODY", help="body template (default: the one of dyngs)")
+    parser.add_argument("--clip", metavar="NAME", help="name of the animation if a glTF file has several")
+    parser.add_argument("--body", type=Path, metavar="BODY", help="body template file (default: the template of dyngs)")
     parser.set_defaults(run=run_motion)
 
 
 def _add_synth(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "synth",
-        help="write an embedded synthetic scene as a capture",
-        description="Ray trace an embedded scene into a capture in the layout of NeRF-synthetic, or of D-NeRF if it "
+        help="write a small synthetic scene as a capture",
+        description="Ray trace a built-in scene to a capture in the layout of NeRF-synthetic, or of D-NeRF if it "
         "moves. still: a still life. spin: a turning die and a rolling ball. wave: a rippling cloth. merge: balls that "
-        "appear, merge and vanish. room: video of fixed cameras of a still room in which one ball hops. human: a "
-        "walking person from all around, with the exact parameters of the body.",
+        "appear, merge and vanish. room: videos of a static room with one hopping ball, from fixed cameras. human: a "
+        "walking person from all around, with exact body parameters.",
     )
     parser.add_argument("scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES))
     parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
     parser.add_argument("--size", type=int, default=128, metavar="PX", help="width and height (default 128)")
     parser.add_argument(
-        "--views", type=int, metavar="N", help="training views, of room and human times (default 48, of human 12)"
+        "--views", type=int, metavar="N", help="training views; for room and human: times (default 48, for human 12)"
     )
-    parser.add_argument("--cameras", type=int, metavar="N", help="training cameras of room and human (default 8)")
+    parser.add_argument("--cameras", type=int, metavar="N", help="training cameras for room and human (default 8)")
     parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="places the cameras, of human colours the clothes (default 0)"
+        "--seed", type=int, default=0, metavar="N", help="random seed of cameras, for human of the clothes (default 0)"
     )
     parser.set_defaults(run=run_synth)
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
-    """Print the report on a capture, and draw it if asked to."""
+    """Print a report on a capture, and draw it if asked to."""
     from dyngs.data.inspection.report import format_report, inspect_capture
 
     given = {"root": arguments.path, "format": arguments.format}
@@ -117,7 +123,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
 
 def _keys_of_data(overrides: list[str]) -> DataConfig:
-    """What ``data.key=value`` say; the root is none."""
+    """Return the data section with overrides ``data.key=value``; its root has no meaning."""
     from dyngs.config.io import load_config
 
     other = [
@@ -129,7 +135,7 @@ def _keys_of_data(overrides: list[str]) -> DataConfig:
 
 
 def run_sfm(arguments: argparse.Namespace) -> int:
-    """Estimate poses and say how to train on them."""
+    """Estimate poses and print the next commands."""
     from dyngs.data.prepare.sfm import SfmOptions, estimate_poses
 
     limits = _keys_of_data(arguments.overrides)
@@ -148,7 +154,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
 
 
 def run_motion(arguments: argparse.Namespace) -> int:
-    """Convert the motion and say what it is."""
+    """Convert the motion and print a summary."""
     from dyngs.human.motion.amass import write_amass
     from dyngs.human.motion.read import read_motion
     from dyngs.human.template.body_reader import read_body
@@ -167,7 +173,7 @@ def run_motion(arguments: argparse.Namespace) -> int:
 
 
 def _summary(motion: Motion) -> str:
-    """Frames, seconds, how many joints change their angle, and how fast the root gets."""
+    """Return frames, seconds, the number of joints that turn, and the largest speed of the root."""
     count, joints = motion.poses.shape[:2]
     turning = int(((motion.poses - motion.poses[:1]).norm(dim=-1).amax(0) > 1e-3).sum())
     speeds = motion.trans.diff(dim=0).norm(dim=-1) * motion.fps
@@ -177,7 +183,7 @@ def _summary(motion: Motion) -> str:
 
 
 def run_synth(arguments: argparse.Namespace) -> int:
-    """Write the capture and say how to train on it."""
+    """Write the capture and print the command that trains on it."""
     from dyngs.data.synthetic import captures as synthetic
 
     out: Path = arguments.out

@@ -1,4 +1,4 @@
-"""``dyngs demo``: everything at once, on a scene that comes with dyngs."""
+"""``dyngs demo``: train, evaluate, render and export a built-in moving scene."""
 
 from __future__ import annotations
 
@@ -13,17 +13,19 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``demo`` to the commands."""
     parser = commands.add_parser(
         "demo",
-        help="train, measure and render an embedded moving scene",
-        description="Ray trace a small moving scene, train on it, measure, render pictures and a video, write a .ply.",
+        help="train, evaluate and render a built-in moving scene",
+        description="Ray trace a small moving scene, train on it, evaluate, render pictures and a video, write a .ply.",
     )
-    parser.add_argument("--out", type=Path, default=Path("dyngs-demo"), metavar="DIR", help="default dyngs-demo")
-    parser.add_argument("--steps", type=int, default=3000, metavar="N", help="of training (default 3000)")
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="0 = all cores")
+    parser.add_argument(
+        "--out", type=Path, default=Path("dyngs-demo"), metavar="DIR", help="output folder (default dyngs-demo)"
+    )
+    parser.add_argument("--steps", type=int, default=3000, metavar="N", help="training steps (default 3000)")
+    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the demo, print the table and where the files are."""
+    """Run the demo and print the results and the paths of the files."""
     if arguments.steps < 1 or arguments.threads < 0:
         raise DyngsError("--steps must be at least 1, --threads at least 0")
     from rich.console import Console
@@ -34,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     Console().print(result_table(result))
     print(f"truth, render, error  {result.sheet}")
     print(f"test views            {result.pictures}")
-    print(f"flight around it      {result.video}")
+    print(f"orbit video           {result.video}")
     print(f"for other viewers     {result.ply}")
     print(f"run folder            {result.run_dir}  (more pictures: dyngs render {result.run_dir} --out DIR)")
     return 0

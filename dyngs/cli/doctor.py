@@ -1,4 +1,4 @@
-"""``dyngs doctor``: what this installation is made of, and whether it can work."""
+"""``dyngs doctor``: versions and state of this installation."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def examine() -> Iterator[Finding]:
-    """What is installed, row by row."""
+    """Yield the rows of the report."""
     yield Finding("dyngs", _version("dyngs") or "not installed (run from a source folder)")
     yield Finding("python", f"{platform.python_version()} on {platform.platform()}")
     yield Finding("cores", f"{_usable_cores()} usable of {os.cpu_count()}")
@@ -96,7 +96,7 @@ def _examine_core() -> Iterator[Finding]:
 
 
 def openmp_runtimes() -> list[Path] | None:
-    """The OpenMP runtimes loaded in this process (more than one fight over the cores); None where that is unknown."""
+    """Return the OpenMP runtimes loaded in this process (several compete for the cores); None where unknown."""
     maps = Path("/proc/self/maps")
     if not maps.is_file():
         return None

@@ -1,4 +1,4 @@
-"""``dyngs eval``: how good a run is on pictures that it has not seen."""
+"""``dyngs eval``: quality metrics of a run on held-out views."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``eval`` to the commands."""
     parser = commands.add_parser(
         "eval",
-        help="measure a run on held-out pictures",
-        description="Measure a run; prints a table and writes metrics.json (metrics_SPLIT.json for another split).",
+        help="evaluate a run on held-out views",
+        description="Evaluate a run. Prints a table and writes metrics.json (metrics_SPLIT.json for another split).",
     )
-    parser.add_argument("run_dir", type=Path, metavar="RUN", help="folder that `dyngs train` wrote")
-    parser.add_argument("--split", choices=("test", "val", "train", "pose"), default="test")
+    parser.add_argument("run_dir", type=Path, metavar="RUN", help="run folder written by `dyngs train`")
+    parser.add_argument("--split", choices=("test", "val", "train", "pose"), default="test", help="default test")
     parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="0 = all cores")
+    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Evaluate and print."""
+    """Evaluate and print a table."""
     from rich.console import Console
 
     from dyngs.evaluate.report import evaluate_run, report_path
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def report_table(report: EvalReport) -> Table:
-    """The means of a report as a table of two columns, with the reason where a value is missing."""
+    """Return a table of the mean metrics, with the reason where one is missing."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -75,7 +75,7 @@ def report_table(report: EvalReport) -> Table:
 
 
 def _rows_over_time(report: EvalReport) -> list[tuple[str, str]]:
-    """Labels and values of what only a capture with times has."""
+    """Return labels and values of the metrics over time."""
     if not report.psnr_per_time:
         return []
     values = [at.psnr for at in report.psnr_per_time]

@@ -1,4 +1,4 @@
-"""``dyngs predict``: a person from a few pictures, by a network that was trained on others."""
+"""``dyngs predict``: predict a person from a few pictures with a network trained on other people."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ examples:
   dyngs predict runs/net captures/ann --out runs/ann
   dyngs predict runs/net captures/ann --out runs/ann --views f000_c00.png,f000_c03.png,f000_c06.png
   dyngs eval runs/ann
-  dyngs train --resume runs/ann                                            goes on from the prediction
+  dyngs train --resume runs/ann                                            continues from the prediction
 """
 
 
@@ -19,34 +19,34 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``predict`` to the commands."""
     parser = commands.add_parser(
         "predict",
-        help="a person from a few pictures, without training on them",
-        description="Predict an avatar from a few training views of a capture; writes a run folder of model.kind=human "
-        "that all other commands take.",
+        help="predict a person from a few pictures, without training",
+        description="Predict an avatar from a few training views of a capture. Writes a run folder (model.kind=human) "
+        "for all other commands.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("network", type=Path, metavar="NET_RUN", help="run folder of model.kind=human_predictor")
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="a capture of a person, with body parameters")
-    parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="a new run folder")
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="capture of a person, with body parameters")
+    parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="new run folder")
     parser.add_argument(
         "--views",
         type=parse_views,
         default=3,
         metavar="N|NAME,..",
-        help="how many views to predict from, or which (default 3)",
+        help="number or names of the views to predict from (default 3)",
     )
     parser.set_defaults(run=run)
 
 
 def parse_views(text: str) -> int | tuple[str, ...]:
-    """A number of views, or their names."""
+    """Return a number of views, or their names."""
     if text.lstrip("-").isdigit():
         return int(text)
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Predict, and say how long it took and what to do next."""
+    """Predict, and print timings and the next commands."""
     from dyngs.api.predict import predict_person
 
     out: Path = arguments.out

@@ -1,4 +1,4 @@
-"""``dyngs prune``: a run with a fraction of its Gaussians."""
+"""``dyngs prune``: remove the least important Gaussians of a run and fine-tune the rest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dyngs train``: from a capture to a run folder."""
+"""``dyngs train``: train a model from a capture."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ examples:
 
 CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip, dynamic,
 human, human_predictor.
-All keys are listed in docs/cli.md; a wrong one is answered with what is allowed.
+All keys are listed in docs/cli.md.
 """
 
 
@@ -29,17 +29,17 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = commands.add_parser(
         "train",
         help="train a model from a capture",
-        description="Train a model from a capture; writes a run folder (default runs/NAME).",
+        description="Train a model from a capture. Writes a run folder (default runs/NAME).",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("overrides", nargs="*", metavar="CONFIG key=value", help="preset and overrides")
-    parser.add_argument("--resume", type=Path, metavar="RUN", help="go on with an interrupted run")
+    parser.add_argument("overrides", nargs="*", metavar="CONFIG key=value", help="preset or YAML file, and overrides")
+    parser.add_argument("--resume", type=Path, metavar="RUN", help="continue an interrupted run")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train, and say what to do next."""
+    """Train and print the next commands."""
     config = parse_config(arguments.overrides, arguments.resume)
     from dyngs.api.train import train
 
@@ -51,14 +51,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _next(folder: Path, config: Config) -> str:
-    """What to do with the run."""
+    """Return the next commands for a run."""
     if config.model.kind == "human_predictor":
         return f"next:    dyngs predict {folder} CAPTURE --out RUN"
     return f"next:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/pictures"
 
 
 def _about_motion(folder: Path, config: Config) -> list[str]:
-    """What a dynamic model found to move."""
+    """Return lines about the moving part of a dynamic model."""
     from dyngs.config.kinds import freezes_below_px
     from dyngs.runs.checkpoint import load_run
 
@@ -74,7 +74,7 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
 
 
 def parse_config(words: Sequence[str], resume: Path | None) -> Config:
-    """The configuration that the words after ``dyngs train`` ask for.
+    """Return the configuration for the words after ``dyngs train``.
 
     Raises:
         DyngsError: nothing to train, an override of a resumed run other than ``run.threads``, or a wrong key or value.

@@ -5,8 +5,8 @@ Layout written (binary little endian, float32)::
     x y z  nx ny nz (zeros)  f_dc_0..2  f_rest_0..3(K-1)-1  opacity  scale_0..2  rot_0..3
 
 ``opacity`` is a logit, ``scale`` a natural logarithm, ``rot`` a quaternion wxyz; ``f_rest`` is channel-major: all red
-terms, then green, then blue. Header comments say what the numbers leave open: ``SplatRenderMode: default|mip`` (how the
-file wants to be drawn), ``SH degree``, ``eps2d`` (the 2D low-pass variance) and ``world_offset`` (add it to x y z to
+terms, then green, then blue. Header comments say what the numbers leave open: ``SplatRenderMode: default|mip`` (how to
+render the file), ``SH degree``, ``eps2d`` (the 2D low-pass variance) and ``world_offset`` (add it to x y z to
 get the coordinates of the original capture).
 """
 
@@ -34,13 +34,13 @@ _DEGREE_OF_REST = {3 * (num_sh_terms(degree) - 1): degree for degree in range(MA
 
 @dataclass(frozen=True)
 class SplatFile:
-    """What a splat file holds.
+    """Contents of a 3DGS .ply.
 
     Attributes:
-        gaussians: float32 on the CPU, quaternions of unit length (zero ones are the identity).
-        mode: how the file says it wants to be drawn; classic where it says nothing.
-        eps2d: 2D low-pass variance in px^2, or None where the file says nothing.
-        world_offset: (3,) float64, added to the means gives the coordinates of the original capture.
+        gaussians: float32 on the CPU, quaternions of unit length (zero ones become the identity).
+        mode: render mode stated in the file; classic if none is.
+        eps2d: 2D low-pass variance in px^2 stated in the file, or None.
+        world_offset: (3,) float64; means plus offset are the coordinates of the original capture.
         comments: all header comments, in order.
     """
 
@@ -60,12 +60,12 @@ def write_ply(
     eps2d: float | None = None,
     world_offset: Sequence[float] | np.ndarray | None = None,
 ) -> Path:
-    """Path of the .ply written, atomically: the old file stays until the new one is complete.
+    """Write Gaussians as .ply, atomically: an old file stays until the new one is complete. Return the path.
 
     Args:
         path: file to write; its folder is created.
-        gaussians: N >= 1 Gaussians, SH degree 0 to 4; any 3D filter must have been fused into them already.
-        mode: noted in the header, as other viewers must draw an antialiased model with opacity compensation.
+        gaussians: N >= 1 Gaussians, SH degree 0 to 4; any 3D filter must be fused into them already.
+        mode: noted in the header, as viewers must render an antialiased model with opacity compensation.
         comments: further header comments, one line of ASCII each.
         eps2d: 2D low-pass variance (px^2) to note in the header.
         world_offset: (3,) offset to note in the header; zeros are not noted.
@@ -94,7 +94,7 @@ def write_ply(
 
 
 def read_ply(path: Path | str, *, nonfinite: Literal["error", "skip"] = "error") -> SplatFile:
-    """The Gaussians of a 3DGS .ply, binary or ascii, whatever its property order, normals and extra properties.
+    """Read a 3DGS .ply, binary or ascii, with properties in any order, with or without normals and extra properties.
 
     Args:
         path: the file. Scalar types other than float32 are converted; elements other than ``vertex`` are skipped.
@@ -132,12 +132,12 @@ def _read(path: Path, nonfinite: Literal["error", "skip"]) -> SplatFile:
 
 
 def _table(gaussians: Gaussians) -> np.ndarray:
-    """(N, P) little-endian float32, columns in the order of ``_property_names``."""
+    """Return (N, P) little-endian float32, columns in the order of ``_property_names``."""
     parts = {name: x.detach().cpu().float() for name, x in gaussians.tensors().items()}
     n = len(gaussians)
     columns = [
         parts["means"],
-        torch.zeros(n, 3),
+        torch.zeros(n, 3, device="cpu"),
         parts["sh"][:, 0],
         parts["sh"][:, 1:].transpose(1, 2).flatten(1),
         parts["logit_opacities"][:, None],
@@ -170,7 +170,7 @@ def _header(comments: Iterable[str], count: int, num_terms: int) -> bytes:
 
 
 def _check_properties(header: PlyHeader, path: Path) -> int:
-    """SH degree of the file, after making sure that everything needed is there."""
+    """Return the SH degree of the file. Raises DyngsError if a required property is missing."""
     present = set(header.vertex_names)
     missing = [name for name in _REQUIRED if name not in present]
     if "packed_position" in present:
@@ -188,7 +188,7 @@ def _check_properties(header: PlyHeader, path: Path) -> int:
 
 
 def _gaussians(rows: np.ndarray, degree: int) -> Gaussians:
-    """Gaussians from a structured array, quaternions normalised."""
+    """Return the Gaussians of a structured array, with unit quaternions."""
 
     def columns(names: Sequence[str]) -> torch.Tensor:
         out = np.empty((len(rows), len(names)), dtype=np.float32)
@@ -209,19 +209,19 @@ def _gaussians(rows: np.ndarray, degree: int) -> Gaussians:
 
 
 def _unit(quats: torch.Tensor) -> torch.Tensor:
-    """(N, 4) of unit length; zero becomes the identity, NaN and Inf stay non-finite, unit ones keep their bits.
+    """Return quaternions (N, 4) of unit length; zero becomes the identity, NaN and Inf stay, unit ones keep their bits.
 
     float64, because float32 squares of 1e-30 and 1e30 leave the range.
     """
     wide = quats.double()
     norm = wide.norm(dim=1, keepdim=True)
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    identity = wide.new_tensor([1.0, 0.0, 0.0, 0.0])
     unit = torch.where((norm - 1).abs() < 1e-6, wide, wide / norm)
     return torch.where(norm == 0, identity, unit).float()
 
 
 def _described(gaussians: Gaussians, comments: tuple[str, ...], path: Path) -> SplatFile:
-    """The Gaussians together with what the header comments say about them."""
+    """Return the Gaussians with render mode, low-pass and offset from the header comments."""
     mode, eps2d, offset = RasterizeMode.CLASSIC, None, (0.0, 0.0, 0.0)
     for comment in comments:
         key, _, value = comment.replace(":", " ", 1).strip().partition(" ")

@@ -1,4 +1,4 @@
-"""A strict parser of .ply headers, and of the vertex rows behind them."""
+"""Strict parser of .ply headers and of the vertex data after them."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class PlyHeader:
     Attributes:
         byte_order: "<", ">" or None for ascii.
         elements: all elements in file order, up to and including ``vertex``.
-        comments: the header's comments.
-        data_start: offset of the first byte behind the header.
+        comments: comments of the header.
+        data_start: offset of the first byte after the header.
     """
 
     byte_order: str | None
@@ -63,7 +63,7 @@ class PlyHeader:
         return tuple(name for name, _ in self.elements[-1].properties)
 
     def read_vertices(self, file: BinaryIO, path: Path) -> np.ndarray:
-        """(N,) structured array of the vertices. Raises DyngsError where the data is shorter than announced."""
+        """Read the vertices as a structured array (N,). Raises DyngsError if the file is truncated."""
         vertex, earlier = self.elements[-1], self.elements[:-1]
         if any(element.has_list for element in self.elements):
             raise DyngsError(f"{path}: has list properties in or before its vertices, so it is not a 3DGS .ply")
@@ -102,7 +102,7 @@ class PlyHeader:
 
 
 def read_header(file: BinaryIO, path: Path) -> PlyHeader:
-    """The header of the .ply opened at its start. Raises DyngsError naming ``path`` and the line that is wrong."""
+    """Read the header of a .ply opened at its start. Raises DyngsError with ``path`` and the wrong line."""
     if file.readline(16).rstrip(b"\r\n") != b"ply":
         raise DyngsError(f"{path}: is not a .ply file (it does not start with 'ply')")
     byte_order: str | None = None
@@ -155,7 +155,7 @@ def _is_list(words: list[str]) -> bool:
 
 
 def _add_property(properties: dict[str, str], words: list[str], path: Path) -> None:
-    """Add what a line of the header says to the types by name."""
+    """Add the property of a header line to the types by name."""
     if len(words) != 3 or words[1] not in _SCALARS:
         raise DyngsError(f"{path}: bad .ply header line {_shown(' '.join(words))}")
     if words[2] in properties:

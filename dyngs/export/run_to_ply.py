@@ -1,4 +1,4 @@
-"""A run as .ply files for other programs: whole, only what moves, only what stays; at one moment or at many."""
+"""Export of runs as .ply files: all Gaussians, only the moving or only the static ones; at one time or at many."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Part = Literal["all", "moving", "still"]
 
 
 def export_ply(run_dir: Path, path: Path) -> Path:
-    """``path`` of the .ply written from a run's newest checkpoint, at time 0; see ``write_run_ply``.
+    """Write the newest checkpoint of a run as .ply, at time 0; see ``write_run_ply``. Return the path.
 
     Raises:
         DyngsError: no such run, no checkpoint, or the file cannot be written.
@@ -31,13 +31,15 @@ def export_ply(run_dir: Path, path: Path) -> Path:
 
 
 def write_run_ply(run: LoadedRun, path: Path, time: float = 0.0, part: Part = "all") -> Path:
-    """``path`` of the .ply written; a 3D filter is fused, the header names the mode, and the time where things move.
+    """Write a run as .ply and return the path.
+
+    A 3D filter is fused; the header states the render mode, and the time if something moves.
 
     Args:
         run: a trained model.
-        path: of the file; replaced when the new one is complete.
-        time: in [0, 1].
-        part: all Gaussians, or only those that move or that do not.
+        path: output file; an old one is replaced when the new one is complete.
+        time: scene time in [0, 1].
+        part: all Gaussians, or only the moving or static ones.
 
     Raises:
         DyngsError: the part is empty, or the file cannot be written.
@@ -46,15 +48,15 @@ def write_run_ply(run: LoadedRun, path: Path, time: float = 0.0, part: Part = "a
 
 
 def write_run_ply_sequence(run: LoadedRun, folder: Path, times: Sequence[float], part: Part = "all") -> list[Path]:
-    """Paths of the numbered files written, one per time: ``frame_0000.ply`` and so on, a sequence for players.
+    """Write a sequence ``frame_0000.ply`` and so on, one file per time, for players; return the paths.
 
-    All are written into a hidden folder first and appear together at the end, so that an export that fails leaves no
-    sequence behind that only looks complete.
+    All files are written into a hidden folder first and appear together, so that a failed export leaves no incomplete
+    sequence behind.
 
     Args:
         run: a trained model.
-        folder: where to; made where it is missing. Files of an earlier sequence of the same length are replaced.
-        times: T >= 1, in [0, 1].
+        folder: output folder, created if missing. Files of an earlier sequence of the same length are replaced.
+        times: T >= 1 times in [0, 1].
         part: as in ``write_run_ply``.
 
     Raises:
@@ -77,18 +79,18 @@ def write_run_ply_sequence(run: LoadedRun, folder: Path, times: Sequence[float],
         shutil.rmtree(staging, ignore_errors=True)
         if is_new:
             with suppress(OSError):
-                folder.rmdir()  # only succeeds if nothing came of it
+                folder.rmdir()  # only succeeds while it is empty
     return [folder / name for name in names]
 
 
 def frame_names(count: int) -> list[str]:
-    """``frame_0000.ply`` and so on: at least four digits, and as many as keep names in order of frames."""
+    """Return ``frame_0000.ply`` and so on, with at least four digits and names in the order of the frames."""
     digits = max(4, len(str(count - 1)))
     return [f"frame_{i:0{digits}d}.ply" for i in range(count)]
 
 
 def scene_part(scene: Scene, part: Part) -> Scene:
-    """The part of a scene. Raises DyngsError where there is none."""
+    """Return a part of a scene. Raises DyngsError if it is empty."""
     if part == "all":
         return scene
     found = scene.part(part)
@@ -114,10 +116,10 @@ def _write(run: LoadedRun, scene: Scene, path: Path, time: float) -> Path:
 
 
 def _require_no_others(folder: Path, names: Sequence[str]) -> None:
-    """Nothing, if a player that takes all .ply files of ``folder`` for frames would be right.
+    """Check that the folder holds no .ply files that players would take for frames.
 
     Raises:
-        DyngsError: names a file that is not among ``names``, or says that the folder is none.
+        DyngsError: there is a file that is not among ``names``, or the folder is a file.
     """
     if folder.exists() and not folder.is_dir():
         raise DyngsError(f"{folder}: is a file, but a sequence needs a folder")

@@ -1,4 +1,4 @@
-"""Where every Gaussian is at many moments, as arrays for other programs."""
+"""Tracks: positions of Gaussians over time, as arrays for other programs."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from dyngs.files.write import atomic_file
 from dyngs.scene import Scene
 
 MAX_BYTES = 4_000_000_000
-"""Of the positions, which are held in memory before they are written."""
+"""Largest size of the positions, which are held in memory."""
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """The ways of N Gaussians (or of the M that move) over T times; the names are those of the file's arrays.
+    """Positions of N Gaussians (or of the M moving ones) at T times; fields are named as the arrays of the file.
 
     Attributes:
-        positions: (N, T, 3) in the capture's own coordinates, float32; float64 where the scene lies so far from its
-            origin that it was rebased, because float32 would lose what moves there.
+        positions: (N, T, 3) in the coordinates of the capture, float32; float64 if the scene was rebased because it is
+            far from its origin, where float32 is too coarse.
         times: (T,) float64 in [0, 1].
-        moving: (N,) bool, false where a position never changes.
+        moving: (N,) bool, false if the position never changes.
         ids: (N,) int64 index of each Gaussian in the model, which is also its row in an exported .ply.
     """
 
@@ -39,21 +39,22 @@ class Tracks:
 def tracks_of(
     scene: Scene, times: Sequence[float], world_offset: Sequence[float] = (0.0, 0.0, 0.0), *, part: str = "all"
 ) -> Tracks:
-    """The tracks of a scene.
+    """Return the tracks of a scene.
 
     Args:
         scene: N Gaussians at any time.
         times: T >= 1 in [0, 1].
-        world_offset: (3,) added to the model's coordinates gives the capture's.
-        part: "all", or "moving" for only those that move.
+        world_offset: (3,); coordinates of the model plus offset are those of the capture.
+        part: "all", or "moving" for only the moving ones.
 
     Raises:
         DyngsError: nothing moves, or the positions would take more than 4 GB.
     """
-    moves = torch.zeros(len(scene), dtype=torch.bool)
+    device = scene.gaussians.means.device
+    moves = torch.zeros(len(scene), dtype=torch.bool, device=device)
     moves[scene.rows] = not scene.is_still
     moving = scene_part(scene, "moving") if part == "moving" or not scene.is_still else None
-    ids = torch.nonzero(moves)[:, 0] if part == "moving" else torch.arange(len(scene))
+    ids = torch.nonzero(moves)[:, 0] if part == "moving" else torch.arange(len(scene), device=device)
     kind = np.float64 if any(world_offset) else np.float32
     _require_room(len(ids), len(times), np.dtype(kind).itemsize)
     positions = np.empty((len(ids), len(times), 3), kind)
@@ -68,13 +69,13 @@ def tracks_of(
 
 
 def write_tracks(path: Path, tracks: Tracks) -> Path:
-    """``path`` of the .npz written, atomically: one array per field of ``Tracks``, uncompressed, no pickle.
+    """Write tracks as uncompressed .npz, atomically: one array per field of ``Tracks``, no pickle. Return the path.
 
     Raises:
-        DyngsError: positions that are not finite, or the file cannot be written.
+        DyngsError: non-finite positions, or the file cannot be written.
     """
     if not np.isfinite(tracks.positions).all():
-        raise DyngsError(f"{path}: not written, there are positions that are not finite")
+        raise DyngsError(f"{path}: not written, some positions are not finite")
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **asdict(tracks))
     return path
