@@ -12,7 +12,8 @@ from pathlib import Path
 import torch
 
 from dyngs.build import assemble
-from dyngs.config import Config, DataConfig, DeformField, RandomInit
+from dyngs.config import Config, DeformField
+from dyngs.config.io import load_config
 from dyngs.config.kinds import field_of
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.deform.field import FieldSetup
@@ -81,14 +82,15 @@ def load_of_run(run_dir: Path) -> DeformLoad:
 
 def synthetic_load(folder: Path, num_gaussians: int, moving_share: float, kind: str) -> DeformLoad:
     """Return a load without a run: random Gaussians and a small room, which is written into ``folder``."""
+    keys = {
+        "data.root": folder,
+        "model.kind": "dynamic",
+        "model.deform.kind": kind,
+        "init.kind": "random",
+        "init.num_random": num_gaussians,
+    }
+    config = load_config(None, [f"{key}={value}" for key, value in keys.items()])
     write_dynamic_capture("room", folder, DynamicOptions(size=200, num_times=4, num_cameras=3, samples=1))
-    config = Config.model_validate(
-        {
-            "data": DataConfig(root=folder),
-            "model": {"kind": "dynamic", "deform": {"kind": kind}},
-            "init": RandomInit(num_random=num_gaussians),
-        }
-    )
     return DeformLoad(config, None, moving_share)
 
 

@@ -29,7 +29,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     deform.add_argument(
         "--kind",
-        choices=("hexplane", "mlp", "trajectory", "control_nodes"),
+        metavar="KIND",
         default="hexplane",
         help="field without RUN (default hexplane)",
     )

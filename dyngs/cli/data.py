@@ -39,9 +39,7 @@ def _add_inspect(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.add_argument(
         "overrides", nargs="*", metavar="data.key=value", help="keys of data, such as data.follow_links=true"
     )
-    formats = ("auto", "blender", "nerfstudio", "colmap", "nerfies", "llff", "camera_folders")
-    people = ("body_json", "zju_mocap", "people_snapshot", "neuman")
-    parser.add_argument("--format", choices=(*formats, *people), default="auto")
+    parser.add_argument("--format", default="auto", help="format of the capture (default: detected; docs/formats.md)")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw cameras and points to this picture file")
     parser.add_argument("--deep", action="store_true", help="decode every picture in full (slow)")
     parser.set_defaults(run=run_inspect)
@@ -106,8 +104,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     """Print a report on a capture, and draw it if asked to."""
     from dyngs.data.inspection.report import format_report, inspect_capture
 
-    given = {"root": arguments.path, "format": arguments.format}
-    options = _keys_of_data(arguments.overrides).model_copy(update=given)
+    options = _data_section(arguments.overrides, arguments.format).model_copy(update={"root": arguments.path})
     report = inspect_capture(options, arguments.deep)
     if report.capture is None:
         for problem in report.problems[1:]:
@@ -122,7 +119,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _keys_of_data(overrides: list[str]) -> DataConfig:
+def _data_section(overrides: list[str], capture_format: str = "auto") -> DataConfig:
     """Return the data section with overrides ``data.key=value``; its root has no meaning."""
     from dyngs.config.io import load_config
 
@@ -131,14 +128,14 @@ def _keys_of_data(overrides: list[str]) -> DataConfig:
     ]
     if other:
         raise DyngsError(f"{other[0]!r}: give keys of data here, such as data.follow_links=true")
-    return load_config(None, ["data.root=.", *overrides]).data
+    return load_config(None, ["data.root=.", f"data.format={capture_format}", *overrides]).data
 
 
 def run_sfm(arguments: argparse.Namespace) -> int:
     """Estimate poses and print the next commands."""
     from dyngs.data.prepare.sfm import SfmOptions, estimate_poses
 
-    limits = _keys_of_data(arguments.overrides)
+    limits = _data_section(arguments.overrides)
     options = SfmOptions(
         matching=arguments.matching,
         num_frames=arguments.frames,

@@ -6,6 +6,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 
+from dyngs.config import Config, DynamicModel
+from dyngs.config.schema import kinds_of
+from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError, printable
 
 Value = float | int | str
@@ -134,19 +137,21 @@ class Setting:
         return value
 
 
-FIELDS = ("trajectory", "hexplane", "mlp", "control_nodes")
+_FIELDS = tuple(kinds_of(DynamicModel.model_fields["deform"]))
+_COLOURS = tuple(kinds_of(Config.model_fields["colour"]))
+_MODES = tuple(mode.value for mode in RasterizeMode)
 SETTINGS = (
     Setting("prune", (0.3, 0.5, 0.7, 0.85), low=0.01, high=0.99),
     Setting("mask_times", (6, 16), low=2, high=1000, whole=True),
     Setting("sh_degree", (2, 1, 0), low=0, high=3, whole=True),
     Setting("storage", (AUTO, 1.0, 3.0), low=0.01, high=64, words=(AUTO,)),
-    Setting("mode", ("classic", "antialiased"), words=("classic", "antialiased")),
+    Setting("mode", _MODES, words=_MODES),
     Setting("alpha_min", (0.008, 0.016, 0.032), low=1e-6, high=0.5),
     Setting("transmittance_min", (1e-3, 1e-2, 5e-2), low=1e-6, high=0.5),
     Setting("scale", (0.75, 0.5), low=0.05, high=1.0),
     Setting("field_step", (4.0, 16.0), low=1 / 64, high=1024),
-    Setting("colour", ("sh", "network", "auto"), words=("sh", "network", "auto"), trains=True),
-    Setting("field", FIELDS, words=FIELDS, trains=True),
+    Setting("colour", _COLOURS, words=_COLOURS, trains=True),
+    Setting("field", _FIELDS, words=_FIELDS, trains=True),
     Setting("field_size", (0.5, 0.25), low=1 / 64, high=64, trains=True),
 )
 
