@@ -31,17 +31,27 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--kind",
         metavar="KIND",
         default="hexplane",
-        help="field without RUN (default hexplane)",
+        help="kind of field if no RUN is given (default hexplane)",
     )
-    deform.add_argument("--gaussians", type=int, default=50_000, metavar="N", help="number without RUN (default 50000)")
     deform.add_argument(
-        "--moving", type=float, default=0.1, metavar="SHARE", help="moving share without RUN (default 0.1)"
+        "--gaussians",
+        type=int,
+        default=50_000,
+        metavar="N",
+        help="number of Gaussians if no RUN is given (default 50000)",
+    )
+    deform.add_argument(
+        "--moving",
+        type=float,
+        default=0.1,
+        metavar="SHARE",
+        help="share of moving Gaussians if no RUN is given (default 0.1)",
     )
     deform.add_argument("--threads", type=int, metavar="N", help="number of threads (default: all cores)")
     deform.add_argument("--repeats", type=int, default=10, metavar="N", help="repetitions of five steps (default 10)")
     deform.set_defaults(run=run_deform)
     for one in (raster, deform):
-        one.add_argument("--json", type=Path, metavar="FILE", help="write the results as JSON, too")
+        one.add_argument("--json", type=Path, metavar="FILE", help="write the results as JSON as well")
 
 
 def run_rasterize(arguments: argparse.Namespace) -> int:
