@@ -1,14 +1,14 @@
-"""The network that predicts people, on synthetic ones that it has not seen, against mean textures.
+"""The network that predicts people, on held-out synthetic people, compared with mean textures.
 
     python benchmarks/human_predictor.py FOLDER [--people 12] [--held-out 4] [--size 128] [--steps 2000] [--threads 1]
 
-FOLDER keeps the captures and the run, which are used again. Printed per held-out person, for other cameras (`test`) and
-for another clip (`pose`): PSNR in the person's box / of the whole picture, from three pictures of one moment, of
+FOLDER keeps the captures and the run, which are reused. Printed per held-out person, for other cameras (`test`) and
+another clip (`pose`): PSNR in the box of the person / of the whole picture, from three pictures of one time, by
 
-- network: what `dyngs predict` makes;
-- seen, else mean: the bare template in the colours that the three pictures show, elsewhere in the mean of the people
-  that were trained on, texel by texel;
-- mean texture: the bare template in that mean alone;
+- network: the result of `dyngs predict`;
+- seen, else mean: the template with the colours of the three pictures where visible, elsewhere with the mean texture of
+  the training people;
+- mean texture: the template with that mean texture alone;
 and the seconds from pictures in memory or on disk to Gaussians.
 """
 
@@ -35,14 +35,14 @@ from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_a
 from dyngs.training.prediction import filmed, human_options, load_network, new_network
 
 FIRST_HELD_OUT = 101
-"""Seed of the first person that is not trained on."""
+"""Seed of the first held-out person."""
 
 SPLITS = ("test", "pose")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One way of making one person: name, PSNR by split (box, whole picture), seconds."""
+    """Results of one method for one person: name, PSNR by split (box, whole picture), seconds."""
 
     name: str
     psnr: dict[str, tuple[float, float]]
@@ -50,14 +50,14 @@ class Row:
 
 
 def captures(folder: Path, seeds: range, options: HumanOptions) -> None:
-    """Synthetic people, those that are not there yet."""
+    """Write the synthetic people that do not exist yet."""
     for seed in seeds:
         if not (folder / f"p{seed:03d}").exists():
             write_human_capture(folder / f"p{seed:03d}", replace(options, seed=seed))
 
 
 def trained(folder: Path, run: Path, steps: int, threads: int) -> Path:
-    """The run of the network, made or gone on with where it is not finished."""
+    """Train the network, or continue its run; return the run folder."""
     words = [f"data.root={folder}", f"run.dir={run}", f"run.threads={threads}", f"train.steps={steps}"]
     config: Config = load_config(packaged_preset("human_predictor"), words)
     return train(config, resume_from=run if checkpoint_paths(run) else None)
@@ -72,7 +72,7 @@ def scored(name: str, run: Path, seconds: float) -> Row:
 def baselines(network: Path, capture: Path, out: Path, count: int) -> list[Row]:
     """The bare template, coloured without the network."""
     config, model = network_config(network)
-    mean = load_network(new_network(model, torch.Generator()), latest_checkpoint(network), model.resolution)
+    mean = load_network(new_network(model, torch.Generator("cpu")), latest_checkpoint(network), model.resolution)
     bare: HumanPredictorModel = model.model_copy(update={"scaffold_heights": (min(model.scaffold_heights),)})
     data = config.data.model_copy(update={"root": capture.absolute()})
     person = filmed(data, bare, load_template(human_options(bare)))

@@ -1,12 +1,11 @@
-"""What pruning, masks, fine-tuning and rounding each bring to a finished run: one row per way of pruning it.
+"""Effect of pruning, masks, fine-tuning and quantisation on a finished run, as a table in Markdown.
 
     python benchmarks/prune.py RUN FOLDER [key=value ...] [--rows stages|parts|scores] [--threads 1]
 
-FOLDER keeps the pruned runs, which are used again. `stages` goes the whole way: pruned, fine-tuned, stored by
-`dyngs export --format dyngs`. `parts` compares pruning alone, masks alone and both, with and without fine-tuning (one
-step); `scores` compares the scores. Pruning does not back off here. Overrides (prune.mask_times=6, ...) hold
-for all rows. Printed as a table in Markdown: Gaussians, PSNR of 20 training views and of the whole test split, how
-many times as fast it draws as RUN, MB as float32 and as stored.
+FOLDER keeps the pruned runs, which are reused. `stages`: pruned, fine-tuned, and stored by `dyngs export --format
+dyngs`. `parts` compares pruning alone, masks alone and both, with and without fine-tuning (one step); `scores` compares
+the scores. The requested share is always removed. Overrides (prune.mask_times=6, ...) apply to all rows. Columns:
+Gaussians, PSNR of 20 training views and of the whole test split, speed relative to RUN, MB as float32 and as stored.
 """
 
 from __future__ import annotations
@@ -36,14 +35,14 @@ ROWS = {
 
 
 def line(name: str, run: Path, cost: Cost, before: Cost, threads: int) -> str:
-    """A row of the table, without the size of its file."""
+    """Return a row of the table without its last column."""
     test, faster = evaluate_run(run, threads=threads).psnr, cost.fps / before.fps
     quality = f"{cost.psnr_train:.2f} | {test:.2f}"
     return f"| {name} | {cost.num_gaussians} | {quality} | {faster:.2f} | {cost.megabytes:.2f} |"
 
 
 def stored(run: Path, threads: int) -> str:
-    """What the file of a run costs, its last column."""
+    """Return the last column: size and PSNR of the .dyngs file."""
     folder = run / "stored"
     size = 1e-6 * write_scene_file(run, folder).num_bytes
     return f" {size:.3f}, {evaluate_run(folder, threads=threads).psnr:.2f} dB |"

@@ -1,14 +1,14 @@
-"""Kills, full disks and too little memory, many times over: no run may be lost, changed, or leave anything behind.
+"""Soak test: kills, full disks and too little memory must not lose or change a run, or leave files behind.
 
     python benchmarks/soak.py [--kills 500] [--minutes 60] [--seed 0] [--jobs static,dynamic,prune,export]
 
-Every round begins a tiny run (16 px; a static one, one with moving Gaussians, one with a size limit, the pruning or
-the export of a finished one), and kills it with SIGKILL: at a random moment, right before one of its file operations,
-or within a few milliseconds of one, so that saves are hit. It is then gone on with as a person would (`train --resume`,
-or the same command where there is nothing to resume), killed again, and at last left to end. Other rounds meet a full
+Every round starts a tiny run (16 px; a static one, one with moving Gaussians, one with a size limit, the pruning or
+the export of a finished one), and kills it with SIGKILL: at a random time, right before one of its file operations,
+or within a few milliseconds of one, so that saves are hit. It is then continued as a person would (`train --resume`,
+or the same command if there is nothing to resume), killed again, and finally left to finish. Other rounds meet a full
 disk (a small tmpfs where that can be mounted, otherwise a limit on the size of files), too little memory, or a second
-process with the same command. After each interruption the run must load if it has a checkpoint; what a command says in
-failing must be one line; in the end all files must have the bytes of an uninterrupted run (the log: all but its
+process with the same command. After each interruption the run must load if it has a checkpoint; the error of a failed
+command must be one line; in the end all files must have the bytes of an uninterrupted run (the log: all but its
 seconds) and there must be no other files. Prints a table in Markdown; exit code 1 if anything was lost.
 
 One process imports everything and forks for every command. It uses one thread, so that the children may use theirs.
@@ -92,7 +92,7 @@ class End:
 
     @property
     def problem(self) -> str | None:
-        """What is wrong with it, if it was not killed."""
+        """Return what is wrong with a command that was not killed."""
         if self.code == LOST_CODE or "Traceback" in self.said:
             return f"exit code {self.code}: {self.said.strip()[-200:]}"
         errors = [line for line in self.said.splitlines() if line.startswith("dyngs: error")]
@@ -103,7 +103,7 @@ class End:
 
 @dataclass
 class Reference:
-    """A run that was left alone."""
+    """A run that was not disturbed."""
 
     folder: Path
     end: End
@@ -111,14 +111,14 @@ class Reference:
 
 @dataclass
 class Tally:
-    """What was done to the runs of one job, and what became of them."""
+    """Counts of disturbances and results of one job."""
 
     counts: Counter[str] = field(default_factory=Counter)
     lost: list[str] = field(default_factory=list)
 
 
 class Trap:
-    """Counts the file operations of this process below a folder, and does something at one of them."""
+    """Counts the file operations of this process below a folder and acts at one of them."""
 
     def __init__(self, folder: Path, at: int, act: Callable[[], None]) -> None:
         self.count, self._folder, self._at, self._act = 0, str(folder), at, act
@@ -139,7 +139,7 @@ class Trap:
 
 
 def forked(words: str, out: Path, prepare: Callable[[], Trap | None], meet: Callable[[int, int], None]) -> End:
-    """How ``dyngs WORDS`` ended in a child; ``OUT`` stands for ``out``.
+    """Run ``dyngs WORDS`` in a child process, with ``out`` for ``OUT``, and return how it ended.
 
     Args:
         words: of the command.
@@ -191,7 +191,7 @@ def _be_child(words: str, out: Path, files: tuple[Path, int], prepare: Callable[
 
 
 def _waited(pid: int) -> int:
-    """The status of a child, which is killed if it seems to hang."""
+    """Return the status of a child, which is killed if it hangs."""
     deadline = time.perf_counter() + PATIENCE
     while time.perf_counter() < deadline:
         done, status = os.waitpid(pid, os.WNOHANG)
@@ -210,12 +210,12 @@ def alone(pid: int, arrived: int) -> None: ...
 
 
 def left_alone(words: str, out: Path) -> End:
-    """How a command ends that nobody disturbs; its file operations are counted."""
+    """Run a command undisturbed and count its file operations."""
     return forked(words, out, lambda: Trap(out, 0, nothing), alone)
 
 
 def killed(words: str, out: Path, kind: str, dice: random.Random, reference: Reference) -> End:
-    """How a command ended that was to be killed."""
+    """Run a command and kill it; return how it ended."""
     share = dice.uniform(0, 0.6) if checkpoint_paths(out) else dice.random()  # the rest takes less than the whole
     at = 1 + int(share * reference.end.operations)
     after = share * reference.end.seconds if kind == "any moment" else dice.uniform(0, 0.004)
@@ -241,7 +241,7 @@ def killed(words: str, out: Path, kind: str, dice: random.Random, reference: Ref
 
 
 def limited(words: str, out: Path, kind: str, dice: random.Random) -> End:
-    """How a command ended that had too little room on the disk or in memory."""
+    """Run a command with too little disk or memory; return how it ended."""
 
     def limit() -> None:
         if kind == "memory":
@@ -257,7 +257,7 @@ def limited(words: str, out: Path, kind: str, dice: random.Random) -> End:
 
 
 def next_command(job: str, out: Path, dice: random.Random) -> str:
-    """What a person would call to go on."""
+    """Return the command that continues a run."""
     start = JOBS[job]
     if start.startswith("export") or not (out / RESOLVED_NAME).exists():
         return start
@@ -267,7 +267,7 @@ def next_command(job: str, out: Path, dice: random.Random) -> str:
 
 
 def differences(out: Path, reference: Path) -> list[str]:
-    """What is wrong with a finished run; times of training are its own."""
+    """Return what is wrong with a finished run; training times may differ."""
     problems = []
     there, wanted = (
         {str(f.relative_to(folder)) for folder in (root,) for f in folder.rglob("*")} for root in (out, reference)
@@ -282,7 +282,7 @@ def differences(out: Path, reference: Path) -> list[str]:
 
 
 def told(file: Path) -> object:
-    """What of a file must be the same in two runs."""
+    """Return the part of a file that must be equal in two runs."""
     if file.name == "log.jsonl":
         lines = [json.loads(line) for line in file.read_text().splitlines()]
         return [{key: value for key, value in line.items() if key != "seconds"} for line in lines]
@@ -294,7 +294,7 @@ def told(file: Path) -> object:
 
 
 class Soak:
-    """Rounds on some jobs, in a folder of their own."""
+    """Rounds over some jobs in one folder."""
 
     def __init__(self, folder: Path, jobs: list[str], dice: random.Random) -> None:
         self.folder, self.dice = folder, dice
@@ -318,7 +318,7 @@ class Soak:
         return end
 
     def kill_round(self, job: str, kills: int) -> None:
-        """A run that is killed up to so many times, and then ends."""
+        """Kill a run up to so many times, then let it finish."""
         tally, out = self.tallies[job], self._new()
         for _ in range(kills):
             kind = self.dice.choice(("any moment", "before a file operation", "around a file operation"))
@@ -331,7 +331,7 @@ class Soak:
         self._finish(job, out)
 
     def limit_round(self, job: str, kind: str) -> None:
-        """A run that meets a limit, and then ends without it."""
+        """Run into a limit, then finish without it."""
         tally, out = self.tallies[job], self._new()
         if kind == "disk":
             self._on_full_disk(job, out)
@@ -342,7 +342,7 @@ class Soak:
         self._finish(job, out)
 
     def _on_full_disk(self, job: str, out: Path) -> None:
-        """On a disk that is full after a while; for the end it gets more room."""
+        """Run into a full disk, then finish with more space."""
         disk = out.parent
         size = self.dice.randrange(8, 160)
         if subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", disk], check=False).returncode:
@@ -357,7 +357,7 @@ class Soak:
             subprocess.run(["umount", disk], check=False)
 
     def pair_round(self, job: str) -> None:
-        """The same command twice at once: one does it, the other is refused or finds nothing to do."""
+        """Run the same command twice at once: one succeeds, the other is refused or has nothing to do."""
         tally, out = self.tallies[job], self._new()
         ends: list[End] = []
 
@@ -387,7 +387,7 @@ class Soak:
             self.tallies[job].lost.append(f"{job}, {kind}: {end.problem}")
 
     def _finish(self, job: str, out: Path) -> None:
-        """Go on to the end, and compare."""
+        """Continue to the end and compare."""
         tally = self.tallies[job]
         tally.counts["runs"] += 1
         end = forked(next_command(job, out, self.dice), out, nothing, alone)
@@ -397,7 +397,7 @@ class Soak:
         tally.lost += [f"{job}: {problem}" for problem in differences(out, self.references[job].folder)]
 
     def rows(self) -> list[str]:
-        """The table."""
+        """Return the table."""
         columns = ("runs", "kills", "any moment", "before a file operation", "around a file operation")
         columns += ("disk", "file size", "memory", "ended by a library", "pairs")
         head = f"| job | {' | '.join(columns)} | lost |"
@@ -411,12 +411,12 @@ class Soak:
 
     @property
     def kills(self) -> int:
-        """So far."""
+        """Return a progress line."""
         return sum(tally.counts["kills"] for tally in self.tallies.values())
 
 
 def can_mount(folder: Path) -> bool:
-    """Whether a small disk can be mounted here."""
+    """Return whether a small disk can be mounted."""
     if shutil.which("mount") is None or os.geteuid() != 0:
         return False
     disk = folder / "disk"

@@ -1,10 +1,10 @@
-"""`dyngs tradeoff` of many runs at once, on this machine or on a Ray cluster whose machines see the same folders.
+"""`dyngs tradeoff` of many runs in parallel, on this machine or on a Ray cluster with a shared file system.
 
     pip install 'dyngs[ray]'
     python examples/tradeoff_ray.py runs/* --cpus 4 -- --vary prune=0.5,0.8 --vary storage
-    RAY_ADDRESS=auto python examples/tradeoff_ray.py ...        on a cluster that runs already
+    RAY_ADDRESS=auto python examples/tradeoff_ray.py ...        on a running cluster
 
-What follows `--` goes to every `dyngs tradeoff`. Each writes RUN/tradeoff, and goes on where it was when started again.
+Arguments after `--` are passed to every `dyngs tradeoff`. Each writes RUN/tradeoff and continues there when restarted.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ import ray
 
 @ray.remote
 def measured(run: str, words: list[str]) -> tuple[str, int, str]:
-    """The run, the exit code of its sweep, and the last line that it said."""
+    """Return the run, the exit code of its sweep, and its last line of output."""
     command = [sys.executable, "-m", "dyngs", "tradeoff", run, *words]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
     return run, done.returncode, (done.stdout.strip().splitlines() or [""])[-1]
 
 
 def main() -> int:
-    """1 if any sweep failed."""
+    """Run all sweeps; return 1 if any failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--cpus", type=int, default=1, help="threads of each, and cores that Ray sets aside for it")
