@@ -1,4 +1,4 @@
-// What all bindings take: NumPy and torch arrays in memory of the CPU, row by row without gaps.
+// The array type of all bindings: NumPy and torch arrays in CPU memory, C-contiguous.
 #pragma once
 
 #include <nanobind/ndarray.h>

@@ -1,4 +1,4 @@
-// Python binding of what moves rows of Gaussians. Argument unpacking only.
+// Python binding of the offsets of a deformation field. Argument unpacking only.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>

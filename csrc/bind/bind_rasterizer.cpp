@@ -231,7 +231,7 @@ bool all_within(const int32_t* indices, int64_t count, int64_t bound) {
   return count == 0 || largest < static_cast<uint64_t>(bound);
 }
 
-// Whether the places that the lists of tiles and splats name are in them.
+// Whether all ranges of the lists of tiles and splats are ascending and within the list of entries.
 bool in_order(const Entries& e, int64_t tiles, int64_t splats) {
   bool good = e.tile_offsets[0] >= 0 && e.tile_offsets[tiles] <= e.count;
   for (int64_t t = 0; t < tiles; ++t) good &= e.tile_offsets[t] <= e.tile_offsets[t + 1];

@@ -46,7 +46,7 @@ SkinPoints<S> points_input(const PointArrays<S>& arrays, int64_t num_nodes) {
           static_cast<int64_t>(followed.shape(1))};
 }
 
-// What both passes hold per point.
+// The arrays per point of both passes.
 template <class T>
 Skinned<T> skinned_arrays(const Rows<T>& offset, const Rows<T>& blended, const Rows<T>& weights, size_t count,
                           size_t width, size_t per_point) {

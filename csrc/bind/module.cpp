@@ -23,7 +23,7 @@ void bind_train(nb::module_& module);
 
 namespace {
 
-// The newest of the x86-64 levels compiled here that this processor runs. Asked of the baseline module only.
+// The newest of the compiled x86-64 levels that this processor runs. Only the baseline module is asked.
 const char* best_isa() {
 #if defined(DYNGS_HAS_v4)
   if (runs_v4()) return "v4";
@@ -37,7 +37,7 @@ const char* best_isa() {
 }  // namespace
 }  // namespace dyngs
 
-// What could not be allocated is refused in one line, as any other request that is too large.
+// Turns a failed allocation into the one line of error that any other request too large gets.
 static void refuse_for_memory(const std::exception_ptr& exception, void*) {
   try {
     std::rethrow_exception(exception);

@@ -1,5 +1,5 @@
-// Which of the x86-64 levels this processor runs. By features, because older Clang does not know the levels by name; those
-// named here come with all others of their level on every processor made so far.
+// Tests for the x86-64 levels that this processor runs. By features, because older Clang does not know the levels by name;
+// those named here come with all others of their level on every processor made so far.
 #pragma once
 
 namespace dyngs {

@@ -1,4 +1,4 @@
-// Fused Adam: one pass over the memory instead of torch's eight, whole vectors even where rows are short.
+// Fused Adam (math/adam.hpp): one pass over the memory instead of torch's eight, whole vectors even where rows are short.
 //
 // The work is cut into blocks of rows. Where few rows of a block are to be updated and rows are long, that is done run by
 // run, which saves the memory traffic of the rows between; otherwise element by element under a mask, which keeps whole
@@ -30,7 +30,7 @@ struct Piece {
   const float* step;
 };
 
-// The step proper. Pointers are parameters, not members: only then does GCC believe __restrict and vectorise.
+// Updates `count` elements. Pointers are parameters, not members: only then does GCC believe __restrict and vectorise.
 // `active` (one int per element, 0 = leave alone) is read only if masked.
 template <bool masked>
 void update_floats(float* __restrict param, const float* __restrict grad, float* __restrict exp_avg,
@@ -50,8 +50,8 @@ void update(const Piece& piece, const int32_t* active, int64_t count, const Coef
   update_floats<masked>(piece.param, piece.grad, piece.exp_avg, piece.exp_avg_sq, piece.step, active, count, c);
 }
 
-// Neither NaN nor 2^63 or more of either sign: a second moment that has taken in the square of such a number is infinite or
-// nearly so, and holds its parameter for ever. Without their sign, floats sort as integers, NaN on top.
+// Whether no element is NaN or at least 2^63 in magnitude: its square would make the second moment infinite, or nearly so,
+// and stop the parameter for ever. Without their sign, floats sort as integers, NaN on top.
 bool all_usable(const float* x, int64_t count) {
   constexpr int32_t kMagnitude = 0x7fffffff, kTooLarge = 0x5f000000;
   int32_t bad = 0;
@@ -63,7 +63,7 @@ bool all_usable(const float* x, int64_t count) {
   return bad == 0;
 }
 
-// Of either sign.
+// Whether all elements are zero, of either sign.
 bool all_zero(const float* x, int64_t count) {
   uint32_t magnitude = 0;
   for (int64_t i = 0; i < count; ++i) {
@@ -74,13 +74,13 @@ bool all_zero(const float* x, int64_t count) {
   return magnitude == 0;
 }
 
-// A block of rows, at most Blocks::rows_per_block of them.
+// A block of rows, at most Plan::rows_per_block of them.
 struct Block {
   int64_t first_row;
   int64_t num_rows;
 };
 
-// What all threads share.
+// Data that all threads share.
 struct Plan {
   const AdamState& state;
   const AdamRates& rates;
@@ -150,13 +150,13 @@ int64_t update_block(const Plan& plan, Block block) {
   const int64_t size = plan.state.row_size;
   const bool* rows = plan.rates.rows;
   bool active[kBlockFloats];
-  if (rows) {
+  if (rows != nullptr) {
     std::memcpy(active, rows + block.first_row, block.num_rows);
   } else {
     std::memset(active, true, block.num_rows);
   }
-  // With long rows to choose from, only the gradients of the chosen ones should be read.
-  const bool check_each = rows && size >= kLongRow;
+  // Where rows are long and only some are updated, only the gradients of these should be read.
+  const bool check_each = rows != nullptr && size >= kLongRow;
   const bool check = check_each || !all_usable(plan.state.grad + block.first_row * size, block.num_rows * size);
   const int64_t skipped = check ? drop_unusable(plan, block, active) : 0;
 
@@ -191,7 +191,9 @@ void seen_rows(const float* grads, int64_t num_rows, int64_t row_size, bool* see
 #pragma omp parallel for num_threads(threads) schedule(static)
   for (int64_t row = 0; row < num_rows; ++row) {
     const float* grad = grads + row * row_size;
-    seen[row] = row_size > 0 && (grad[0] != 0 || !all_zero(grad, row_size));  // where seen, mostly at the first number
+    seen[row] =
+        row_size > 0 &&
+        (grad[0] != 0 || !all_zero(grad, row_size));  // where there is a gradient, mostly the first number shows it
   }
 }
 

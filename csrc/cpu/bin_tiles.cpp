@@ -1,10 +1,10 @@
-// Which Gaussian meets which 16x16 tile, front to back. Exact: a tile is listed only if some pixel row of it is crossed
-// by the ellipse where alpha >= alpha_min. The visible Gaussians are sorted by depth first; then everything streams in that
-// order. One span of tile columns per Gaussian and tile row is computed once; counting and emitting both read the spans,
-// so they cannot disagree.
+// Lists the Gaussians of each 16x16 tile, front to back. Exact: a tile is listed only if the ellipse where
+// alpha >= alpha_min crosses some pixel row of it. The visible Gaussians are sorted by depth first; all later passes run in
+// that order. The span of tile columns of each Gaussian and tile row is computed once; counting and emitting both read the
+// spans, so they cannot disagree.
 //
-// There may be more than memory holds, or than can be counted in a day. So all threads add up in one Budget what they find,
-// and once that is exceeded they only go on counting, for the message, and not for long.
+// There may be more entries than memory holds, or than can be counted in a day. So all threads add theirs to one Budget, and
+// once it is exceeded they only go on counting, for the message, and not for long.
 #include <atomic>
 #include <bit>
 #include <limits>
@@ -26,15 +26,15 @@ constexpr int kRadixBits = 11, kBuckets = 1 << kRadixBits;
 constexpr int64_t kParallelSort = 1 << 18, kParallelSpans = 1 << 11;
 
 constexpr int64_t kBytesPerEntry = 20;     // of lists and spans, at most
-constexpr int64_t kFewEntries = 1 << 22;   // for so few nobody asks how much memory is left
+constexpr int64_t kFewEntries = 1 << 22;   // up to here the free memory is not looked up
 constexpr int64_t kCountedRows = 1 << 22;  // rows of spans that are still counted once there are too many entries
 
-// How many entries there may be.
+// The number of entries so far, and how many there may be.
 class Budget {
  public:
   explicit Budget(int64_t max_entries) : limit_(std::min<int64_t>(max_entries, std::numeric_limits<int32_t>::max())) {}
 
-  // Whether that many more are still within it.
+  // Adds entries; returns whether the total is still within the budget.
   bool add(int64_t entries) {
     const int64_t total = total_.fetch_add(entries, std::memory_order_relaxed) + entries;
     if (total <= kFewEntries) return total <= limit_;
@@ -45,11 +45,11 @@ class Budget {
     return total <= std::min(limit_, in_memory_);
   }
 
-  // The rest is for when all threads are done.
+  // These may be called once all threads are done.
   int64_t total() const { return total_; }
   bool exceeded() const { return total_ > std::min(limit_, in_memory_); }
 
-  // What follows the number of entries in a message.
+  // The words that follow the number of entries in a message.
   std::string reason() const {
     if (total_ > limit_) return ", more than the limit of " + std::to_string(limit_);
     return ", whose lists take " + gigabytes(kBytesPerEntry * total_) + "; " + gigabytes(available_) +
@@ -118,9 +118,9 @@ struct Part {
   };
   std::vector<Splat> splats;
   std::vector<Span> spans;
-  std::vector<int64_t> per_tile;  // counts, then the places where this part writes next
+  std::vector<int64_t> per_tile;  // counts, then the positions at which this part writes next
   int64_t entries = 0;
-  bool within_budget = true;  // of all parts; else nothing is kept any more
+  bool within_budget = true;  // the total of all parts; if not, nothing more is stored
   int64_t counted_rows = 0;   // since then
 };
 
@@ -131,7 +131,7 @@ void prefetch_splat(const Splats<S>& s, int64_t row) {
   __builtin_prefetch(s.opacities + row);
 }
 
-// Notes the spans of one tile row of 16 splats.
+// Stores and counts the spans of 16 splats, each in its tile row r.
 void note_spans(const Span (&spans)[kLanes], const int32_t (&begin)[kLanes], const int32_t (&end)[kLanes], int32_t r,
                 const Grid& grid, const size_t (&place)[kLanes], Part& part) {
   for (int i = 0; i < kLanes; ++i) {
@@ -174,7 +174,7 @@ void append_spans(const Splats<S>& s, const Grid& grid, const int32_t* order, in
   }
 }
 
-// Fills the part; it has room for the least that there can be.
+// Finds the spans of `count` splats of the depth order.
 template <class S>
 void find_spans(const Splats<S>& s, const Grid& grid, const int32_t* order, int64_t count, Budget& budget, Part& part) {
   for (int64_t k = 0; k < count && part.counted_rows < kCountedRows; k += kLanes) {
@@ -188,7 +188,7 @@ void find_spans(const Splats<S>& s, const Grid& grid, const int32_t* order, int6
   }
 }
 
-// Turns the parts' counts into the places where each part writes in each tile's list: parts in depth order.
+// Turns the counts of the parts into the positions at which each writes in each tile's list: parts in depth order.
 void assign_places(std::vector<Part>& parts, int64_t* tile_offsets, int64_t start) {
   const size_t tiles = parts[0].per_tile.size();
   for (size_t t = 0; t < tiles; ++t) {
@@ -234,7 +234,7 @@ std::string number_of(int64_t gaussians, int64_t views, const Grid& grid) {
          std::to_string(grid.width) + "x" + std::to_string(grid.height) + " px";
 }
 
-// The lists of tiles themselves: one of offsets, and one of counts per thread.
+// Throws if the arrays over tiles, one of offsets and one of counts per thread, do not fit into memory.
 template <class S>
 void check_tiles(const Splats<S>& s, const Grid& grid) {
   const double bytes = 8.0 * s.num_views * grid.columns * grid.rows * (s.threads + 1);
@@ -277,6 +277,7 @@ Binning bin_tiles(const Splats<S>& s, int64_t max_entries) {
     std::vector<Part>& parts = views[v];
     assign_places(parts, out.tile_offsets.data() + v * tiles, slot);
     std::vector<int64_t> first_slots;
+    first_slots.reserve(parts.size());
     for (const Part& part : parts) first_slots.push_back(std::exchange(slot, slot + part.entries));
     const int count = static_cast<int>(parts.size());
     parallel_parts(count, count, [&](int p, int64_t, int64_t) { emit(parts[p], grid, first_slots[p], out); });

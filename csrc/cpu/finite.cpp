@@ -1,3 +1,4 @@
+// Counts NaN and infinities by their exponent bits.
 #include "core/api.hpp"
 
 #include <atomic>

@@ -1,4 +1,4 @@
-// View-dependent colour: max(0, sum_k sh_k Y_k(dir) + 0.5) with dir = (mean - centre) / |mean - centre|, and its backward pass.
+// View-dependent colour max(0, sum_k sh_k Y_k(d) + 0.5), d = (mean - centre) / |mean - centre|, and its backward pass.
 #include "math/harmonics.hpp"
 
 #include "core/api.hpp"

@@ -4,7 +4,7 @@
 //
 // Precision. V = G(x^2) - G(x)^2 loses digits where x^2 is large beside C2: in float32 0.1% of Q at kLargestInFloat. A
 // tile with more than that anywhere, which no ordinary picture has, is computed again in float64: 0.1% are then reached at
-// 1e5, and nothing overflows. Which it is depends on the tile's pixels alone.
+// 1e5, and nothing overflows. The choice depends on the tile's pixels alone.
 //
 // Channels are interleaved: a row is 3 * width numbers, and the horizontal taps lie 3 numbers apart.
 #include "core/api.hpp"
@@ -67,7 +67,7 @@ class Workspace {
  public:
   static int64_t size(int64_t max_tile_pixels) { return stride_for(max_tile_pixels) * kRows; }
 
-  // In memory of size(max_tile_pixels) numbers, which it clears.
+  // `memory`: size(max_tile_pixels) numbers, set to zero here.
   Workspace(T* memory, int64_t max_tile_pixels) : stride_(stride_for(max_tile_pixels)), numbers_(memory) {
     std::memset(numbers_, 0, size(max_tile_pixels) * sizeof(T));
   }
@@ -88,7 +88,7 @@ class Workspace {
   T* numbers_;
 };
 
-// Everything that the steps below share for one tile.
+// Data of one tile that the steps below share.
 template <class T>
 struct Context {
   const LossInput& input;
@@ -306,7 +306,7 @@ Sums l1_tile(Context<T>& c) {
   return sums;
 }
 
-// In one precision; of no use unless is_precise(context) holds afterwards.
+// The sums in precision T; to be discarded unless is_precise(context) holds afterwards.
 template <class T>
 Sums tile_sums(Context<T>& c) {
   return c.input.ssim_weight == 0 ? l1_tile(c) : ssim_tile(c);

@@ -35,12 +35,12 @@ int64_t left_on_machine(const std::string& root) {
   return kilobytes < 0 ? kUnlimited : 1024 * kilobytes;
 }
 
-// Names of a control group's files: its limit, what is used of it, and how much of that are files that can be dropped.
+// Names of a control group's files: its limit, its usage, and the part of the usage that is file cache and can be dropped.
 struct GroupFiles {
   const char *limit, *usage, *inactive;
 };
 
-// What a control group and those above it leave. `path` begins with a slash.
+// Bytes that a control group and its parents still allow. `path` begins with a slash.
 int64_t left_in_groups(const std::string& mount, std::string path, const GroupFiles& files) {
   int64_t left = kUnlimited;
   for (;; path.resize(path.rfind('/'))) {

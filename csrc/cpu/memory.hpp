@@ -1,4 +1,4 @@
-// How much memory is left.
+// The amount of free memory.
 #pragma once
 
 #include <cstdint>
@@ -6,11 +6,11 @@
 
 namespace dyngs {
 
-// Bytes that this process can still take: the least of what the machine, the control groups and RLIMIT_AS leave it. Takes
-// about 0.1 ms. 16 GiB where the system is not Linux and nobody is asked. `root` stands before /proc and /sys, for tests.
+// Bytes that this process can still allocate: the least of the limits of the machine, the control groups and RLIMIT_AS.
+// Takes about 0.1 ms. 16 GiB on other systems than Linux, without looking. `root` is put before /proc and /sys, for tests.
 int64_t available_memory(const std::string& root = "");
 
-// "12.3 GB", for messages.
+// A size such as "12.3 GB", for messages.
 std::string gigabytes(int64_t bytes);
 
 }  // namespace dyngs

@@ -1,3 +1,4 @@
+// Offsets of a deformation field, added to Gaussians in place.
 #include "core/api.hpp"
 
 #include "cpu/parallel.hpp"

@@ -1,6 +1,6 @@
 // Three ways to share a loop among OpenMP threads. Results never depend on the number of threads as long as the bodies
-// write disjoint places. An exception that left a parallel region would end the process: the first one is kept, what is
-// left of the loop is skipped, and it is thrown from here.
+// write disjoint places. An exception that left a parallel region would end the process: the first one is kept, the
+// rest of the loop is skipped, and it is thrown again after the region.
 #pragma once
 
 #include <omp.h>
@@ -26,7 +26,7 @@ class FirstException {
       if (!thrown_.exchange(true)) first_ = std::current_exception();
     }
   }
-  // After the region, whose end all threads have reached.
+  // To be called after the region, when all threads are done.
   void rethrow() const {
     if (first_) std::rethrow_exception(first_);
   }
@@ -36,7 +36,7 @@ class FirstException {
   std::exception_ptr first_;
 };
 
-// One T(args...) for each worker that parallel_workers may name: what it needs for itself, allocated before the loop.
+// One T(args...) for each worker of parallel_workers: its own scratch memory, allocated before the loop.
 template <class T, class... Args>
 std::vector<std::unique_ptr<T>> for_each_worker(int threads, const Args&... args) {
   std::vector<std::unique_ptr<T>> all(std::max(threads, 1));
@@ -59,7 +59,7 @@ void parallel_workers(int64_t n, int64_t grain, int threads, F&& f) {
   exception.rethrow();
 }
 
-// f(begin, end) likewise.
+// The same with f(begin, end).
 template <class F>
 void parallel_for(int64_t n, int64_t grain, int threads, F&& f) {
   parallel_workers(n, grain, threads, [&](int, int64_t begin, int64_t end) { f(begin, end); });

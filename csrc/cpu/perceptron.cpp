@@ -169,7 +169,7 @@ class Buffer {
   int64_t used_ = 0;
 };
 
-// Where a layer's parts lie, and its packed weights.
+// A layer's packed weights, and the offsets of its parts in the buffers.
 template <class S>
 struct Layer {
   int64_t hidden, in, out;
@@ -182,7 +182,7 @@ struct Layer {
   int64_t bias_offset;    // (padded(out),)
 };
 
-// A network ready to run: its weights packed.
+// A network with its weights packed.
 template <class S>
 class Plan {
  public:
@@ -286,7 +286,7 @@ void add_columns(const S* from, int64_t rows, int64_t columns, int64_t stride, S
   }
 }
 
-// What one thread needs for the forward pass.
+// Scratch memory of one thread in the forward pass.
 template <class S>
 struct Rows {
   Buffer<S> x, last, inputs;  // padded; the last two layers' inputs, unless all are kept
@@ -296,7 +296,7 @@ struct Rows {
         inputs(kept ? 0 : 2 * kBlock * plan.stride()) {}
 };
 
-// And for the backward pass. x and grad_x are padded.
+// And in the backward pass. x and grad_x are padded.
 template <class S>
 struct Scratch {
   Buffer<S> x, kept, grad, next_grad, grad_x;
@@ -343,9 +343,9 @@ void backward_block(const Plan<S>& plan, int64_t rows, const S* kept, const S* g
 inline void prefer_large_pages(void* data, size_t bytes) {
 #if defined(__linux__)
   constexpr uintptr_t kLargePage = uintptr_t(1) << 21;
-  const uintptr_t begin = (reinterpret_cast<uintptr_t>(data) + kLargePage - 1) / kLargePage * kLargePage;
-  const uintptr_t end = (reinterpret_cast<uintptr_t>(data) + bytes) / kLargePage * kLargePage;
-  if (begin < end) madvise(reinterpret_cast<void*>(begin), end - begin, MADV_HUGEPAGE);
+  const uintptr_t address = reinterpret_cast<uintptr_t>(data), skip = (kLargePage - address % kLargePage) % kLargePage;
+  if (bytes < skip + kLargePage) return;
+  madvise(static_cast<char*>(data) + skip, (bytes - skip) / kLargePage * kLargePage, MADV_HUGEPAGE);
 #else
   (void)data, (void)bytes;
 #endif

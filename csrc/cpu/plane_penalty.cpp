@@ -29,7 +29,7 @@ struct Plane {
   int64_t row_size() const { return columns * channels; }
 };
 
-// A running sum, lane by lane, and of what fills no packet.
+// A running sum, lane by lane, and of the elements that do not fill a packet.
 template <class S>
 struct Sum {
   Packet<S> lanes{S(0)};
@@ -114,7 +114,7 @@ struct RowDifferences {
   }
 };
 
-// Numbers that band_penalty needs room for.
+// Size of the scratch memory of band_penalty.
 template <class S>
 int64_t room_for(const Plane<S>& plane) {
   return 4 * plane.row_size() + 2 * plane.channels;
@@ -149,7 +149,7 @@ double band_penalty(const Plane<S>& plane, int64_t begin, int64_t end, S* room) 
   return plane.by_rows * rows_sum + plane.by_columns * columns_sum + plane.one * one_sum;
 }
 
-// What a mean over `count` numbers multiplies their sum by; 0 if there are none.
+// The factor that turns a sum of `count` numbers into weight times their mean; 0 if there are none.
 double mean_factor(double weight, int64_t count) { return count > 0 ? weight / static_cast<double>(count) : 0; }
 
 template <class S>
@@ -176,23 +176,23 @@ std::vector<Plane<S>> all_planes(const HexPlane<S>& hexplane, const PenaltyWeigh
 }  // namespace
 
 template <class S>
-double plane_penalty(const HexPlane<S>& hexplane, const PenaltyWeights& weights, std::span<const PlaneGrads<S>> grads,
+double plane_penalty(const HexPlane<S>& planes, const PenaltyWeights& weights, std::span<const PlaneGrads<S>> grads,
                      int threads) {
   struct Band {
     size_t plane;
     int64_t begin, end;
   };
-  const auto planes = all_planes(hexplane, weights, grads);
+  const auto arrays = all_planes(planes, weights, grads);
   std::vector<Band> bands;
-  for (size_t p = 0; p < planes.size(); ++p)
-    for (int64_t row = 0; row < planes[p].rows; row += kBandRows)
-      bands.push_back({p, row, std::min(planes[p].rows, row + kBandRows)});
+  for (size_t p = 0; p < arrays.size(); ++p)
+    for (int64_t row = 0; row < arrays[p].rows; row += kBandRows)
+      bands.push_back({p, row, std::min(arrays[p].rows, row + kBandRows)});
   std::vector<double> sums(bands.size());
   int64_t most = 0;
-  for (const auto& plane : planes) most = std::max(most, room_for(plane));
+  for (const auto& plane : arrays) most = std::max(most, room_for(plane));
   const auto room = for_each_worker<std::vector<S>>(threads, most);
   parallel_workers(static_cast<int64_t>(bands.size()), 1, threads, [&](int worker, int64_t b, int64_t) {
-    sums[b] = band_penalty(planes[bands[b].plane], bands[b].begin, bands[b].end, room[worker]->data());
+    sums[b] = band_penalty(arrays[bands[b].plane], bands[b].begin, bands[b].end, room[worker]->data());
   });
   double total = 0;
   for (const double sum : sums) total += sum;

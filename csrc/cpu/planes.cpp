@@ -20,7 +20,7 @@ constexpr int kFast[kAxes] = {0, 0, 1};  // axes of the planes xy, xz, yz
 constexpr int kSlow[kAxes] = {1, 2, 2};
 constexpr int64_t kCells = 16;  // of the coarse grid, along each axis
 
-// What NaN falls into is cell 0.
+// NaN counts as cell 0.
 template <class S>
 int64_t coarse_cell(S u) {
   const S x = (u + S(1)) * S(kCells / 2);
@@ -40,7 +40,7 @@ void sort_points(const PlanePoints<S>& points, int32_t* order) {
   for (int64_t i = 0; i < points.count; ++i) order[next[keys[i]]++] = static_cast<int32_t>(i);
 }
 
-// The coordinates of up to 16 points, axis by axis; missing ones are 0.
+// The coordinates of up to 16 points, axis by axis; 0 where there are fewer.
 template <class S>
 struct Chunk {
   S coords[kAxes][kLanes];
@@ -68,7 +68,7 @@ std::vector<Chunk<S>> load_chunks(const PlanePoints<S>& points, const int32_t* o
   return chunks;
 }
 
-// Where the points of a chunk fall between the samples of one level: index + frac, along each axis.
+// Positions of a chunk's points between the samples of one level: index + frac, along each axis.
 template <class S>
 struct Cells {
   typename Packet<S>::Int index[kAxes][kLanes];
@@ -87,7 +87,7 @@ Cells<S> locate_chunk(const Chunk<S>& chunk, int64_t size) {
   return cells;
 }
 
-// (3, size, C): the time planes of a level at the one time of the call.
+// The time planes of a level, interpolated at the one time of the call: (3, size, C).
 template <class S>
 std::vector<S> lines_at_time(const PlaneLevel<S>& level, int64_t channels, double time) {
   const TimeRows rows = time_rows(time, level.times);
@@ -147,7 +147,7 @@ struct LevelView {
         row(level.size > 1 ? level.size * channels : 0) {}
 };
 
-// Where the six planes are read for the points of a chunk: offsets of the first samples, weights of the next ones.
+// Offsets of the first samples that a chunk's points read in the six planes, and the weights of the samples next to them.
 template <class S>
 struct Places {
   int64_t corner[kAxes][kLanes];
@@ -200,7 +200,7 @@ void chunk_features(const LevelView<S>& level, const Chunk<S>& chunk, S* feature
 }
 
 // The gradients that one task of the backward pass owns: of one level and up to 16 channels; of all planes, or where
-// there are more threads than such tasks, of one plane over space and one over time (each then does the rest anew).
+// there are more threads than such tasks, of one plane over space and one over time (each then computes the rest again).
 template <class S>
 struct Task {
   LevelView<S> level;  // from the first channel of the task on
@@ -214,7 +214,7 @@ struct Task {
   int64_t times;
 };
 
-// The scattered part of a chunk: offsets and weights of the four samples of each plane, and of the two of each line.
+// Offsets and weights with which a chunk's gradients are added to the four samples of each plane and the two of each line.
 template <class S>
 struct Scatter {
   int64_t line[kAxes][kLanes];
@@ -294,7 +294,7 @@ void store_coords(const Task<S>& task, const Chunk<S>& chunk, const CoordGrad<S>
     }
 }
 
-// Shares the gradients by the lines (3, size, 16) out to the two rows of the time planes.
+// Distributes the gradients by the lines (3, size, 16) to the two rows of the time planes.
 template <class S>
 void store_lines(const Task<S>& task, const S* g_lines) {
   const S weight = static_cast<S>(task.rows.weight);
@@ -313,7 +313,7 @@ void store_lines(const Task<S>& task, const S* g_lines) {
   }
 }
 
-// `g_lines`: room for the gradients of the task's lines.
+// `g_lines`: scratch memory for the gradients of the task's lines.
 template <bool full, bool with_coords, class S>
 void run_task(const Task<S>& given, const std::vector<Chunk<S>>& chunks, int64_t count, int64_t row_size, S* g_lines) {
   constexpr int kWidth = Native<S>::kSize;
@@ -359,7 +359,7 @@ std::vector<LevelView<S>> level_views(const HexPlane<S>& planes, const std::vect
   return views;
 }
 
-// Sums the parts (parts, 3, count) of the tasks in order, and back into the order of the points.
+// Sums the tasks' parts (parts, 3, count) in order, and puts the sums into the order of the points.
 template <class S>
 void sum_coords(const std::vector<S>& parts, const int32_t* order, int64_t count, S* g_coords, int threads) {
   const int64_t num_parts = count ? static_cast<int64_t>(parts.size()) / (kAxes * count) : 0;

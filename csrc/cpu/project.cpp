@@ -94,7 +94,7 @@ struct BlockGrads {
   Quat<Packet<S>> unit;
 };
 
-// Adds what one view says about 16 Gaussians; `camera` (12 numbers) collects the gradient of [rotation | translation].
+// Adds the gradients of one view for 16 Gaussians; `camera` (12 numbers) collects those of [rotation | translation].
 template <class S>
 void backward_view(const Pinhole<S>& cam, const Loaded<S>& g, const ProjectOptions<S>& options, const int32_t* radii,
                    const ProjectedGrads<S>& grads, int64_t row, int count, BlockGrads<S>& sum, double* camera) {
@@ -153,6 +153,7 @@ void project_backward(const GaussianViews<S>& in, const ProjectOptions<S>& optio
   using P = Packet<S>;
   const int64_t blocks = (in.num_gaussians + kBlock - 1) / kBlock;
   std::vector<Pinhole<S>> cams;
+  cams.reserve(in.num_views);
   for (int64_t v = 0; v < in.num_views; ++v) cams.push_back(load_pinhole(in, options, v));
   std::vector<double> camera(out.viewmats ? blocks * in.num_views * 12 : 0);  // per block: summed in fixed order below
   parallel_for(in.num_gaussians, kBlock, options.threads, [&](int64_t begin, int64_t end) {

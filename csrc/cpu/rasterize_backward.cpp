@@ -27,12 +27,13 @@ struct Layout {
   int packets() const { return (fields() + kLanes - 1) / kLanes; }
 };
 
-// The pixel centres of a tile nearest to a point, and those of the picture.
+// The point nearest to (x, y) in the square of a tile's pixel centres.
 template <class S>
 Vec2<S> nearest_in_tile(const TileFrame<S>& frame, S x, S y) {
   const S x0 = static_cast<S>(frame.x0) + S(0.5), y0 = static_cast<S>(frame.y0) + S(0.5), side = S(kTile - 1);
   return {std::clamp(x, x0, x0 + side), std::clamp(y, y0, y0 + side)};
 }
+// The point nearest to (x, y) in the picture.
 template <class S>
 Vec2<S> nearest_in_picture(const Splats<S>& s, S x, S y) {
   return {std::clamp(x, S(0), static_cast<S>(s.width)), std::clamp(y, S(0), static_cast<S>(s.height))};
@@ -163,7 +164,7 @@ void flush(const Layout& layout, S px, S py, const BlockPixels<S>& pixels, Scrat
   batch.count = 0;
 }
 
-// Lanes whose pixel was not yet full at `position`.
+// Positions at which the pixels were full, relative to the chunk.
 template <class S>
 Packet<S> relative_stop(const BlockPixels<S>& pixels, int32_t chunk_begin) {
   Packet<S> r;
@@ -205,7 +206,7 @@ void block_backward(const Splats<S>& s, const Layout& layout, const TileFrame<S>
   pixels.behind = behind;
 }
 
-// Moments of one entry about its anchor in the tile, turned into those of a slot.
+// Turns the moments of one entry about its anchor in the tile into the sums of its slot.
 template <class S>
 void write_moments(const Splats<S>& s, const TileFrame<S>& frame, const BlendGaussian<S>& g, const S* sum, S* to) {
   const double unscale = 1 / std::sqrt(0.5 * kLog2E);  // a BlendGaussian holds u, w, v times sqrt(log2(e) / 2)

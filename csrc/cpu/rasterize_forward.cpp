@@ -23,7 +23,7 @@ struct Scratch {
   S sums[kChunk];  // tallies of the chunk's Gaussians
 };
 
-// Pixels that the Gaussian would take below transmittance_min are full: it is not added and they take no more.
+// Closes pixels that the Gaussian would take below transmittance_min.
 template <class S, int D>
 void mark_full(PacketMask<S> full, int32_t position, BlockState<S, D>& state) {
   uint32_t bits = to_bits(full);
@@ -94,7 +94,7 @@ bool any_open(const BlockState<S, D>& state) {
   return any(state.threshold < Packet<S>(std::numeric_limits<S>::infinity()));
 }
 
-// All channels of a block's finished pixels, added up.
+// Sums over the channels of a block's finished pixels.
 template <class S>
 Packet<S> light_of_block(const Splats<S>& s, const TileFrame<S>& frame, int block, const Image<S>& image) {
   Packet<S> light(S(0));
@@ -105,7 +105,7 @@ Packet<S> light_of_block(const Splats<S>& s, const TileFrame<S>& frame, int bloc
   return light;
 }
 
-// A tile that no Gaussian meets shows the background.
+// Writes the background into a tile without Gaussians.
 template <class S>
 void fill_tile(const Splats<S>& s, const TileFrame<S>& frame, const Image<S>& image) {
   const int x1 = std::min(frame.x0 + kTile, s.width), y1 = std::min(frame.y0 + kTile, s.height);
@@ -161,7 +161,7 @@ void blend_all(const Splats<S>& s, const Entries& entries, const Image<S>& image
   });
 }
 
-// Tallies per (Gaussian, tile) entry, then summed per Gaussian in slot order: the same for any thread count.
+// Sums tallies per entry, then per Gaussian in slot order: the same for any thread count.
 template <class S, Tally kTally>
 void blend_with_tally(const Splats<S>& s, const Entries& entries, const Image<S>& image) {
   std::vector<S> slot_sums(entries.count, S(0));
@@ -192,7 +192,7 @@ void rasterize_forward(const Splats<S>& s, const Entries& entries, const Image<S
     case Tally::kPixels: return blend_with_tally<S, Tally::kPixels>(s, entries, image);
     case Tally::kLanes: return blend_with_tally<S, Tally::kLanes>(s, entries, image);
     case Tally::kSquaredSlopes:
-      blend(s, entries, image);  // what lies behind a Gaussian is taken from the finished picture
+      blend(s, entries, image);  // the light behind a Gaussian is taken from the finished picture
       return blend_with_tally<S, Tally::kSquaredSlopes>(s, entries, image);
     case Tally::kNone: return blend(s, entries, image);
   }

@@ -1,3 +1,4 @@
+// Inputs of the network of compact colour, row by row (math/shading.hpp).
 #include "core/api.hpp"
 
 #include <algorithm>

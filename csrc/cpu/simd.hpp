@@ -33,7 +33,7 @@ struct VectorOf {
 };
 
 template <class S, int kCount>
-struct Simd {  // aligned as its vector is
+struct Simd {  // with the alignment of its vector
   using Vec = typename VectorOf<S, kCount>::Type;
   using Int = std::conditional_t<sizeof(S) == 4, int32_t, int64_t>;
   using IntVec = typename VectorOf<Int, kCount>::Type;

@@ -1,6 +1,6 @@
-// Whatever a node carries lies in one row of a table, in fours (x, y, z and one spare), so that a point and a node meet
-// in a few short vector operations. The backward pass splits the points into a number of contiguous parts that depends
-// on the sizes only; each adds up, in order, gradients of its own by all nodes, and these are then summed in order.
+// All data of a node lie in one row of a table, in vectors of four (x, y, z and a spare lane), so that a point and a node need
+// a few short vector operations. The backward pass splits the points into contiguous parts, whose number depends on the
+// sizes only; each part sums its own gradients by all nodes in order, and these are then summed in order.
 #include "core/api.hpp"
 
 #include <algorithm>
@@ -24,10 +24,10 @@ constexpr int64_t kMaxParts = 16;
 template <class S>
 using Four = Simd<S, 4>;
 
-// Rows of the table: the place with minus the rate of decay in the spare lane; R - I, by column in the forward and by
+// Vectors of a table row: the position with the weight's decay in the spare lane; R - I, by column in the forward and by
 // row in the backward pass; and in the forward pass the shift and the values.
 constexpr int kPlace = 0, kTurn = 1, kShift = 4, kValues = 5;
-// Rows of gradients: by the columns of R, the shift and the values.
+// Vectors of a gradient row: by the columns of R, the shift and the values.
 constexpr int kByTurn = 0, kByShift = 3, kByValues = 4;
 
 template <class S>
@@ -140,7 +140,7 @@ inline void blend(const Table<S>& table, const S* coords, const int64_t* followe
   }
 }
 
-// Adds to `sums`, a row per node, what the points [begin, end) give, and writes the gradients by these points.
+// Adds the gradients of the points [begin, end) to `sums`, a row per node, and writes the gradients by these points.
 template <class S>
 void gather_part(const Table<S>& table, const SkinPoints<S>& points, const Skinned<const S>& g, int64_t width,
                  int64_t begin, int64_t end, Four<S>* sums, S* g_points) {
@@ -178,7 +178,7 @@ void write_node(const SkinNodes<S>& nodes, int64_t node, const Four<S>* sum, con
     store_some<S>(grads.values + node * nodes.width + 4 * k, sum[kByValues + k], nodes.width - 4 * k);
 }
 
-// Few where there are more nodes than points: every part costs a pass over all nodes.
+// The number of parts: few where there are more nodes than points, as every part costs a pass over all nodes.
 int64_t num_parts(int64_t num_points, int64_t per_point, int64_t num_nodes) {
   return std::clamp<int64_t>(num_points * per_point / std::max<int64_t>(4 * num_nodes, 1), 1, kMaxParts);
 }

@@ -1,5 +1,5 @@
-// What the forward and the backward rasterizer share: the Gaussians of one tile, copied into a compact form, and the
-// test of which of the tile's sixteen 4x4 blocks each of them can touch. One packet holds one block's 16 pixels.
+// Shared by the forward and the backward rasterizer: the Gaussians of one tile, copied into a compact form, and the test
+// which of the tile's sixteen 4x4 blocks each of them can touch. One packet holds one block's 16 pixels.
 #pragma once
 
 #include <algorithm>
@@ -14,10 +14,10 @@
 namespace dyngs {
 
 inline constexpr int kBlockSide = 4, kBlocks = 16;
-inline constexpr int kChunk = 256;  // Gaussians copied at a time: their records stay in the L1 cache
+inline constexpr int kChunk = 256;  // Gaussians copied at a time: they stay in the L1 cache
 
 inline constexpr int kDynamic = 0;         // number of channels known only at run time
-inline constexpr int kInlineChannels = 4;  // colours of up to this many channels are copied beside the records
+inline constexpr int kInlineChannels = 4;  // colours of up to this many channels are copied beside the Gaussians
 
 template <class S>
 struct Chunk {
@@ -84,7 +84,7 @@ TileFrame<S> tile_frame(const Splats<S>& s, int64_t tile) {
   return f;
 }
 
-// Blocks (lanes) that u^2 + v^2 <= limit may reach.
+// Bits of the blocks in which alpha may reach alpha_min.
 template <class S>
 uint16_t touched_blocks(const TileFrame<S>& f, const BlendGaussian<S>& g) {
   using P = Packet<S>;
@@ -130,7 +130,7 @@ struct LaneOffsets {
   }
 };
 
-// Infinite in lanes outside the image: no log2 alpha passes it.
+// The least log2 alpha that is drawn; infinite in lanes outside the image.
 template <class S>
 Packet<S> pixel_threshold(const Splats<S>& s, const TileFrame<S>& f, int block) {
   Packet<S> t;

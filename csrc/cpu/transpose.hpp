@@ -1,5 +1,5 @@
-// In-place transpose of a 16x16 matrix of rows held in packets: what turns "16 pixels of one Gaussian" into "one pixel
-// of 16 Gaussians", so that sums over pixels need no horizontal adds.
+// In-place transpose of a 16x16 matrix of rows held in packets. It turns "16 pixels of one Gaussian" into "one pixel of 16
+// Gaussians", so that sums over pixels need no horizontal adds.
 #pragma once
 
 #include "cpu/simd.hpp"

@@ -28,7 +28,7 @@ struct ScalarOf {
 template <class R>
 using Scalar = typename ScalarOf<R>::type;
 
-// What comparing two R gives: bool for numbers.
+// The type of a comparison of two R: bool for numbers.
 template <class R>
 using MaskOf = decltype(std::declval<R>() < std::declval<R>());
 

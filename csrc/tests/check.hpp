@@ -1,4 +1,4 @@
-// What the C++ tests share: random inputs that are the same on every machine, comparisons that print what failed, and
+// Shared by the C++ tests: random inputs that are the same on every machine, comparisons that print what failed, and
 // slopes by central differences.
 #pragma once
 

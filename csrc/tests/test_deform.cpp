@@ -170,7 +170,7 @@ Features<S> features_of(const Grids& g, const Values& cotangent, int threads) {
   return out;
 }
 
-// Of plane (rows, size, C) at fast coordinate x and row coordinate y, in samples.
+// Bilinear interpolation in a plane (rows, size, C) at fast coordinate x and row coordinate y, in samples.
 double bilinear(const double* plane, int64_t rows, int64_t size, int64_t channels, int64_t c, double x, double y) {
   const int64_t i = std::clamp<int64_t>(static_cast<int64_t>(x), 0, size - 2);
   const int64_t j = std::clamp<int64_t>(static_cast<int64_t>(y), 0, rows - 2);
@@ -300,7 +300,7 @@ Network<S> run_network(const std::vector<int64_t>& widths, int64_t skip, const V
   const auto p = as<S>(params), inputs = as<S>(x), by_y = as<S>(g_y);
   const Perceptron<S> net{widths, skip, p.data(), threads};
   const int64_t rows = static_cast<int64_t>(x.size()) / widths[0];
-  // as large vectors need it
+  // the kernels' vectors need this alignment
   const auto kept = std::make_unique<S[]>(rows * net.kept_per_row() + 64);
   S* aligned = kept.get() + (64 - reinterpret_cast<uintptr_t>(kept.get()) % 64) % 64 / sizeof(S);
   Network<S> out{std::vector<S>(rows * widths.back()), std::vector<S>(x.size()), std::vector<S>(params.size())};

@@ -79,7 +79,7 @@ Values plain_light(const Values& v) {
   return light;
 }
 
-// By the steps of math/blend.hpp, for cotangents g of the two pixels: the light, and what the backward steps say.
+// The same by the steps of math/blend.hpp, and the gradients of its backward steps for cotangents g of the two pixels.
 struct Blended {
   Values light, shades;     // (2), (kDepth) gradients by the shades
   double p[kDepth][2];      // gradients by log alpha

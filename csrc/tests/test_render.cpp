@@ -41,7 +41,7 @@ Scene random_scene(int64_t n, int width, int height, int channels, double size) 
 
 constexpr Tally kTallies[] = {Tally::kWeights, Tally::kPixels, Tally::kLanes, Tally::kSquaredSlopes};
 
-// All that the kernels say about a scene. Opacities are those that compensate for the low-pass filter.
+// All outputs of the kernels for a scene. Opacities are those that compensate for the low-pass filter.
 template <class S>
 struct Drawn {
   std::vector<S> means2d, depths, factors, compensations, opacities, colors;
@@ -173,7 +173,7 @@ Drawn<S> draw(const Scene& s, int threads, const Cotangents* cotangents = nullpt
   return d;
 }
 
-// Every pixel looks at every Gaussian, nearest first.
+// The picture by a loop over all pixels and all Gaussians, nearest first.
 Values plain_picture(const Scene& s, const Drawn<double>& d) {
   Values color(s.pixels() * s.channels);
   for (int64_t v = 0; v < s.views; ++v) {

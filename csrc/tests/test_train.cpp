@@ -32,7 +32,7 @@ double blurred(const Pictures& p, int64_t row, int64_t col, F&& f) {
   return sum / total;
 }
 
-// What one pixel adds to the sums of |x - y| and of 1 - SSIM.
+// The terms of one pixel in the sums of |x - y| and of 1 - SSIM.
 double pixel_loss(const Pictures& p, int64_t row, int64_t col) {
   const double weight = p.mask[row * p.width + col];
   double loss = 0;
