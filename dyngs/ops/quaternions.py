@@ -1,6 +1,6 @@
 """Quaternions wxyz of any length: unit quaternions, products, rotations of vectors, rotation matrices.
 
-Unit quaternions are made as the kernels make them (``normalize`` in csrc/math/projection.hpp).
+Unit quaternions are made as the kernels make them (``normalize`` in csrc/math/quaternion.hpp).
 """
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
