@@ -45,7 +45,7 @@ _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 
 
 def load_config(preset: Path | None, overrides: Iterable[str] = ()) -> Config:
-    """The configuration of a preset with overrides laid over it.
+    """Return the configuration of a preset with overrides laid over it.
 
     Args:
         preset: a YAML file, or the name of a packaged preset (``static``, ``configs/static.yaml``) where no such file
@@ -72,7 +72,7 @@ def load_config(preset: Path | None, overrides: Iterable[str] = ()) -> Config:
 
 
 def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
-    """The configuration of a finished or interrupted run.
+    """Return the configuration of a finished or interrupted run.
 
     Args:
         path: a run folder, or the YAML file in it.
@@ -104,7 +104,7 @@ def save_config(config: Config, path: Path) -> None:
 
 
 def find_preset(path: Path) -> Path:
-    """The preset file meant by ``path``: itself if it exists, else the packaged preset of that name.
+    """Return the preset file meant by ``path``: itself if it exists, else the packaged preset of that name.
 
     Only a bare name or one below ``configs/`` is looked for in the package, so that a mistyped path of the user's own
     is an error. In a source checkout the package's presets are those in the repository's ``configs``.
@@ -124,7 +124,7 @@ def find_preset(path: Path) -> Path:
 
 
 def packaged_preset(name: str) -> Path:
-    """The file of the preset ``name`` that comes with dyngs, for instance ``static``.
+    """Return the file of the preset ``name`` that comes with dyngs, for instance ``static``.
 
     Raises:
         DyngsError: there is none of that name.
@@ -146,7 +146,7 @@ def _packaged_presets() -> dict[str, Path]:
 
 @dataclass
 class _Layers:
-    """The tree that is being put together, and for every value where it came from."""
+    """Nested values of a preset and overrides, and for each value where it was written."""
 
     tree: dict[str, Any] = field(default_factory=dict)
     origins: dict[tuple[str, ...], str] = field(default_factory=dict)
@@ -233,7 +233,7 @@ def _validate(layers: _Layers) -> Config:
 
 
 def _require_countable(section: dict[str, Any], above: tuple[str, ...], layers: _Layers) -> None:
-    """Nothing, if no whole number needs more than 64 bits. Raises DyngsError."""
+    """Raise DyngsError if a whole number needs more than 64 bits."""
     for key, value in section.items():
         keys = (*above, key)
         if isinstance(value, dict):
@@ -280,7 +280,7 @@ def _explain(layers: _Layers, problem: ErrorDetails) -> str:
 
 
 def _explain_unknown(layers: _Layers, keys: tuple[str, ...]) -> str:
-    """What to say of a key that its section does not have: that another kind has it, or what is near."""
+    """Return a message for a key that its section does not have: which kind has it, or which keys are similar."""
     above, dotted = keys[:-1], ".".join(keys)
     holder = section_at(layers.tree, above).model_fields.get(above[-1]) if above else None
     variants = section_classes(holder) if holder is not None else []

@@ -1,6 +1,6 @@
-"""The keys of the configuration in words: what each accepts, its default, what it is for.
+"""Descriptions of the configuration keys: allowed values, default, meaning; and look-up of sections by kind.
 
-Error messages and the documentation's table are made from this, so that neither can disagree with ``dyngs.config``.
+Error messages and the table in docs/cli.md are generated from this, so that neither can disagree with ``dyngs.config``.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from dyngs.config import Config
 
 @dataclass(frozen=True)
 class ConfigKey:
-    """One key of the configuration, for people.
+    """One key of the configuration, described for users.
 
     Attributes:
         name: dotted, for instance ``train.steps``.
         kinds: the variants that have the key, outermost first, as ``("dynamic", "mlp")``; empty where all have it.
         allowed: what it may be, in words.
         default: as YAML, "" where the key is required.
-        description: one line, may be empty.
+        description: one line.
     """
 
     name: str
@@ -39,15 +39,15 @@ class ConfigKey:
 
 
 def config_keys() -> list[ConfigKey]:
-    """Every key of ``Config`` in declaration order.
+    """Return every key of ``Config`` in declaration order.
 
-    Of a section with variants comes first the ``kind``, then what all have alike, then what each has of its own.
+    For a section with several kinds: first its ``kind``, then the keys that all kinds share, then those of each kind.
     """
     return list(_keys_below(Config, ""))
 
 
 def _keys_below(section: type[BaseModel], prefix: str) -> Iterator[ConfigKey]:
-    """The keys of ``section``, named with ``prefix``; their kinds are those of the sections inside it."""
+    """Yield the keys of ``section``, named with ``prefix``; their kinds are those of the sections inside it."""
     for key, info in section.model_fields.items():
         name, variants = prefix + key, section_classes(info)
         if not variants:
@@ -65,7 +65,7 @@ def _keys_below(section: type[BaseModel], prefix: str) -> Iterator[ConfigKey]:
 
 
 def _kind_key(name: str, info: FieldInfo, variants: list[type[BaseModel]]) -> ConfigKey:
-    """The ``kind`` of the section ``name``, described by what it decides and what each variant is."""
+    """Return the key ``kind`` of the section ``name``; its description says what each kind is."""
     kinds = [variant.model_fields["kind"] for variant in variants]
     meanings = "; ".join(f"{', '.join(choices_of(kind.annotation))}: {kind.description}" for kind in kinds)
     description = f"{info.description}. {meanings}"
@@ -73,7 +73,7 @@ def _kind_key(name: str, info: FieldInfo, variants: list[type[BaseModel]]) -> Co
 
 
 def keys_table() -> str:
-    """All keys as a table in Markdown, for docs/cli.md."""
+    """Return all keys as a table in Markdown, for docs/cli.md."""
     lines = ["| key | allowed | default | meaning |", "|---|---|---|---|"]
     for key in config_keys():
         variant = f" ({', '.join(key.kinds)})" if key.kinds else ""
@@ -85,7 +85,7 @@ def keys_table() -> str:
 
 
 def allowed_values(info: FieldInfo, plural: bool = False) -> str:
-    """What a field accepts, in words: ``an integer >= 1``, ``a list of integers >= 1``, ``one of white, black``."""
+    """Return the allowed values of a field in words: ``an integer >= 1``, ``one of white, black``."""
     annotation = info.annotation
     optional = NoneType in get_args(annotation)
     plain = next((a for a in get_args(annotation) if a is not NoneType), annotation) if optional else annotation
@@ -111,7 +111,7 @@ def allowed_values(info: FieldInfo, plural: bool = False) -> str:
 
 
 def choices_of(annotation: Any) -> list[str]:
-    """The values of a ``Literal`` or an enum as text; none for other types."""
+    """Return the values of a ``Literal`` or an enum as text; none for other types."""
     if get_origin(annotation) is Literal:
         return [str(a) for a in get_args(annotation)]
     if isinstance(annotation, type) and issubclass(annotation, Enum):
@@ -134,19 +134,19 @@ def _default_text(info: FieldInfo) -> str:
 
 
 def section_classes(info: FieldInfo) -> list[type[BaseModel]]:
-    """The section classes that a field may hold: several for a section with a ``kind``, none for a value."""
+    """Return the section classes that a field may hold: several for a section with a ``kind``, none for a value."""
     options = get_args(info.annotation) or (info.annotation,)
     return [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
 
 
 def kinds_of(info: FieldInfo) -> list[str]:
-    """The kinds that a section may be of; none where it has no variants."""
+    """Return the kinds that a section may have; empty where there is only one class."""
     variants = section_classes(info)
     return [k for v in variants for k in choices_of(v.model_fields["kind"].annotation)] if len(variants) > 1 else []
 
 
 def section_class(info: FieldInfo, kind: object) -> type[BaseModel]:
-    """The class of a section in its variant ``kind`` (the default one where there is no such variant)."""
+    """Return the class of a section of this ``kind``; the default one where there is no such kind."""
     variants = section_classes(info)
     if len(variants) == 1:
         return variants[0]
@@ -155,7 +155,7 @@ def section_class(info: FieldInfo, kind: object) -> type[BaseModel]:
 
 
 def section_at(tree: dict[str, Any], keys: tuple[str, ...]) -> type[BaseModel]:
-    """The class of the section that holds the last of ``keys`` (the innermost known one), by the kinds in ``tree``."""
+    """Return the class of the section that holds the last of ``keys`` (innermost known), by the kinds in ``tree``."""
     section: type[BaseModel] = Config
     node: Any = tree
     for key in keys[:-1]:
@@ -168,7 +168,7 @@ def section_at(tree: dict[str, Any], keys: tuple[str, ...]) -> type[BaseModel]:
 
 
 def keys_of_location(location: tuple[int | str, ...]) -> tuple[str, ...]:
-    """The keys of a pydantic location: without the kinds after sections with variants, without indices."""
+    """Return the keys of a pydantic location, without the kinds of sections and without indices."""
     keys: list[str] = []
     section: type[BaseModel] = Config
     parts = iter(location)

@@ -1,7 +1,7 @@
-"""YAML of presets and overrides as values with the places where they were written: one boundary for all that it raises.
+"""Read YAML of presets and overrides as values with their origin (file, line); every YAML error becomes a DyngsError.
 
-What YAML takes for a number, a date or the like and then cannot make one of (``2024-02-30``, ``0x_``, 5,000 digits) is
-the text that it was written as; the schema says what it must be.
+A scalar that looks like a number or a date but is none (``2024-02-30``, ``0x_``, 5,000 digits) is read as text; the
+schema then says what it must be.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from yaml.reader import ReaderError
 from dyngs.errors import DyngsError, printable, reason, require_name
 
 MAX_BYTES = 2**20
-"""Of a preset or an override; the longest that we know has 5 KB."""
+"""Largest size of a preset or an override; the longest that we know has 5 KB."""
 MAX_DEPTH = 40
-"""Of mappings and lists within each other; a configuration has 4."""
+"""Deepest nesting of mappings and lists; a configuration has 4."""
 _BITS = 63
-"""Of a whole number."""
+"""Largest size of an integer."""
 _SHOWN = 100
 """Characters of an override that a message repeats."""
 _ODD_NUMBER = re.compile(r"[-+]?(0\d|\d[\d_]*:)")
@@ -33,7 +33,7 @@ _EXACT_FLOAT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
 
 @dataclass(frozen=True)
 class Leaf:
-    """One value of a file or an override: where it lies, what it is, how it was written and where."""
+    """One value of a file or an override: its keys, its value, its text, and its origin for messages."""
 
     keys: tuple[str, ...]
     value: Any
@@ -42,7 +42,7 @@ class Leaf:
 
 
 def read_file(path: Path) -> list[Leaf]:
-    """The values of a file in its order; an empty section is a leaf of value None.
+    """Read the values of a file in its order; an empty section is a leaf of value None.
 
     Raises:
         DyngsError: names the file, the line and what is wrong there.
@@ -69,7 +69,7 @@ def read_file(path: Path) -> list[Leaf]:
 
 
 def read_override(text: str) -> list[Leaf]:
-    """The values that ``section.key=value`` sets: one, or those of a section that is given as a whole.
+    """Read the values that ``section.key=value`` sets: one, or several where a whole section is given.
 
     Raises:
         DyngsError: it is no override, or its value holds the same key twice and the like.
@@ -95,7 +95,7 @@ def read_override(text: str) -> list[Leaf]:
 
 
 class _NotYaml(DyngsError):
-    """What YAML itself cannot read, other than what we do not allow in it."""
+    """Text that is not valid YAML, as opposed to YAML that is not allowed here."""
 
 
 class _PresetLoader(yaml.SafeLoader):
@@ -121,7 +121,7 @@ class _PresetLoader(yaml.SafeLoader):
         super().fetch_flow_collection_start(TokenClass)  # type: ignore[no-untyped-call]
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """What a node says; the text of a scalar that is not what it looks like, or of a number that is too large."""
+        """Return the value of a node; its text where it only looks like a number or date, or is too large a number."""
         if not isinstance(node, yaml.ScalarNode):
             return super().construct_object(node, deep)  # type: ignore[no-untyped-call]
         try:
@@ -198,7 +198,7 @@ def _walk(
 
 
 def require_usable(leaf: Leaf) -> None:
-    """Nothing, if a text can name a file: no NUL, nothing that is no character. Raises DyngsError."""
+    """Raise DyngsError if a text cannot be a file name: NUL, or not a character."""
     if isinstance(leaf.value, str):
         try:
             require_name(leaf.value)

@@ -10,7 +10,7 @@ from dyngs.config.keys.section import Positive, Section
 
 
 class ColourSection(Section):
-    """What all kinds of colour have in common."""
+    """Keys that all kinds of colour share."""
 
     opacity_entropy: float = Field(
         default=0.0,

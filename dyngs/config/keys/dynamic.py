@@ -11,7 +11,7 @@ from dyngs.config.keys.section import Fraction, Positive, Section
 
 
 class FieldSection(Section):
-    """What all deformation fields have in common: which attributes change over time. Positions always do."""
+    """Keys that all deformation fields share: which attributes change over time besides positions."""
 
     move_rotations: bool = Field(default=True, description="rotations change over time")
     move_scales: bool = Field(default=True, description="scales change over time")

@@ -12,7 +12,7 @@ from dyngs.config.keys.section import Fraction, Positive
 
 
 class _OnTemplate(SceneModel):
-    """What models of people have in common: a body template, and scaffolds of Gaussians around it."""
+    """Keys that models of people share: a body template, and scaffolds of Gaussians around it."""
 
     body: Path | None = Field(default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template")
     uv: Path | None = Field(default=None, description=".obj with the texture coordinates of body; null: its own")

@@ -11,7 +11,7 @@ from dyngs.conventions import RasterizeMode
 
 
 class SceneModel(Section):
-    """What all models have in common: how Gaussians are coloured and drawn."""
+    """Keys that all models share: how Gaussians are coloured and drawn."""
 
     sh_degree: int = Field(
         default=3, ge=0, le=4, description="degree of the spherical harmonics of a colour; 0: the same from all sides"
