@@ -13,39 +13,35 @@ from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, StaticModel, TrajectoryField
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.deform.field import FieldSetup, Offsets, chosen
+from dyngs.deform.field import DeformationField, FieldSetup, NetworkField, Offsets, chosen
 from dyngs.deform.fields import field_state, new_field
-from dyngs.deform.scene import TrainedScene
+from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.parameters import Parameters
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
+from dyngs.state import tensors_of
+from dyngs.static.scene import StaticScene
 
 MOVING_ROWS = (1, 3)
 TRAIN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
 TEST_TIMES = (0.1, 0.4, 0.9)
 
 
+SETUP = FieldSetup(torch.zeros(3), torch.ones(3), len(TRAIN_TIMES), len(MOVING_ROWS), 1.0)
+
+
 @dataclass
-class Sliding:
+class Sliding(NetworkField):
     """Everything goes ``speed`` along x from time 0 to 1; counts how often it is asked."""
 
     speed: float = 1.0
     calls: int = 0
-    learned: Parameters = field(default_factory=lambda: Parameters({}, {}))
-    buffers: dict[str, Tensor] = field(default_factory=dict)
+    setup: FieldSetup = SETUP
+    parameters: Parameters = field(default_factory=lambda: Parameters({}, {}))
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         self.calls += 1
         return Offsets(torch.tensor([self.speed * time, 0.0, 0.0]).expand(len(chosen(means, rows)), 3))
-
-    def penalties(self, time: float) -> dict[str, Tensor]:
-        return {}
-
-    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        raise NotImplementedError
-
-    def select(self, index: Tensor, is_new: Tensor) -> None:
-        raise NotImplementedError
 
 
 @dataclass
@@ -68,16 +64,16 @@ def row_of_balls(count: int = 5) -> Gaussians:
     return Gaussians(means, quats, torch.full((count, 3), -1.6), torch.full((count,), 3.0), torch.zeros(count, 1, 3))
 
 
-def still_scene(count: int = 5, times: tuple[float, ...] = ()) -> TrainedScene:
+def still_scene(count: int = 5, times: tuple[float, ...] = ()) -> StaticScene:
     """A scene in which nothing moves."""
-    return TrainedScene(row_of_balls(count), torch.zeros(0, dtype=torch.long), times=times)
+    return StaticScene(gaussians=row_of_balls(count), seen_at=times)
 
 
 def moving_scene(
-    motion: Sliding, rows: tuple[int, ...] = MOVING_ROWS, times: tuple[float, ...] = TRAIN_TIMES
-) -> TrainedScene:
+    motion: DeformationField, rows: tuple[int, ...] = MOVING_ROWS, times: tuple[float, ...] = TRAIN_TIMES
+) -> DynamicScene:
     """Five balls of which ``rows`` follow ``motion``."""
-    return TrainedScene(row_of_balls(), torch.tensor(rows), motion, times=times)
+    return DynamicScene(gaussians=row_of_balls(), seen_at=times, field=motion, moving=torch.tensor(rows))
 
 
 def camera(width: int = 20, height: int = 14) -> Cameras:
@@ -119,11 +115,9 @@ def write_moving_run(
     gaussians = row_of_balls()
     tensors = {f"gaussians.{name}": x.contiguous() for name, x in gaussians.tensors().items()}
     if moves:
-        setup = FieldSetup(torch.zeros(3), torch.ones(3), len(TRAIN_TIMES), len(MOVING_ROWS), 1.0)
-        motion = new_field(options, setup, torch.Generator())
-        motion.learned["means"].data[:, 0, 0] = 0.5  # times 2 t - 1
-        state = field_state(motion, setup)
-        tensors |= {f"model.field.{name}": x for name, x in state.items()}
+        motion = new_field(options, SETUP, torch.Generator())
+        motion.parameters["means"].data[:, 0, 0] = 0.5  # times 2 t - 1
+        tensors |= {f"model.field.{name}": x for name, x in tensors_of(field_state(motion)).items()}
         tensors["model.rows"] = torch.tensor(MOVING_ROWS)
         tensors["model.times"] = torch.tensor(TRAIN_TIMES, dtype=torch.float64)
     info = CheckpointInfo(7, 1.0, offset, "white", "classic")

@@ -68,7 +68,7 @@ def stirred_field(kind: str, num_moving: int = 9, *, size: float = 0.2, everythi
 def stir(field: DeformationField, size: float = 0.2) -> None:
     """Put noise on all that is learned."""
     generator = torch.Generator().manual_seed(4)
-    for name, x in field.learned.values().items():
+    for name, x in field.parameters.values().items():
         noise = size * torch.randn(x.shape, generator=generator)
         x += noise.abs() if name.startswith(("bias", "space")) else noise
 

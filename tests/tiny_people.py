@@ -6,12 +6,11 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from dyngs.train.predictor import Filmed, filmed
-
 from dyngs.config import DataConfig, HumanPredictorModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.load import default_template
+from dyngs.training.prediction import Filmed, filmed
 
 TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)
 NET = HumanPredictorModel(
