@@ -64,8 +64,10 @@ def test_gradients_reach_all_that_is_learned(kind: str) -> None:
     for field, trained in ((stirred_field(kind), True), (tiny_field(kind), False)):
         outputs = [x for x in vars(field.offsets(gaussians.means, 0.37)).values() if x is not None]
         torch.stack([(x * weights(x)).sum() for x in outputs]).sum().backward()
-        names = list(field.learned.values())
-        reached = {name for name in names if field.learned[name].grad is not None and field.learned[name].grad.any()}
+        names = list(field.parameters.values())
+        reached = {
+            name for name in names if field.parameters[name].grad is not None and field.parameters[name].grad.any()
+        }
         first = set(names[-2:]) if kind in ("hexplane", "mlp") else set(names)
         assert reached == (set(names) if trained else first)
 

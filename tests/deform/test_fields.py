@@ -6,11 +6,12 @@ import pytest
 import torch
 from tiny_fields import KINDS, TIMES, cloud, stirred_field, tiny_field, tiny_options, tiny_setup
 
-from dyngs.deform.fields import field_state, new_field, part_of, restored_field
+from dyngs.deform.fields import field_state, new_field, restored_field
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
 from dyngs.deform.skeleton import Skeleton
 from dyngs.deform.trajectory import Trajectory
+from dyngs.state import tensors_of
 
 
 def test_options_decide_the_kind() -> None:
@@ -25,16 +26,17 @@ def test_a_restored_field_moves_everything_alike(kind: str) -> None:
     field, setup, means = stirred_field(kind), tiny_setup(), cloud().means
     for time in TIMES:
         field.offsets(means, time).means.square().sum().backward()
-    field.learned.step(1, 0.0)
-    state = {name: x.clone() for name, x in field_state(field, setup).items()}
-    again, same = restored_field(tiny_options(kind), state, 9)
+    field.parameters.step(1, 0.0)
+    state = {name: x.clone() for name, x in tensors_of(field_state(field)).items()}
+    again = restored_field(tiny_options(kind), state, 9)
+    same = again.setup
     assert torch.equal(same.center, setup.center)
     assert torch.equal(same.half_size, setup.half_size)
     assert (same.num_times, same.num_moving, same.extent) == (setup.num_times, 9, setup.extent)
     for step in (2, 3):
         for one in (field, again):
             one.offsets(means, 0.2 * step).means.square().sum().backward()
-            one.learned.step(step, 0.5)
+            one.parameters.step(step, 0.5)
     for time in TIMES:
         found, expected = again.offsets(means, time), field.offsets(means, time)
         for name, x in vars(expected).items():
@@ -44,7 +46,7 @@ def test_a_restored_field_moves_everything_alike(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_missing_is_named(kind: str) -> None:
-    state = field_state(tiny_field(kind), tiny_setup())
+    state = tensors_of(field_state(tiny_field(kind)))
     for name in ("box", "numbers", next(name for name in state if name.startswith("learned."))):
         with pytest.raises(KeyError, match=name.removeprefix("learned.")):
             restored_field(tiny_options(kind), {k: x for k, x in state.items() if k != name}, 9)
@@ -53,7 +55,7 @@ def test_what_is_missing_is_named(kind: str) -> None:
 def test_the_generator_decides_everything() -> None:
     for kind in KINDS:
         fields = [new_field(tiny_options(kind), tiny_setup(), torch.Generator().manual_seed(s)) for s in (1, 1, 2)]
-        first, second, other = (f.learned.values() for f in fields)
+        first, second, other = (f.parameters.values() for f in fields)
         assert all(torch.equal(x, second[name]) for name, x in first.items())
         assert kind in ("control_nodes", "trajectory") or any(
             not torch.equal(x, other[name]) for name, x in first.items()
@@ -72,8 +74,3 @@ def test_some_rows_are_moved_as_among_all(kind: str) -> None:
         (slope,) = torch.autograd.grad(some.means.sum(), means)
         assert set(torch.nonzero(slope.any(1))[:, 0].tolist()) == {2, 3, 7}
     assert len(field.offsets(means, 0.37, rows[:0]).means) == 0
-
-
-def test_part_of_takes_the_prefix_away() -> None:
-    x, y = torch.zeros(1), torch.ones(1)
-    assert part_of({"a.x": x, "ab.x": y, "x": y}, "a.") == {"x": x}

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from dyngs.config import HexplaneField
 from dyngs.deform.hexplane import Hexplane, time_rows
+from dyngs.gaussians import TopologyEdit
+from dyngs.state import tensors_of
 
 WITHOUT_PENALTIES = {"space_smoothness": 0.0, "time_smoothness": 0.0, "time_sparsity": 0.0}
 
@@ -127,7 +129,7 @@ def test_extend_makes_the_motion_stand_still_beyond_what_was_seen() -> None:
     options = tiny_options("hexplane").model_copy(update={"time_resolution": 11})
     assert isinstance(options, HexplaneField)
     field = Hexplane(options, tiny_setup(), torch.Generator().manual_seed(0))
-    for x in field.learned.values().values():
+    for x in field.parameters.values().values():
         x += 0.2 * torch.randn(x.shape, generator=torch.Generator().manual_seed(1))
     means = cloud().means
     inside, first, last = (outputs_at(field, means, t) for t in (0.5, 0.4, 0.6))
@@ -148,10 +150,10 @@ def test_penalties_vanish_on_smooth_planes_only() -> None:
     rough = field.penalties(0.3)["plane smoothness"]
     assert rough.detach() > 0
     rough.backward()
-    grad = field.learned["time0"].grad
+    grad = field.parameters["time0"].grad
     assert grad is not None
     assert grad[1].any()
-    assert not grad[2].any() or bool((field.learned["time0"][2] != 1).any())
+    assert not grad[2].any() or bool((field.parameters["time0"][2] != 1).any())
     field.levels[0].time.data[1, 2] += 0.1
     assert field.penalties(0.3)["plane smoothness"].detach() > rough.detach()
     options = HexplaneField(channels=1, resolution=4, levels=(1,), **WITHOUT_PENALTIES)
@@ -160,6 +162,6 @@ def test_penalties_vanish_on_smooth_planes_only() -> None:
 
 def test_select_changes_nothing() -> None:
     field = stirred_field("hexplane")
-    before = {name: x.clone() for name, x in field.learned.state().items()}
-    field.select(torch.tensor([3, 3, 0]), torch.tensor([False, True, False]))
-    assert all(torch.equal(x, before[name]) for name, x in field.learned.state().items())
+    before = {name: x.clone() for name, x in tensors_of(field.parameters.state()).items()}
+    field = field.edited(TopologyEdit(torch.tensor([3, 3, 0]), torch.tensor([False, True, False])))
+    assert all(torch.equal(x, before[name]) for name, x in tensors_of(field.parameters.state()).items())

@@ -11,6 +11,8 @@ from tiny_fields import TIMES, cloud, stirred_field, tiny_field, tiny_setup
 from dyngs.config import MlpField
 from dyngs.deform.field import Offsets
 from dyngs.deform.mlp import SKIP_LAYER, Mlp, encoded
+from dyngs.gaussians import TopologyEdit
+from dyngs.state import tensors_of
 
 
 def outputs(offsets: Offsets) -> list[torch.Tensor]:
@@ -33,7 +35,7 @@ def test_deep_networks_see_the_input_once_more(depth: int, skips: bool) -> None:
         MlpField(depth=depth, width=6, space_frequencies=1, time_frequencies=1), tiny_setup(), torch.Generator()
     )
     num_inputs = 3 * 3 + 3
-    widths = [field.learned[f"weight{i}"].shape[1] for i in range(depth + 1)]
+    widths = [field.parameters[f"weight{i}"].shape[1] for i in range(depth + 1)]
     expected = [num_inputs] + [6] * depth
     if skips:
         expected[SKIP_LAYER] += num_inputs
@@ -58,8 +60,8 @@ def test_nothing_moving_is_no_error() -> None:
 
 def test_extend_and_select_change_no_weight() -> None:
     field = tiny_field("mlp")
-    before = {name: x.clone() for name, x in field.learned.state().items()}
+    before = {name: x.clone() for name, x in tensors_of(field.parameters.state()).items()}
     field.extend((0.4, 0.6), (0.0, 1.0))
-    field.select(torch.tensor([1, 1]), torch.tensor([False, True]))
-    assert all(torch.equal(x, before[name]) for name, x in field.learned.state().items())
+    field = field.edited(TopologyEdit(torch.tensor([1, 1]), torch.tensor([False, True])))
+    assert all(torch.equal(x, before[name]) for name, x in tensors_of(field.parameters.state()).items())
     assert field.penalties(0.3) == {}

@@ -7,33 +7,26 @@ from collections.abc import Callable
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tiny_fields import cloud, stirred_field
+from tiny_fields import cloud, stirred_field, tiny_setup
 from torch import Tensor
 
-from dyngs.deform.field import Offsets, deformed
+from dyngs.deform.field import NetworkField, Offsets, deformed
 from dyngs.deform.motion import MAX_SAMPLES, PX_PER_OPACITY, bake_, measure_motion
 from dyngs.parameters import Parameters
 
 TIMES = tuple(i / 10 for i in range(11))
 
 
-class Scripted:
+class Scripted(NetworkField):
     """A field that follows a function of time; keeps the times at which it was asked."""
 
     def __init__(self, script: Callable[[Tensor, float], Offsets]) -> None:
         self.script, self.asked = script, list[float]()
-        self.learned, self.buffers = Parameters({}, {}), dict[str, Tensor]()
+        self.setup, self.parameters = tiny_setup(), Parameters({}, {})
 
-    def offsets(self, means: Tensor, time: float) -> Offsets:
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         self.asked.append(time)
         return self.script(means, time)
-
-    def penalties(self, time: float) -> dict[str, Tensor]:
-        return {}
-
-    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None: ...
-
-    def select(self, index: Tensor, is_new: Tensor) -> None: ...
 
 
 def filled(count: int, *values: float) -> Tensor:

@@ -83,7 +83,7 @@ def test_the_ends_of_the_clip_are_ordinary_times(kind: str, time: float) -> None
     )
     found = values(field.offsets(means, time))
     (found * weights(found)).sum().backward()
-    grads = [field.learned[name].grad for name in field.learned.values()]
+    grads = [field.parameters[name].grad for name in field.parameters.values()]
     assert all(x is not None and x.isfinite().all() and x.any() for x in grads)
 
 
@@ -161,7 +161,7 @@ def test_no_moving_gaussians(kind: str) -> None:
     assert all(torch.equal(x, gaussians.tensors()[name]) for name, x in moved.tensors().items())
     if moved.means.requires_grad:
         moved.means.sum().backward()
-    assert field.learned.step(1, 0.0) == 0
+    assert field.parameters.step(1, 0.0) == 0
     scene = TrainedScene(gaussians, torch.zeros(0, dtype=torch.long), field)
     assert scene.at(0.4) is gaussians
 
@@ -174,7 +174,7 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     assert isinstance(model, DynamicScene)
     model.rows = torch.tensor([0, 3])
     assert model.field is not None
-    model.field.select(model.rows, torch.zeros(2, dtype=torch.bool))
+    model.field = field.edited(TopologyEdit(model.rows, torch.zeros(2, dtype=torch.bool)))
     trainer.step()
     keep = torch.ones(len(trainer.scene.gaussians), dtype=torch.bool)
     keep[model.rows] = False
@@ -213,7 +213,9 @@ def test_boxes_without_volume(kind: str, flat: str) -> None:
     found = values(field.offsets(means, 0.3))
     assert found.isfinite().all()
     (found * weights(found)).sum().backward()
-    assert all(field.learned[n].grad is None or field.learned[n].grad.isfinite().all() for n in field.learned.values())
+    assert all(
+        field.parameters[n].grad is None or field.parameters[n].grad.isfinite().all() for n in field.parameters.values()
+    )
     if flat == "point" and kind != "trajectory":
         torch.testing.assert_close(found, found[:1].expand_as(found))
 
@@ -250,7 +252,7 @@ def test_gaussians_far_outside_the_box(distance: float) -> None:
         return
     for kind in ("mlp", "control_nodes", "trajectory"):
         field = stirred_field(kind)
-        field.select(torch.arange(9), torch.zeros(9, dtype=torch.bool))
+        field = field.edited(TopologyEdit(torch.arange(9), torch.zeros(9, dtype=torch.bool)))
         assert values(field.offsets(means, 0.4)).isfinite().all()
 
 
@@ -289,12 +291,12 @@ def test_gradients_that_are_not_finite_are_left_out(kind: str) -> None:
     """Row by row, counted in the log as ``bad_gradients``; what is learned stays finite."""
     field, means = stirred_field(kind), cloud().means
     values(field.offsets(means, 0.4)).sum().backward()
-    for name in field.learned.values():
-        grad = field.learned[name].grad
+    for name in field.parameters.values():
+        grad = field.parameters[name].grad
         assert grad is not None
         grad.view(-1)[0] = float("nan")
-    assert field.learned.step(1, 0.0) == len(field.learned.values())
-    assert all(x.isfinite().all() for x in field.learned.state().values())
+    assert field.parameters.step(1, 0.0) == len(field.parameters.values())
+    assert all(x.isfinite().all() for x in tensors_of(field.parameters.state()).values())
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
@@ -305,7 +307,7 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
     model = trainer.model
     assert isinstance(model, DynamicScene)
     assert model.field is not None
-    for x in model.field.learned.values().values():
+    for x in model.field.parameters.values().values():
         x.fill_(bad)
     before = trainer.scene.gaussians.means.detach().clone()
     with pytest.raises(

@@ -18,6 +18,8 @@ from torch import Tensor
 from dyngs.config import ControlNodesField
 from dyngs.deform.field import Offsets
 from dyngs.deform.skeleton import Skeleton
+from dyngs.gaussians import TopologyEdit
+from dyngs.state import tensors_of
 
 MEANS_ONLY = dict.fromkeys(HEADS, False)
 
@@ -38,14 +40,21 @@ def placed(means: Tensor, **options: object) -> Skeleton:
     return field
 
 
+def changed(field: Skeleton, source: Tensor, is_new: Tensor) -> Skeleton:
+    """The field after an edit in training."""
+    field = field.edited(TopologyEdit(source, is_new))
+    field.regroup()
+    return field
+
+
 def points_of(field: Skeleton) -> Tensor:
     """(P,) control points of the first node's motion along x."""
-    return field.learned["means"].detach()[0, :, 0]
+    return field.parameters["means"].detach()[0, :, 0]
 
 
 def hold(field: Skeleton, name: str, values: Tensor) -> None:
     """Let all nodes keep ``values`` (S, size) of one head at all times: all control points are equal."""
-    field.learned[name].data[:] = values[:, None]
+    field.parameters[name].data[:] = values[:, None]
 
 
 def outputs(offsets: Offsets) -> Tensor:
@@ -66,7 +75,7 @@ def test_motion_is_a_cubic_spline(time: float, pieces: int, seed: int) -> None:
     means = cloud().means
     field = placed(means, nodes=1, pieces=pieces, **MEANS_ONLY)
     values = np.random.default_rng(seed).normal(size=(pieces + 3, 3))
-    field.learned["means"].data[0] = torch.from_numpy(values).float()
+    field.parameters["means"].data[0] = torch.from_numpy(values).float()
     expected = BSpline((np.arange(pieces + 7) - 3) / pieces, values, 3)(time)
     found = field.offsets(means, time).means.detach()
     # Four values of up to 5 with weights that add up to 1: 8 roundings of those; the place among up to 6 pieces is off
@@ -101,7 +110,7 @@ def test_after_any_changes_of_the_set_nodes_are_where_gaussians_are(nodes: int, 
     index = torch.arange(12)
     for chosen in sets:
         rows = torch.tensor([i % len(index) for i in chosen] if len(index) else [], dtype=torch.long)
-        field.select(rows, torch.zeros(len(rows), dtype=torch.bool))
+        field = changed(field, rows, torch.zeros(len(rows), dtype=torch.bool))
         index = index[rows]
         means = everything[index]
         offsets = field.offsets(means, 0.3)
@@ -110,11 +119,23 @@ def test_after_any_changes_of_the_set_nodes_are_where_gaussians_are(nodes: int, 
             continue
         positions, followed = field.buffers["positions"], field.buffers["followed"]
         assert 1 <= len(positions) <= nodes
-        assert len(positions.unique(dim=0)) == len(positions) == len(field.learned["means"])
+        assert len(positions.unique(dim=0)) == len(positions) == len(field.parameters["means"])
         assert followed.max() < len(positions)
         if nodes == 12:
             assert torch.equal(positions[followed[:, 0]], means)
-        assert all(len(x) == len(positions) for x in field.learned.state().values())
+        assert all(len(x) == len(positions) for x in tensors_of(field.parameters.state()).values())
+
+
+def test_an_edited_field_leaves_the_other_as_it_was() -> None:
+    """Also when nodes are placed anew: a scene and its parts may be drawn in turns."""
+    means, rows = cloud().means, torch.tensor([2, 5, 5, 7])
+    field = stirred_field("control_nodes")
+    before = outputs(field.offsets(means, 0.3))
+    part = field.edited(TopologyEdit.select(rows))
+    assert torch.equal(outputs(part.offsets(means[rows], 0.3)), before[rows])
+    part.regroup()
+    part.offsets(means[rows], 0.3)
+    assert torch.equal(outputs(field.offsets(means, 0.3)), before)
 
 
 def test_new_nodes_start_with_the_motion_found_there() -> None:
@@ -127,7 +148,7 @@ def test_new_nodes_start_with_the_motion_found_there() -> None:
     hold(field, "means", positions @ matrix.T - positions)
     quat = torch.from_numpy(turn.as_quat()).float().roll(1)
     hold(field, "quats", (quat - torch.tensor([1.0, 0, 0, 0])).expand(10, 4))
-    field.select(torch.arange(30) % 10, torch.arange(30) >= 10)
+    field = changed(field, torch.arange(30) % 10, torch.arange(30) >= 10)
     moved = means + field.offsets(means, 1.0).means.detach()
     assert len(field.buffers["positions"]) == 20
     torch.testing.assert_close(moved, means @ matrix.T, rtol=0, atol=1e-5)
@@ -137,18 +158,18 @@ def test_nodes_that_nothing_follows_are_dropped_with_their_moments() -> None:
     means = torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]])
     field = placed(means, nodes=3, pieces=1, **MEANS_ONLY)
     field.offsets(means, 0.5).means.square().sum().backward()
-    for x in (field.learned["means"],):
+    for x in (field.parameters["means"],):
         x.grad = torch.ones_like(x)
-    field.learned.step(1, 0.0)
+    field.parameters.step(1, 0.0)
     stays = [x.tolist() for x in field.buffers["positions"]].index([-1.0, 0.0, 0.0])
-    old = {name: x[stays].clone() for name, x in field.learned.state().items()}
-    field.select(torch.tensor([0]), torch.tensor([False]))
+    old = {name: x[stays].clone() for name, x in tensors_of(field.parameters.state()).items()}
+    field = changed(field, torch.tensor([0]), torch.tensor([False]))
     field.offsets(means[:1], 0.5)
     assert field.buffers["positions"].tolist() == [[-1.0, 0.0, 0.0]]
-    assert all(torch.equal(x, old[name][None]) for name, x in field.learned.state().items())
-    field.select(torch.tensor([0, 0]), torch.tensor([False, True]))
+    assert all(torch.equal(x, old[name][None]) for name, x in tensors_of(field.parameters.state()).items())
+    field = changed(field, torch.tensor([0, 0]), torch.tensor([False, True]))
     field.offsets(means[[0, 2]], 0.5)
-    state = field.learned.state()
+    state = tensors_of(field.parameters.state())
     assert state["exp_avg.means"][0].any()
     assert not state["exp_avg.means"][1].any()
 
@@ -159,7 +180,7 @@ def test_when_nothing_is_left_there_is_nothing_to_move() -> None:
     field = skeleton()
     assert len(field.offsets(nobody, 0.5).means) == 0
     field = placed(cloud().means)
-    field.select(torch.zeros(0).long(), torch.zeros(0).bool())
+    field = changed(field, torch.zeros(0).long(), torch.zeros(0).bool())
     offsets = field.offsets(nobody, 0.5)
     assert offsets.means.shape == (0, 3)
     assert offsets.quats is not None
@@ -180,7 +201,7 @@ def test_nodes_stay_while_the_set_does() -> None:
 def test_motion_goes_on_at_constant_velocity() -> None:
     """That of the last two intervals on either side; the outermost points of what was seen do not count."""
     field = placed(cloud().means, pieces=10)
-    field.learned["means"].data[0, :, 0] = torch.tensor([-7.0] * 5 + [3, 4, 6, 7] + [-7] * 4)
+    field.parameters["means"].data[0, :, 0] = torch.tensor([-7.0] * 5 + [3, 4, 6, 7] + [-7] * 4)
     field.extend((0.4, 0.6), (0.2, 0.8))
     assert points_of(field).tolist() == [-4.5, -3, -1.5, 0, 1.5, 3, 4, 6, 7.5, 9, 10.5, 12, 13.5]
     field.extend((0.0, 1.0), (0.0, 1.0))
@@ -190,7 +211,7 @@ def test_motion_goes_on_at_constant_velocity() -> None:
 def test_of_a_single_moment_there_is_no_velocity() -> None:
     """Cameras of a rig: the first window may be one time."""
     field = placed(cloud().means, pieces=4)
-    field.learned["means"].data[0, :, 0] = torch.tensor([0.0, 0, 0, 3, 0, 0, 0])
+    field.parameters["means"].data[0, :, 0] = torch.tensor([0.0, 0, 0, 3, 0, 0, 0])
     field.extend((0.5, 0.5), (0.0, 1.0))
     assert points_of(field).tolist() == [3.0] * 7
 
@@ -208,7 +229,7 @@ def test_uniform_motion_goes_on(pieces: int, strays: list[float]) -> None:
     high = pieces + 2 if last >= 1 else math.ceil(last * pieces) + 1
     start = torch.full((pieces + 3,), -99.0)
     start[low : high + 1] = uniform[low : high + 1]
-    field.learned["means"].data[0, :, 0] = start
+    field.parameters["means"].data[0, :, 0] = start
     for before, after in pairwise(windows):
         field.extend(before, after)
     assert torch.equal(points_of(field)[low : high + 1], uniform[low : high + 1])
@@ -221,7 +242,7 @@ def test_uniform_motion_goes_on(pieces: int, strays: list[float]) -> None:
 
 def test_uniform_motion_has_no_acceleration_and_a_shift_no_strain() -> None:
     field = placed(cloud().means, nodes=4, pieces=3)
-    field.learned["means"].data[:] = torch.arange(6.0)[None, :, None]
+    field.parameters["means"].data[:] = torch.arange(6.0)[None, :, None]
     penalties = field.penalties(0.3)
     assert penalties.keys() == {"node acceleration", "node rigidity"}
     assert float(penalties["node acceleration"].detach()) == pytest.approx(0.0, abs=1e-10)
@@ -233,13 +254,13 @@ def test_known_penalties() -> None:
     means = torch.tensor([[-1.0, 0, 0], [1, 0, 0]])
     field = placed(means, nodes=2, pieces=1, rigidity=1.0, smoothness=1.0)
     right = int(field.buffers["positions"][:, 0].argmax())
-    field.learned["means"].data[right, 0, 0] = 6.0
+    field.parameters["means"].data[right, 0, 0] = 6.0
     assert float(field.penalties(0.0)["node rigidity"].detach()) == pytest.approx(0.25)
     assert float(field.penalties(1.0)["node rigidity"].detach()) == 0.0
     acceleration = 3**2 / 12  # second differences 6 / 2 and 0 along one of 2 x 3 coordinates
     assert float(field.penalties(0.5)["node acceleration"].detach()) == pytest.approx(acceleration)
     field.penalties(0.0)["node rigidity"].backward()
-    grad = field.learned["means"].grad
+    grad = field.parameters["means"].grad
     assert grad is not None
     away = grad[right, :, 0]
     assert away.tolist() == pytest.approx([0.5 / 6, 0.5 * 4 / 6, 0.5 / 6, 0.0])

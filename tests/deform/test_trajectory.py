@@ -11,6 +11,8 @@ from torch import Tensor
 
 from dyngs.config import TrajectoryField
 from dyngs.deform.trajectory import Trajectory, basis
+from dyngs.gaussians import TopologyEdit
+from dyngs.state import tensors_of
 
 MEANS_ONLY = {"move_rotations": False, "move_scales": False}
 
@@ -51,7 +53,7 @@ def test_number_of_terms(polynomial: int, fourier: int) -> None:
     assert basis(0.3, polynomial, fourier).shape == (polynomial + 2 * fourier,)
     field = new_trajectory(polynomial=polynomial, fourier=fourier)
     assert not field.offsets(cloud().means, 0.3).means.any()
-    assert field.learned.num_values == 9 * (polynomial + 2 * fourier) * 10
+    assert field.parameters.num_values == 9 * (polynomial + 2 * fourier) * 10
 
 
 def test_a_curve_in_the_span_is_reproduced() -> None:
@@ -60,7 +62,7 @@ def test_a_curve_in_the_span_is_reproduced() -> None:
     curve = torch.stack([torch.sin(2 * math.pi * times), times**2 - times + 1 / 6, times - 0.5], dim=1)
     values = torch.stack([basis(float(t), 2, 1) for t in times])
     field = new_trajectory(2, polynomial=2, fourier=1, **MEANS_ONLY)
-    field.learned["means"].data[1] = torch.linalg.lstsq(values, curve).solution.float()
+    field.parameters["means"].data[1] = torch.linalg.lstsq(values, curve).solution.float()
     for t in (0.0, 0.123, 0.7, 1.0):
         found = field.offsets(torch.zeros(2, 3), t).means.detach()
         expected = torch.tensor([math.sin(2 * math.pi * t), t * t - t + 1 / 6, t - 0.5])
@@ -69,11 +71,11 @@ def test_a_curve_in_the_span_is_reproduced() -> None:
 
 def test_each_gaussian_has_its_own_curve_and_takes_it_along() -> None:
     field = new_trajectory(3)
-    for x in field.learned.values().values():
+    for x in field.parameters.values().values():
         x += torch.arange(3.0)[:, None, None]
     index = torch.tensor([2, 0, 2, 1])
     before = field.offsets(torch.zeros(3, 3), 0.3)
-    field.select(index, torch.tensor([False, False, True, False]))
+    field = field.edited(TopologyEdit(index, torch.tensor([False, False, True, False])))
     after = field.offsets(torch.zeros(4, 3), 0.3)
     for name, x in vars(before).items():
         assert (x is None) == (getattr(after, name) is None)
@@ -83,9 +85,9 @@ def test_each_gaussian_has_its_own_curve_and_takes_it_along() -> None:
 
 def test_the_place_does_not_matter_and_nothing_is_penalized() -> None:
     field = new_trajectory()
-    field.learned["means"].data += 1.0
+    field.parameters["means"].data += 1.0
     assert torch.equal(field.offsets(torch.zeros(9, 3), 0.2).means, field.offsets(torch.ones(9, 3), 0.2).means)
-    before = {name: x.clone() for name, x in field.learned.state().items()}
+    before = {name: x.clone() for name, x in tensors_of(field.parameters.state()).items()}
     field.extend((0.4, 0.6), (0.0, 1.0))
-    assert all(torch.equal(x, before[name]) for name, x in field.learned.state().items())
+    assert all(torch.equal(x, before[name]) for name, x in tensors_of(field.parameters.state()).items())
     assert field.penalties(0.3) == {}
