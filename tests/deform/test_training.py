@@ -1,8 +1,9 @@
-"""The dynamic model: its phases, where motion begins, what it freezes, how it follows changes of the set."""
+"""Training of a dynamic scene: its phases, where motion begins, what is frozen, how it follows changes of the set."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -16,16 +17,18 @@ from dyngs.camera import Cameras
 from dyngs.config import DynamicModel, OptimConfig, TrajectoryField
 from dyngs.data.loader import Picture
 from dyngs.deform.field import FieldSetup
-from dyngs.deform.fields import field_state, new_field
+from dyngs.deform.fields import new_field
 from dyngs.deform.residual import Residuals
+from dyngs.deform.scene import DynamicScene
 from dyngs.deform.seeds import box_of
-from dyngs.deform.training import DeformSchedule, DynamicScene, Surroundings4D
-from dyngs.deform.window import TimeWindow
+from dyngs.deform.training import DeformSchedule, DynamicTraining, TrainingViews
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.rendering import render
+from dyngs.scene import Moment
+from dyngs.state import part_of, tensors_of
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.rates import Rates
-from dyngs.static.training import StaticScene
+from dyngs.static.training import FilterUpdate
 
 FINE, FULL, SPLIT, STEPS = 2, 4, 6, 20
 TIMES = tuple(i / 20 for i in range(21))
@@ -47,6 +50,10 @@ def flat_cloud(count: int = 9) -> Gaussians:
     means = torch.rand((count, 3), generator=torch.Generator().manual_seed(1)) - 0.5
     means[:, 2] = 0.0
     gaussians = cloud(count).replace(means=means)
+    return leaves(gaussians)
+
+
+def leaves(gaussians: Gaussians) -> Gaussians:
     return Gaussians(**{name: x.clone().requires_grad_() for name, x in gaussians.tensors().items()})
 
 
@@ -58,73 +65,107 @@ def unmeasured(gaussians_at: Callable[[float], Gaussians]) -> Residuals:
     return alike(torch.zeros(len(gaussians_at(0.0))))
 
 
-def new_scene(
+@dataclass
+class Run:
+    """A scene and how it is trained, driven as the trainer does."""
+
+    training: DynamicTraining
+    scene: DynamicScene
+
+    def moment(self, time: float | None, step: int) -> Moment:
+        return self.training.moment(self.scene, picture(time), step)
+
+    def drawn_at(self, time: float) -> Gaussians:
+        """At the end of the run."""
+        return self.moment(time, STEPS).gaussians.detach()
+
+    def after_step(self, step: int, result: EditResult | None = None) -> int:
+        """Optimize, follow ``result``, bring up to date; the number of rows left out for bad gradients."""
+        left_out = self.training.optimize(self.scene, step)
+        if result is not None and result.edit is not None:
+            edited = self.scene.edited(result.edit)
+            self.scene = edited.with_gaussians(leaves(edited.gaussians))
+        self.scene = self.training.after_step(self.scene, step, result is not None)
+        return left_out
+
+    def grow(self, step: int) -> EditResult | None:
+        grown = self.training.grown(self.scene, step)
+        if grown is None:
+            return None
+        self.scene, result = grown
+        return result
+
+    @property
+    def model_state(self) -> dict[str, Tensor]:
+        """What is stored beside the Gaussians."""
+        return part_of(tensors_of(self.scene.state()), "model")
+
+
+def new_run(
+    gaussians: Gaussians,
     times: tuple[float, ...] = TIMES,
     residuals: Callable[[Callable[[float], Gaussians]], Residuals] = unmeasured,
-    still: StaticScene | None = None,
+    update: FilterUpdate | None = None,
     cameras_stay: bool = False,
+    full: int = FULL,
     **options: object,
-) -> DynamicScene:
-    """A dynamic model; its field is a straight line per Gaussian unless told otherwise."""
+) -> Run:
+    """Before the first step; the field is a straight line per Gaussian unless told otherwise."""
     line = TrajectoryField(polynomial=1, fourier=0, move_rotations=False, move_scales=False)
     defaults = {"deform": line, "num_random_moving": 0, "motion_sparsity": 0.0, "freeze_below_px": THRESHOLD}
-    capture = Surroundings4D(times, [camera()], 1.0, residuals, cameras_stay)
-    schedule = DeformSchedule(FINE, FINE, FULL, FINE, (SPLIT,), Rates(STEPS))
+    capture = TrainingViews(times, [camera()], 1.0, residuals, cameras_stay)
+    schedule = DeformSchedule(FINE, FINE, full, FINE, (SPLIT,), Rates(STEPS))
     model = DynamicModel.model_validate(defaults | options)
-    return DynamicScene(model, schedule, capture, still or StaticScene(), torch.Generator())
+    training = DynamicTraining(model, schedule, capture, update or FilterUpdate(), torch.Generator())
+    return Run(training, training.first_scene(gaussians))
 
 
-def begun(gaussians: Gaussians, **options: object) -> DynamicScene:
+def begun(gaussians: Gaussians, **options: object) -> Run:
     """After the coarse phase, as if the errors had said that all of the Gaussians move."""
-    scene = new_scene(**options)  # type: ignore[arg-type]
-    setup = FieldSetup(*box_of(gaussians, 1.0), len(scene.times), len(gaussians), 1.0)
-    field = new_field(scene.options.deform, setup, torch.Generator().manual_seed(0))
-    state = {f"field.{name}": x.clone() for name, x in field_state(field, setup).items()}
-    scene.load_state({**state, "rows": torch.arange(len(gaussians))})
-    return scene
+    run = new_run(gaussians, **options)  # type: ignore[arg-type]
+    setup = FieldSetup(*box_of(gaussians, 1.0), len(run.scene.times), len(gaussians), 1.0)
+    field = new_field(run.training.options.deform, setup, torch.Generator().manual_seed(0))
+    run.scene = replace(run.scene, field=field, moving=torch.arange(len(gaussians)))
+    return run
 
 
-def move(scene: DynamicScene, speeds: Tensor) -> None:
+def move(run: Run, speeds: Tensor) -> None:
     """Let Gaussian i go from -speeds[i] to speeds[i] along x, world units."""
-    assert scene.field is not None
-    scene.field.learned["means"].data[:, 0, 0] = speeds
+    assert run.scene.field is not None
+    run.scene.field.parameters["means"].data[:, 0, 0] = speeds
 
 
-def speeds_of(scene: DynamicScene) -> Tensor:
-    assert scene.field is not None
-    return scene.field.learned["means"].detach()[:, 0, 0]
-
-
-def drawn_at(scene: DynamicScene, gaussians: Gaussians, time: float) -> Gaussians:
-    return scene.gaussians_at(gaussians, picture(time), STEPS).gaussians.detach()
+def speeds_of(run: Run) -> Tensor:
+    assert run.scene.field is not None
+    return run.scene.field.parameters["means"].detach()[:, 0, 0]
 
 
 # --- phases -----------------------------------------------------------------------------------------------------------
 
 
 def test_before_the_fine_phase_it_is_the_static_model() -> None:
-    scene, gaussians = new_scene(residuals=lambda _: alike(torch.arange(9.0))), flat_cloud()
+    gaussians = flat_cloud()
+    run = new_run(gaussians, residuals=lambda _: alike(torch.arange(9.0)))
     for step in (1, FINE):
-        assert scene.edit(gaussians, step - 1) is None
-        drawn = scene.gaussians_at(gaussians, picture(0.3), step)
+        assert run.grow(step - 1) is None
+        drawn = run.moment(0.3, step)
         assert drawn.gaussians is gaussians
         assert drawn.penalties == {}
-        assert scene.num_moving(9) == 0
-        scene.after_step(gaussians, step, None)
-    scene.edit(gaussians, FINE)
-    assert scene.num_moving(9) > 0
-    assert torch.equal(drawn_at(scene, gaussians, 0.3).means, gaussians.means)
+        assert run.scene.num_moving == 0
+        run.after_step(step)
+    run.grow(FINE)
+    assert run.scene.num_moving > 0
+    assert torch.equal(run.drawn_at(0.3).means, gaussians.means)
 
 
 @pytest.mark.parametrize(("step", "tracks"), [(FINE + 2, True), (FINE + 3, False)])
 def test_on_the_newest_views_only_the_motion_learns(step: int, tracks: bool) -> None:
     """What is new must not spoil the form before it is followed."""
     gaussians = flat_cloud()
-    scene = begun(gaussians)
-    scene.window = TimeWindow.around_middle(TIMES, 0.3, FINE, FINE, FINE + 10)
-    scene.gaussians_at(gaussians, picture(0.6), step).gaussians.means.sum().backward()
-    assert scene.field is not None
-    assert scene.field.learned["means"].grad is not None
+    run = begun(gaussians, time_window=0.3, full=FINE + 10)
+    run.moment(0.6, step).gaussians.means.sum().backward()
+    assert run.scene.field is not None
+    assert run.scene.field.parameters["means"].grad is not None
     assert (gaussians.means.grad is None) == tracks
 
 
@@ -136,17 +177,17 @@ ERRORS = (0.01, 0.3, 0.02, 0.35, 0.03, 0.0, 0.31, 0.02, 0.01)
 
 def test_what_a_still_model_cannot_explain_moves() -> None:
     """And only after the last step of the coarse phase."""
-    scene, gaussians = new_scene(residuals=lambda _: alike(torch.tensor(ERRORS))), flat_cloud()
-    result = scene.edit(gaussians, FINE)
-    assert scene.rows.tolist() == [1, 3, 6]
-    assert scene.num_moving(9) == 3
+    run = new_run(flat_cloud(), residuals=lambda _: alike(torch.tensor(ERRORS)))
+    result = run.grow(FINE)
+    assert run.scene.rows.tolist() == [1, 3, 6]
+    assert run.scene.num_moving == 3
     assert result is not None
     assert result.edit is not None
     assert result.edit.source.tolist() == list(range(9)), "without seeds the set stays"
-    field = scene.field
+    field = run.scene.field
     for step in (1, FINE + 1, FULL, SPLIT):
-        assert scene.edit(gaussians, step) is None
-    assert scene.field is field
+        assert run.grow(step) is None
+    assert run.scene.field is field
 
 
 @pytest.mark.parametrize(
@@ -164,46 +205,51 @@ def test_what_a_still_model_cannot_explain_moves() -> None:
 )
 def test_small_errors_are_no_motion(errors: tuple[float, ...], motion_threshold: float, rows: list[int]) -> None:
     """Where nothing stands out the model stays static: the same Gaussians, nothing added, no field."""
-    scene = new_scene(
-        residuals=lambda _: alike(torch.tensor(errors)), motion_threshold=motion_threshold, num_random_moving=5
-    )
     gaussians = flat_cloud()
-    result = scene.edit(gaussians, FINE)
+    run = new_run(
+        gaussians,
+        residuals=lambda _: alike(torch.tensor(errors)),
+        motion_threshold=motion_threshold,
+        num_random_moving=5,
+    )
+    result = run.grow(FINE)
     if rows:
-        assert scene.rows.tolist() == [*rows, *range(9, 14)]
+        assert run.scene.rows.tolist() == [*rows, *range(9, 14)]
     else:
-        assert (result, scene.field, scene.rows.tolist(), scene.num_moving(9)) == (None, None, [], 0)
-        assert scene.state().keys() == {"times"}
-        assert scene.gaussians_at(gaussians, picture(0.2), FINE + 1).gaussians is gaussians
+        assert (result, run.scene.field, run.scene.rows.tolist(), run.scene.num_moving) == (None, None, [], 0)
+        assert run.model_state.keys() == {"times"}
+        assert run.moment(0.2, FINE + 1).gaussians is gaussians
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_seeds_move_too(kind: str) -> None:
-    scene = new_scene(residuals=lambda _: alike(torch.tensor(ERRORS)), num_random_moving=4, deform=tiny_options(kind))
     gaussians = flat_cloud()
-    result = scene.edit(gaussians, FINE)
+    run = new_run(
+        gaussians, residuals=lambda _: alike(torch.tensor(ERRORS)), num_random_moving=4, deform=tiny_options(kind)
+    )
+    result = run.grow(FINE)
     assert result is not None
     optimizer = GaussianOptimizer(gaussians, OptimConfig())
     optimizer.apply(result)
     grown = optimizer.parameters
-    assert scene.rows.tolist() == [1, 3, 6, 9, 10, 11, 12]
-    assert scene.num_moving(len(grown)) == 7
-    assert torch.equal(drawn_at(scene, grown, 0.3).means, grown.means.detach())
-    assert scene.field is not None
-    stir(scene.field)
-    moved = (drawn_at(scene, grown, 0.3).means != drawn_at(scene, grown, 0.9).means).any(1)
-    assert torch.equal(torch.nonzero(moved)[:, 0], scene.rows)
+    run.scene = run.scene.with_gaussians(grown)
+    assert run.scene.rows.tolist() == [1, 3, 6, 9, 10, 11, 12]
+    assert run.scene.num_moving == 7
+    assert torch.equal(run.drawn_at(0.3).means, grown.means.detach())
+    assert run.scene.field is not None
+    stir(run.scene.field)
+    moved = (run.drawn_at(0.3).means != run.drawn_at(0.9).means).any(1)
+    assert torch.equal(torch.nonzero(moved)[:, 0], run.scene.rows)
 
 
 def test_the_filter_of_a_still_model_counts_the_seeds() -> None:
     """A checkpoint of that very step has as many values as Gaussians."""
-    still = StaticScene([camera()])
-    scene = new_scene(residuals=lambda _: alike(torch.tensor(ERRORS)), still=still, num_random_moving=4)
-    gaussians = flat_cloud()
-    scene.gaussians_at(gaussians, picture(0.3), FINE)
-    assert len(scene.state()["filter_std"]) == 9
-    scene.edit(gaussians, FINE)
-    assert len(scene.state()["filter_std"]) == 13
+    update, errors = FilterUpdate([camera()]), alike(torch.tensor(ERRORS))
+    run = new_run(flat_cloud(), residuals=lambda _: errors, update=update, num_random_moving=4)
+    run.moment(0.3, FINE)
+    assert len(run.model_state["filter_std"]) == 9
+    run.grow(FINE)
+    assert len(run.model_state["filter_std"]) == 13
 
 
 # --- the field learns -------------------------------------------------------------------------------------------------
@@ -213,14 +259,14 @@ def test_the_filter_of_a_still_model_counts_the_seeds() -> None:
 def test_the_field_learns_after_the_fine_phase(kind: str) -> None:
     """Gradients of what is drawn reach field and canonical Gaussians; ``after_step`` changes the field alone."""
     gaussians = flat_cloud()
-    scene = begun(gaussians, deform=tiny_options(kind), motion_sparsity=0.1)
+    run = begun(gaussians, deform=tiny_options(kind), motion_sparsity=0.1)
     for step in (FINE + 1, FINE + 2):
-        drawn = scene.gaussians_at(gaussians, picture(0.7), step)
+        drawn = run.moment(0.7, step)
         (drawn.gaussians.means[:, 1].sum() + sum(drawn.penalties.values(), torch.zeros(()))).backward()
         canonical = gaussians.means.detach().clone()
-        assert scene.after_step(gaussians, step, None) == 0
+        assert run.after_step(step) == 0
         assert torch.equal(gaussians.means, canonical)
-    assert (drawn_at(scene, gaussians, 0.7).means[:, 1] < gaussians.means[:, 1]).all()
+    assert (run.drawn_at(0.7).means[:, 1] < gaussians.means[:, 1]).all()
     assert set(drawn.penalties) == {"motion sparsity"} | {
         "hexplane": {"plane smoothness"},
         "control_nodes": {"node acceleration", "node rigidity"},
@@ -240,57 +286,57 @@ def test_motion_is_learned_from_pictures(kind: str) -> None:
     rates = {"hexplane": {**planes, "lr_planes": 0.05, "lr_decoder": 0.01}, "mlp": {"lr": 0.01, "width": 32}}
     options = tiny_options(kind, everything=False).model_copy(update=rates.get(kind, {"lr_means": 0.01}))
     steps = 150
-    scene = begun(gaussians, deform=options, motion_sparsity=0.0)
-    scene.schedule = DeformSchedule(0, 0, 0, 0, (), Rates(steps))
+    run = begun(gaussians, deform=options, motion_sparsity=0.0)
+    run.training.schedule = DeformSchedule(0, 0, 0, 0, (), Rates(steps))
     shift = torch.tensor([0.3, 0.0, 0.0])
     times = [(7 * i % 11) / 10 for i in range(steps)]
     for step, time in enumerate(times, start=1):
         truth = gaussians.detach().replace(means=gaussians.means.detach() + (time - 0.5) * shift)
-        drawn = scene.gaussians_at(gaussians, picture(time), step).gaussians
+        drawn = run.moment(time, step).gaussians
         pictures = [render(x, camera()).rgb for x in (drawn, truth)]
         (pictures[0] - pictures[1]).abs().mean().backward()
-        scene.after_step(gaussians, step, None)
+        run.after_step(step)
     for time in (0.1, 0.5, 0.9):
-        found = drawn_at(scene, gaussians, time).means - gaussians.means.detach()
+        found = run.drawn_at(time).means - gaussians.means.detach()
         assert (found.mean(0) - (time - 0.5) * shift)[:2].norm() < 0.2 * 0.3  # one camera sees no depth
 
 
 def test_bad_gradients_of_the_field_are_counted() -> None:
     gaussians = flat_cloud()
-    scene = begun(gaussians)
-    assert scene.field is not None
+    run = begun(gaussians)
+    assert run.scene.field is not None
     grad = torch.zeros(9, 1, 3)
     grad[4, 0, 1] = float("nan")
-    scene.field.learned["means"].grad = grad
-    assert scene.after_step(gaussians, FINE + 1, None) == 1
-    assert scene.field.learned["means"].isfinite().all()
+    run.scene.field.parameters["means"].grad = grad
+    assert run.after_step(FINE + 1) == 1
+    assert run.scene.field.parameters["means"].isfinite().all()
 
 
 def test_it_trains_on_the_window() -> None:
     """Which opens where motion begins: before, all views are trained on."""
-    scene = new_scene(times=tuple(i / 100 for i in range(101)), time_window=0.1)
-    assert all(scene.trains_on(time, step) for time in (0.0, 0.5, 1.0, None) for step in (1, FINE, FULL))
-    assert scene.trains_on(0.5, FINE + 1)
-    assert not scene.trains_on(0.0, FINE + 1)
-    assert not scene.trains_on(None, FINE + 1), "no time is time 0"
+    run = new_run(flat_cloud(), times=tuple(i / 100 for i in range(101)), time_window=0.1)
+    assert all(run.training.trains_on(time, step) for time in (0.0, 0.5, 1.0, None) for step in (1, FINE, FULL))
+    assert run.training.trains_on(0.5, FINE + 1)
+    assert not run.training.trains_on(0.0, FINE + 1)
+    assert not run.training.trains_on(None, FINE + 1), "no time is time 0"
 
 
 def test_motion_sparsity_is_the_mean_length_in_extents() -> None:
     gaussians = flat_cloud()
-    scene = begun(gaussians, motion_sparsity=0.5)
-    move(scene, torch.arange(9.0))
-    penalty = scene.gaussians_at(gaussians, picture(1.0), FINE + 1).penalties["motion sparsity"]
+    run = begun(gaussians, motion_sparsity=0.5)
+    move(run, torch.arange(9.0))
+    penalty = run.moment(1.0, FINE + 1).penalties["motion sparsity"]
     assert float(penalty.detach()) == pytest.approx(0.5 * 4.0, rel=1e-5)
-    assert begun(gaussians).gaussians_at(gaussians, picture(1.0), FINE + 1).penalties == {}
+    assert begun(gaussians).moment(1.0, FINE + 1).penalties == {}
 
 
 def test_time_jitter_shrinks_and_stays_in_the_clip() -> None:
     gaussians = flat_cloud()
-    scene = begun(gaussians, time_jitter=3.0)
-    move(scene, torch.ones(9))
+    run = begun(gaussians, time_jitter=3.0)
+    move(run, torch.ones(9))
 
     def spread(step: int, time: float) -> tuple[float, float, float]:
-        drawn = [scene.gaussians_at(gaussians, picture(time), step).gaussians.means.detach() for _ in range(60)]
+        drawn = [run.moment(time, step).gaussians.means.detach() for _ in range(60)]
         x = torch.stack([(means - gaussians.means.detach())[0, 0] for means in drawn])
         return float(x.std()), float(x.min()), float(x.max())
 
@@ -310,79 +356,79 @@ def test_where_cameras_stay_nothing_moves_that_pictures_show_still(in_place: boo
     still, moving = 0.2 * DynamicModel().motion_threshold, 0.3 * DynamicModel().motion_threshold
     errors = alike(torch.tensor([still, moving, moving, moving]))
     gaussians = flat_cloud(4)
-    scene = begun(gaussians, residuals=lambda _: errors, cameras_stay=in_place)
-    move(scene, torch.tensor([0.1, 0.0, 0.1, 0.1]))
-    scene.after_step(gaussians, SPLIT, None)
-    assert scene.rows.tolist() == kept
+    run = begun(gaussians, residuals=lambda _: errors, cameras_stay=in_place)
+    move(run, torch.tensor([0.1, 0.0, 0.1, 0.1]))
+    run.after_step(SPLIT)
+    assert run.scene.rows.tolist() == kept
 
 
 def test_freezing_keeps_just_what_is_seen_to_move() -> None:
     """A pixel covers 0.03 units: 0.3 px are 0.009."""
     gaussians = flat_cloud()
-    scene = begun(gaussians)
+    run = begun(gaussians)
     speeds = torch.tensor([0.0, 0.1, 0.0085, 0.0095, -0.0095, -0.0085, 0.0, 5.0, 1e-6])
-    move(scene, speeds)
-    before = {time: drawn_at(scene, gaussians, time) for time in TIMES}
-    scene.after_step(gaussians, SPLIT, None)
-    assert scene.rows.tolist() == [1, 3, 4, 7]
-    assert scene.num_moving(9) == 4
-    assert torch.equal(speeds_of(scene), speeds[scene.rows])
+    move(run, speeds)
+    before = {time: run.drawn_at(time) for time in TIMES}
+    run.after_step(SPLIT)
+    assert run.scene.rows.tolist() == [1, 3, 4, 7]
+    assert run.scene.num_moving == 4
+    assert torch.equal(speeds_of(run), speeds[run.scene.rows])
     px_size = DISTANCE / FOCAL
     for time, old in before.items():
-        stray = (drawn_at(scene, gaussians, time).means - old.means).norm(dim=1) / px_size
+        stray = (run.drawn_at(time).means - old.means).norm(dim=1) / px_size
         assert stray.max() < THRESHOLD
-        assert stray[scene.rows].max() < 1e-5
+        assert stray[run.scene.rows].max() < 1e-5
     assert all(x.requires_grad and x.is_leaf for x in gaussians.tensors().values())
 
 
 def test_freezing_bakes_a_constant_offset_into_the_canonical_gaussians() -> None:
     gaussians = flat_cloud()
-    scene = begun(gaussians, deform=TrajectoryField(polynomial=1, fourier=0))
-    assert scene.field is not None
-    move(scene, torch.full((9,), 0.005))
-    moved_at = drawn_at(scene, gaussians, 0.5)
-    scene.after_step(gaussians, SPLIT, None)
-    assert scene.field is None
-    for name, x in drawn_at(scene, gaussians, 0.9).tensors().items():
+    run = begun(gaussians, deform=TrajectoryField(polynomial=1, fourier=0))
+    assert run.scene.field is not None
+    move(run, torch.full((9,), 0.005))
+    moved_at = run.drawn_at(0.5)
+    run.after_step(SPLIT)
+    assert run.scene.field is None
+    for name, x in run.drawn_at(0.9).tensors().items():
         torch.testing.assert_close(x, moved_at.tensors()[name], rtol=0, atol=1e-6)
 
 
 def test_where_nothing_moves_the_field_goes_for_good() -> None:
     gaussians = flat_cloud()
-    scene = begun(gaussians)
-    scene.after_step(gaussians, SPLIT, None)
-    assert (scene.field, scene.rows.tolist(), scene.num_moving(9)) == (None, [], 0)
-    assert scene.state().keys() == {"times"}
-    assert scene.gaussians_at(gaussians, picture(0.2), SPLIT + 1).gaussians is gaussians
-    scene.after_step(gaussians, SPLIT + 1, EditResult(TopologyEdit.select(torch.arange(9) < 5)))
-    assert scene.field is None
+    run = begun(gaussians)
+    run.after_step(SPLIT)
+    assert (run.scene.field, run.scene.rows.tolist(), run.scene.num_moving) == (None, [], 0)
+    assert run.model_state.keys() == {"times"}
+    assert run.moment(0.2, SPLIT + 1).gaussians is gaussians
+    run.after_step(SPLIT + 1, EditResult(TopologyEdit.select(torch.arange(9) < 5)))
+    assert run.scene.field is None
 
 
 def test_freezing_goes_on_at_the_next_split() -> None:
     gaussians = flat_cloud()
-    scene = begun(gaussians)
-    move(scene, torch.tensor([1.0, 0, 1, 0, 1, 0, 1, 0, 1]))
-    scene.after_step(gaussians, SPLIT, None)
-    move(scene, torch.tensor([0.0, 1, 1, 0, 1]))
-    scene.after_step(gaussians, SPLIT, None)
-    assert scene.rows.tolist() == [2, 4, 8]
-    assert torch.equal(speeds_of(scene), torch.ones(3))
+    run = begun(gaussians)
+    move(run, torch.tensor([1.0, 0, 1, 0, 1, 0, 1, 0, 1]))
+    run.after_step(SPLIT)
+    move(run, torch.tensor([0.0, 1, 1, 0, 1]))
+    run.after_step(SPLIT)
+    assert run.scene.rows.tolist() == [2, 4, 8]
+    assert torch.equal(speeds_of(run), torch.ones(3))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_can_be_frozen(kind: str) -> None:
     """Also where a network moves everything: what is left moves as before, except that nodes come and go."""
     gaussians = flat_cloud()
-    scene = begun(gaussians, deform=tiny_options(kind), freeze_below_px=1.0)
-    assert scene.field is not None
-    drawn_at(scene, gaussians, 0.4)
-    stir(scene.field, 0.02)
-    old = drawn_at(scene, gaussians, 0.4)
-    scene.after_step(gaussians, SPLIT, None)
+    run = begun(gaussians, deform=tiny_options(kind), freeze_below_px=1.0)
+    assert run.scene.field is not None
+    run.drawn_at(0.4)
+    stir(run.scene.field, 0.02)
+    old = run.drawn_at(0.4)
+    run.after_step(SPLIT)
     if kind != "control_nodes":
-        new = drawn_at(scene, gaussians, 0.4)
-        torch.testing.assert_close(new.means[scene.rows], old.means[scene.rows], rtol=0, atol=1e-5)
-    assert drawn_at(scene, gaussians, 0.4).means.isfinite().all()
+        new = run.drawn_at(0.4)
+        torch.testing.assert_close(new.means[run.scene.rows], old.means[run.scene.rows], rtol=0, atol=1e-5)
+    assert run.drawn_at(0.4).means.isfinite().all()
 
 
 # --- following --------------------------------------------------------------------------------------------------------
@@ -393,52 +439,52 @@ def test_every_kind_can_be_frozen(kind: str) -> None:
 def test_descendants_of_what_moves_move(data: st.DataObject) -> None:
     """After any sequence of edits; each with the curve of its ancestor."""
     gaussians = flat_cloud()
-    scene = begun(gaussians)
+    run = begun(gaussians)
     moves = torch.tensor(data.draw(st.lists(st.booleans(), min_size=9, max_size=9)))
     identity = torch.arange(1.0, 10.0)  # the speed tells the ancestor
-    move(scene, torch.where(moves, identity, 0.0))
+    move(run, torch.where(moves, identity, 0.0))
     frozen = data.draw(st.booleans(), label="frozen before")
     if frozen:
-        scene.after_step(gaussians, SPLIT, None)
+        run.after_step(SPLIT)
     ancestor = torch.arange(9)
     for _ in range(data.draw(st.integers(1, 3))):
         source = torch.tensor(data.draw(st.lists(st.integers(0, len(ancestor) - 1), max_size=14)), dtype=torch.long)
         is_new = torch.tensor(data.draw(st.lists(st.booleans(), min_size=len(source), max_size=len(source))))
         edit = TopologyEdit(source, is_new.bool())
         gaussians = Gaussians(**{name: edit.apply(x.detach()).clone() for name, x in gaussians.tensors().items()})
-        scene.after_step(gaussians, FINE + 1, EditResult(edit))
+        run.after_step(FINE + 1, EditResult(edit))
         ancestor = ancestor[source]
         if len(ancestor) == 0:
             break
-    shift = (drawn_at(scene, gaussians, 1.0).means - gaussians.means)[:, 0]
+    shift = (run.drawn_at(1.0).means - gaussians.means)[:, 0]
     torch.testing.assert_close(shift, torch.where(moves, identity, 0.0)[ancestor], rtol=0, atol=1e-5)
     followed = moves[ancestor] if frozen else torch.ones(len(ancestor), dtype=torch.bool)
-    assert torch.equal(scene.rows, torch.nonzero(followed)[:, 0])
-    if scene.field is not None:
-        assert torch.equal(speeds_of(scene), torch.where(moves, identity, 0.0)[ancestor[scene.rows]])
-    assert scene.num_moving(len(ancestor)) == (0 if scene.field is None else len(speeds_of(scene)))
+    assert torch.equal(run.scene.rows, torch.nonzero(followed)[:, 0])
+    if run.scene.field is not None:
+        assert torch.equal(speeds_of(run), torch.where(moves, identity, 0.0)[ancestor[run.scene.rows]])
+    assert run.scene.num_moving == (0 if run.scene.field is None else len(speeds_of(run)))
 
 
 def test_moments_of_new_rows_start_at_zero() -> None:
     gaussians = flat_cloud()
-    scene = begun(gaussians)
-    move(scene, torch.tensor([0.0, 1, 1, 1, 0, 0, 0, 0, 0]))
-    scene.after_step(gaussians, SPLIT, None)
-    assert scene.field is not None
-    scene.field.learned["means"].grad = torch.ones(3, 1, 3)
+    run = begun(gaussians)
+    move(run, torch.tensor([0.0, 1, 1, 1, 0, 0, 0, 0, 0]))
+    run.after_step(SPLIT)
+    assert run.scene.field is not None
+    run.scene.field.parameters["means"].grad = torch.ones(3, 1, 3)
     edit = TopologyEdit(torch.tensor([0, 1, 1, 2, 8, 3]), torch.tensor([False, False, True, False, True, True]))
-    scene.after_step(gaussians, SPLIT + 1, EditResult(edit))
-    assert scene.rows.tolist() == [1, 2, 3, 5]
-    moments = scene.field.learned.state()["exp_avg.means"]
+    run.after_step(SPLIT + 1, EditResult(edit))
+    assert run.scene.rows.tolist() == [1, 2, 3, 5]
+    moments = run.scene.field.parameters.state()["exp_avg.means"].tensor
     assert moments.any(-1)[:, 0].tolist() == [True, False, True, False]
 
 
 def test_a_reset_of_opacities_moves_no_rows() -> None:
     gaussians = flat_cloud()
-    scene = begun(gaussians)
-    move(scene, torch.ones(9))
-    scene.after_step(gaussians, FINE + 1, EditResult(None, {"logit_opacities": torch.zeros(9)}))
-    assert torch.equal(speeds_of(scene), torch.ones(9))
+    run = begun(gaussians)
+    move(run, torch.ones(9))
+    run.after_step(FINE + 1, EditResult(None, {"logit_opacities": torch.zeros(9)}))
+    assert torch.equal(speeds_of(run), torch.ones(9))
 
 
 # --- state ------------------------------------------------------------------------------------------------------------
@@ -448,23 +494,23 @@ def test_a_reset_of_opacities_moves_no_rows() -> None:
 @pytest.mark.parametrize("phase", ["coarse", "fine", "split"])
 def test_state_goes_round(kind: str, phase: str) -> None:
     gaussians, options = flat_cloud(), {"deform": tiny_options(kind)}
-    scene = new_scene(**options) if phase == "coarse" else begun(gaussians, **options)
+    run = new_run(gaussians, **options) if phase == "coarse" else begun(gaussians, **options)
     if phase != "coarse":
-        assert scene.field is not None
-        drawn_at(scene, gaussians, 0.4)
-        stir(scene.field, 0.1)
+        assert run.scene.field is not None
+        run.drawn_at(0.4)
+        stir(run.scene.field, 0.1)
     if phase == "split":
-        scene.after_step(gaussians, SPLIT, None)
-    other = new_scene(**options)
-    other.load_state({name: x.clone() for name, x in scene.state().items()})
-    assert other.state().keys() == scene.state().keys()
-    assert all(torch.equal(x, other.state()[name]) for name, x in scene.state().items())
-    assert other.num_moving(9) == scene.num_moving(9)
+        run.after_step(SPLIT)
+    other = new_run(gaussians, **options)  # type: ignore[arg-type]
+    stored = {name: x.clone() for name, x in run.model_state.items()}
+    other.scene = other.training.restored(gaussians, stored, other.scene)
+    assert other.model_state.keys() == run.model_state.keys()
+    assert all(torch.equal(x, other.model_state[name]) for name, x in run.model_state.items())
+    assert other.scene.num_moving == run.scene.num_moving
     for time in (0.0, 0.4):
-        for name, x in drawn_at(scene, gaussians, time).tensors().items():
-            assert torch.equal(x, drawn_at(other, gaussians, time).tensors()[name]), name
-    other.load_state({})
-    assert other.field is None
+        for name, x in run.drawn_at(time).tensors().items():
+            assert torch.equal(x, other.drawn_at(time).tensors()[name]), name
+    assert other.training.restored(gaussians, {}, other.scene).field is None
 
 
 # --- the box ----------------------------------------------------------------------------------------------------------
