@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,24 +14,23 @@ from scenes import look_around, weights
 from tiny_fields import KINDS, busy_config, cloud, stir, stirred_field, tiny_field, tiny_options, write_tiny_capture
 from torch import Tensor
 
-from dyngs.build import assemble
+from dyngs.build import assemble, restored_scene
 from dyngs.camera import Cameras
 from dyngs.config import ControlNodesField, DynamicModel, HexplaneField, StaticModel, TrainConfig
-from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, Offsets, deformed
+from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
 from dyngs.deform.hexplane import Hexplane, time_rows
 from dyngs.deform.motion import MAX_SAMPLES, measure_motion
-from dyngs.deform.scene import TrainedScene
+from dyngs.deform.scene import DynamicScene
 from dyngs.deform.seeds import box_of
 from dyngs.deform.skeleton import Skeleton
-from dyngs.deform.training import DynamicScene
 from dyngs.deform.window import FRONTIER_VIEWS, TimeWindow
 from dyngs.errors import DyngsError
-from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.ops.planes import PlaneLevel, hexplane_features
 from dyngs.rendering import render
-from dyngs.runs.checkpoint import stored_scene
-from dyngs.static.training import StaticScene
+from dyngs.state import tensors_of
+from dyngs.static.scene import StaticScene
 from dyngs.training.trainer import Trainer
 
 LONG = 10_000
@@ -47,6 +47,11 @@ def values(offsets: Offsets) -> Tensor:
     """(M, all) numbers of the offsets."""
     parts = [x for x in vars(offsets).values() if x is not None]
     return torch.cat([x.reshape(len(x), -1) for x in parts], dim=1)
+
+
+def scene_of(rows: Tensor, field: DeformationField) -> DynamicScene:
+    """The cloud, ``rows`` of which a field moves."""
+    return DynamicScene(gaussians=cloud(), seen_at=(0.0, 1.0), field=field, moving=rows)
 
 
 def fine_trainer(capture: Path, kind: str, **model: object) -> Trainer:
@@ -89,7 +94,7 @@ def test_the_ends_of_the_clip_are_ordinary_times(kind: str, time: float) -> None
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_times_outside_the_clip_are_clamped(kind: str) -> None:
-    scene = TrainedScene(cloud(), torch.arange(9), stirred_field(kind))
+    scene = scene_of(torch.arange(9), stirred_field(kind))
     for outside, inside in ((-1e-9, 0.0), (-1e30, 0.0), (1 + 1e-9, 1.0), (float("inf"), 1.0)):
         assert torch.equal(scene.at(outside).means, scene.at(inside).means)
 
@@ -97,7 +102,7 @@ def test_times_outside_the_clip_are_clamped(kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_single_training_time_is_a_static_scene(tmp_path: Path, kind: str) -> None:
     trainer = assemble(busy_config(timed(tmp_path / "capture", [0.5] * 5), tmp_path, kind))
-    assert isinstance(trainer.model, StaticScene)
+    assert isinstance(trainer.scene, StaticScene)
     assert trainer.step().loss > 0
 
 
@@ -111,8 +116,8 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     trainer = assemble(config.model_copy(update={"model": model}))
     seen = {trainer.step().picture.time for _ in range(12)}
     assert seen == {0.0, 1.0}
-    assert isinstance(trainer.model, DynamicScene)
-    field = trainer.model.field
+    assert isinstance(trainer.scene, DynamicScene)
+    field = trainer.scene.field
     if isinstance(field, Hexplane):
         assert field.levels[0].time.shape[1] == 2
     if isinstance(field, Skeleton):
@@ -162,7 +167,7 @@ def test_no_moving_gaussians(kind: str) -> None:
     if moved.means.requires_grad:
         moved.means.sum().backward()
     assert field.parameters.step(1, 0.0) == 0
-    scene = TrainedScene(gaussians, torch.zeros(0, dtype=torch.long), field)
+    scene = replace(scene_of(torch.zeros(0, dtype=torch.long), field), gaussians=gaussians)
     assert scene.at(0.4) is gaussians
 
 
@@ -170,21 +175,21 @@ def test_no_moving_gaussians(kind: str) -> None:
 def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: str) -> None:
     """The run goes on with what is left, and its checkpoint can be loaded."""
     trainer = fine_trainer(capture, kind)
-    model = trainer.model
-    assert isinstance(model, DynamicScene)
-    model.rows = torch.tensor([0, 3])
-    assert model.field is not None
-    model.field = field.edited(TopologyEdit(model.rows, torch.zeros(2, dtype=torch.bool)))
+    scene, two = trainer.scene, TopologyEdit.select(torch.tensor([0, 3]))
+    assert isinstance(scene, DynamicScene)
+    assert scene.field is not None
+    field = scene.field.edited(two)
+    field.regroup()
+    trainer.scene = replace(scene, moving=two.source, field=field)
     trainer.step()
-    keep = torch.ones(len(trainer.scene.gaussians), dtype=torch.bool)
-    keep[model.rows] = False
-    result = EditResult(TopologyEdit.select(keep))
-    trainer.optimizer.apply(result)
+    keep = torch.ones(len(trainer.scene), dtype=torch.bool)
+    keep[trainer.scene.rows] = False
+    assert not keep.all()
     trainer.densifier = assemble(trainer.config).densifier
-    model.after_step(trainer.scene.gaussians, 11, result)
+    trainer.keep(keep)
     for _ in range(2):
         assert trainer.step().loss > 0
-        assert model.num_moving(len(trainer.scene.gaussians)) == 0
+        assert trainer.num_moving == 0
     other = assemble(trainer.config)
     other.restore(trainer.checkpoint())
     assert other.step().loss == trainer.step().loss
@@ -213,9 +218,8 @@ def test_boxes_without_volume(kind: str, flat: str) -> None:
     found = values(field.offsets(means, 0.3))
     assert found.isfinite().all()
     (found * weights(found)).sum().backward()
-    assert all(
-        field.parameters[n].grad is None or field.parameters[n].grad.isfinite().all() for n in field.parameters.values()
-    )
+    grads = [field.parameters[name].grad for name in field.parameters.values()]
+    assert all(x is None or x.isfinite().all() for x in grads)
     if flat == "point" and kind != "trajectory":
         torch.testing.assert_close(found, found[:1].expand_as(found))
 
@@ -304,10 +308,10 @@ def test_gradients_that_are_not_finite_are_left_out(kind: str) -> None:
 def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> None:
     """The next step stops before anything changes, and names step, view, attributes and time."""
     trainer = fine_trainer(capture, kind)
-    model = trainer.model
-    assert isinstance(model, DynamicScene)
-    assert model.field is not None
-    for x in model.field.parameters.values().values():
+    scene = trainer.scene
+    assert isinstance(scene, DynamicScene)
+    assert scene.field is not None
+    for x in scene.field.parameters.values().values():
         x.fill_(bad)
     before = trainer.scene.gaussians.means.detach().clone()
     with pytest.raises(
@@ -323,8 +327,8 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
 def test_a_picture_that_a_still_model_explains(capture: Path) -> None:
     """No error stands out: nothing moves, no seeds, no field; the run goes on static."""
     trainer = fine_trainer(capture, "control_nodes", motion_threshold=10.0)
-    assert isinstance(trainer.model, DynamicScene)
-    assert trainer.model.field is None
+    assert isinstance(trainer.scene, DynamicScene)
+    assert trainer.scene.field is None
     assert len(trainer.scene.gaussians) == len(reference_set(capture))
     assert trainer.step().loss > 0
 
@@ -337,7 +341,7 @@ def test_no_seeds(capture: Path) -> None:
         for _ in range(8):
             trainer.step()
         sizes.append(len(trainer.scene.gaussians))
-        moving.append(trainer.model.num_moving(sizes[-1]))
+        moving.append(trainer.num_moving)
         assert trainer.step().loss > 0
     assert sizes[0] == sizes[1] + 12
     assert moving[0] == moving[1] + 12 > 12
@@ -359,7 +363,7 @@ def test_a_run_of_one_step(capture: Path, filtered: bool) -> None:
     config = config.model_copy(update={"train": TrainConfig(steps=1)})
     trainer = assemble(config)
     trainer.step()
-    scene = stored_scene(trainer.checkpoint(), config.model)
+    scene = restored_scene(trainer.checkpoint(), config.model)
     assert not scene.is_still
     assert len(scene) == 60 + 12
     assert torch.equal(scene.at(0.3).means, scene.gaussians.means)

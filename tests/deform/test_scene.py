@@ -1,4 +1,4 @@
-"""A trained scene at any time, in parts, and from a checkpoint."""
+"""A dynamic scene at any time, in parts, and from a checkpoint."""
 
 from __future__ import annotations
 
@@ -6,23 +6,32 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_fields import KINDS, cloud, stirred_field, tiny_field, tiny_options, tiny_setup
+from tiny_fields import KINDS, cloud, stirred_field, tiny_field, tiny_options
 from torch import Tensor
 
-from dyngs.config import DynamicModel, StaticModel
-from dyngs.deform.field import deformed
+from dyngs.config import DynamicModel
+from dyngs.deform.field import DeformationField, deformed
 from dyngs.deform.fields import field_state
+from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.state import tensors_of
 from dyngs.static.filters import fuse_filter
+from dyngs.static.scene import StaticScene
 from dyngs.visibility import VisibilityMasks
 
 ROWS = torch.tensor([1, 4, 5, 8])
 NOTHING = torch.zeros(0, dtype=torch.long)
 
 
-def some_scene(kind: str = "hexplane", filter_std: Tensor | None = None) -> TrainedScene:
-    return TrainedScene(cloud(), ROWS, stirred_field(kind, len(ROWS)), filter_std, times=(0.0, 0.5, 1.0))
+def scene_of(rows: Tensor, field: DeformationField | None = None, filter_std: Tensor | None = None) -> DynamicScene:
+    """The cloud, ``rows`` of which a field moves."""
+    times = (0.0, 0.5, 1.0)
+    return DynamicScene(gaussians=cloud(), seen_at=times, field=field, moving=rows, filter_std=filter_std)
+
+
+def some_scene(kind: str = "hexplane", filter_std: Tensor | None = None) -> DynamicScene:
+    return scene_of(ROWS, stirred_field(kind, len(ROWS)), filter_std)
 
 
 def same(a: Gaussians, b: Gaussians) -> bool:
@@ -56,7 +65,7 @@ def test_times_after_the_clip_are_its_end(time: float) -> None:
 @pytest.mark.parametrize("kind", [*KINDS, None])
 def test_a_time_that_is_no_number_is_refused(kind: str | None) -> None:
     """Also where nothing moves."""
-    scene = some_scene(kind) if kind else TrainedScene(cloud(), NOTHING)
+    scene = some_scene(kind) if kind else scene_of(NOTHING)
     with pytest.raises(DyngsError, match="not a number; give one from 0 to 1"):
         scene.at(float("nan"))
 
@@ -80,10 +89,10 @@ def test_what_moves_and_what_is_still_make_the_scene(kind: str, filtered: bool) 
 
 def test_parts_of_extreme_scenes() -> None:
     field = stirred_field("trajectory", 9)
-    all_move = TrainedScene(cloud(), torch.arange(9), field)
+    all_move = scene_of(torch.arange(9), field)
     assert same(all_move.part("moving").at(0.3), all_move.at(0.3))
     assert len(all_move.part("still")) == 0
-    none_moves = TrainedScene(cloud(), NOTHING)
+    none_moves = scene_of(NOTHING)
     assert same(none_moves.part("still").at(0.3), none_moves.gaussians)
     assert len(none_moves.part("moving").at(0.3)) == 0
 
@@ -92,10 +101,10 @@ def test_what_a_scene_says_of_itself() -> None:
     scene, field = some_scene("trajectory"), tiny_field("trajectory", 4)
     assert len(scene) == 9
     assert scene.moving_share == pytest.approx(4 / 9)
-    assert scene.num_field_values == sum(x.numel() for x in field.learned.values().values())
-    for still in (TrainedScene(cloud(), NOTHING), TrainedScene(cloud(), NOTHING, field)):
+    assert scene.num_motion_values == sum(x.numel() for x in field.parameters.values().values())
+    for still in (scene_of(NOTHING), scene_of(NOTHING, field)):
         assert still.is_still
-        assert (still.moving_share, still.num_field_values) == (0.0, 0)
+        assert (still.moving_share, still.num_motion_values) == (0.0, 0)
         assert still.at(0.7) is still.gaussians
 
 
@@ -111,11 +120,11 @@ def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
     """As the model stored it; without rows all Gaussians move."""
     gaussians, num_moving = cloud(), 9 if rows is None else len(rows)
     field = stirred_field(kind, num_moving)
-    state = {f"field.{name}": x for name, x in field_state(field, tiny_setup(num_moving)).items()}
+    state = {f"field.{name}": x for name, x in tensors_of(field_state(field)).items()}
     state |= {"times": torch.tensor([0.0, 0.25, 1.0], dtype=torch.float64), "filter_std": torch.ones(9)}
     if rows is not None:
         state["rows"] = rows
-    scene = trained_scene(gaussians, state, DynamicModel(deform=tiny_options(kind)))
+    scene = DynamicScene.restored(DynamicModel(deform=tiny_options(kind)), gaussians, state)
     assert scene.times == (0.0, 0.25, 1.0)
     assert torch.equal(scene.rows, torch.arange(9) if rows is None else rows)
     assert scene.is_still == (num_moving == 0)
@@ -142,15 +151,14 @@ def test_masks_show_the_same_of_fewer(kind: str, filtered: bool) -> None:
 
 
 def test_a_state_without_field_is_a_still_scene() -> None:
-    for options in (StaticModel(), DynamicModel()):
-        scene = trained_scene(cloud(), {}, options)
+    for scene in (StaticScene.restored(cloud(), {}), DynamicScene.restored(DynamicModel(), cloud(), {})):
         assert scene.is_still
         assert scene.times == ()
         assert same(scene.at(0.5), cloud())
 
 
 def test_a_field_that_lacks_something_is_a_key_error() -> None:
-    state = {f"field.{name}": x for name, x in field_state(tiny_field("mlp"), tiny_setup()).items()}
+    state = {f"field.{name}": x for name, x in tensors_of(field_state(tiny_field("mlp"))).items()}
     del state["field.learned.bias0"]
     with pytest.raises(KeyError, match="bias0"):
-        trained_scene(cloud(), state, DynamicModel(deform=tiny_options("mlp")))
+        DynamicScene.restored(DynamicModel(deform=tiny_options("mlp")), cloud(), state)
