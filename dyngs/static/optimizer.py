@@ -91,14 +91,15 @@ class GaussianOptimizer:
         return self._adam.state()
 
     def restored(self, parameters: Gaussians, tensors: Mapping[str, Tensor]) -> GaussianOptimizer:
-        """Return an optimizer of a copy of ``parameters``, with the moments that ``state`` returned.
+        """Return an optimizer of copies of ``parameters`` with the moments that ``state`` returned.
 
         Raises:
             KeyError: a moment is missing.
             ValueError: one is not finite float32, or does not fit the parameters.
         """
-        own = {name: x.detach().clone() for name, x in parameters.tensors().items()}  # steps are taken in place
-        optimizer = GaussianOptimizer(Gaussians(**own), self.options)
+        # steps change them in place, and a checkpoint may share its memory with another trainer
+        copies = Gaussians(**{name: x.detach().clone() for name, x in parameters.tensors().items()})
+        optimizer = GaussianOptimizer(copies, self.options)
         optimizer._adam = AdamState.restored(tensors, parameters.tensors())
         return optimizer
 
