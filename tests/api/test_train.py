@@ -28,7 +28,7 @@ from dyngs.config import (
 )
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.deform.training import DynamicScene
+from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run, save_checkpoint
 from dyngs.training.trainer import StepReport, Trainer
@@ -202,15 +202,15 @@ def test_bad_input_leaves_no_folder(tmp_path: Path) -> None:
 def test_a_loss_that_is_not_finite_stops_the_run(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from dyngs.train import step
+    from dyngs.training import trainer
 
-    real, calls = step.l1_ssim_loss, []
+    real, calls = trainer.l1_ssim_loss, []
 
     def failing(rendered: Tensor, target: Tensor, weight: float, mask: Tensor | None) -> Tensor:
         calls.append(0)
         return real(rendered, target, weight, mask) * (float("nan") if len(calls) == 6 else 1.0)
 
-    monkeypatch.setattr(step, "l1_ssim_loss", failing)
+    monkeypatch.setattr(trainer, "l1_ssim_loss", failing)
     config = _config(capture, tmp_path / "run", train=TrainConfig(steps=14, save_every=4))
     with pytest.raises(DyngsError, match=r"step 6, view .*'picture' is nan.*step_0000004"):
         train(config)
@@ -287,10 +287,9 @@ def test_what_is_loaded_is_what_the_trainer_draws(moving_capture: Path, tmp_path
     save_checkpoint(tmp_path, trainer.checkpoint(), 1.0)
     scene = load_run(tmp_path).scene
     assert scene.is_still == (steps == 2)
-    parameters = trainer.scene.gaussians
     for time in (0.0, 0.37, 1.0):
         picture = replace(trainer.pictures[0], time=time)
-        drawn = trainer.model.gaussians_at(parameters, picture, steps + 1).gaussians
+        drawn = trainer.training.moment(trainer.scene, picture, steps + 1).gaussians
         for name, x in scene.at(time).tensors().items():
             torch.testing.assert_close(x, drawn.tensors()[name].detach(), rtol=1e-6, atol=1e-7)
 
@@ -365,8 +364,9 @@ def _spoil_in_step(step: int, monkeypatch: pytest.MonkeyPatch, value: float) -> 
     real = Trainer.step
 
     def stepping(trainer: Trainer) -> StepReport:
-        if trainer.done + 1 == step and isinstance(trainer.model, DynamicScene) and trainer.model.field is not None:
-            for x in trainer.model.field.learned.values().values():
+        scene = trainer.scene
+        if trainer.done + 1 == step and isinstance(scene, DynamicScene) and scene.field is not None:
+            for x in scene.field.parameters.values().values():
                 x.fill_(value)
         return real(trainer)
 

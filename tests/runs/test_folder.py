@@ -11,9 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from dyngs.prune.run import prune_run
-from dyngs.storage.run import write_scene_file
 
+from dyngs.api.prune import prune_run
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig, RandomInit, RunConfig, StaticModel, TrainConfig
@@ -22,6 +21,7 @@ from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.demo import unused_folder
 from dyngs.errors import DyngsError
 from dyngs.export.run_to_ply import write_run_ply_sequence
+from dyngs.export.scene_file import write_scene_file
 from dyngs.runs.checkpoint import KEEP_CHECKPOINTS, checkpoint_paths, latest_checkpoint, load_run, save_checkpoint
 from dyngs.runs.folder import default_folder, new_folder, tidy
 from dyngs.runs.lock import LOCK_NAME, InUseError, writing

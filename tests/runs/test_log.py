@@ -1,16 +1,18 @@
-"""log.jsonl, torn lines, resumed logs, and plain progress where there is no terminal."""
+"""log.jsonl, torn lines, and resumed logs."""
 
 from __future__ import annotations
 
-import io
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from steps import step_done
 
 from dyngs.errors import DyngsError
-from dyngs.runs.log import LogRecord, Progress, RunLog
+from dyngs.runs.log import LogRecord, RunLog, record_of
+from dyngs.training.events import Evaluated, Message
 
 
 def _record(step: int, psnr: float | None = 20.0) -> LogRecord:
@@ -53,36 +55,20 @@ def test_tensorboard_is_optional(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         RunLog(tmp_path, 0, tensorboard=True)
 
 
-def test_without_a_terminal_there_are_about_ten_lines() -> None:
-    stream = io.StringIO()
-    with Progress(1000, 0, stream) as progress:
-        for step in range(10, 1001, 10):
-            progress.update(_record(step, psnr=None if step == 10 else 30.0))
-    lines = stream.getvalue().splitlines()
-    assert 10 <= len(lines) <= 12
-    assert lines[0].startswith("step 10/1000 loss 0.5000 psnr - 1,234 Gaussians")
-    assert lines[-1].startswith("step 1000/1000 loss 0.5000 psnr 30.00 1,234 Gaussians")
-    assert lines[-1].endswith("0:00 left")
+def test_it_listens_to_steps_and_scores(tmp_path: Path) -> None:
+    """Each fifth step and the last have a line, and so does each evaluation."""
+    with RunLog(tmp_path, 0, every=5) as log:
+        for step in range(1, 13):
+            log(step_done(step, 12))
+            log(Message("nothing for the log"))
+        log(Evaluated(12, "test", 21.0, 0.9, 3.0))
+    lines = [json.loads(line) for line in log.path.read_text().splitlines()]
+    assert [line["step"] for line in lines] == [5, 10, 12, 12]
+    assert lines[0] | {"seconds": 0.0} == asdict(_record(5)) | {"psnr": lines[0]["psnr"], "seconds": 0.0}
+    assert lines[-1] == {"step": 12, "split": "test", "psnr": 21.0, "ssim": 0.9}
 
 
-def test_the_number_of_steps_may_change_on_the_way() -> None:
-    stream = io.StringIO()
-    with Progress(1000, 0, stream) as progress:
-        progress.update(_record(10))
-        progress.expect(20)
-        progress.update(_record(20))
-    assert [line.split()[1] for line in stream.getvalue().splitlines()] == ["10/1000", "20/20"]
-
-
-def test_on_a_terminal_there_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TERM", "xterm")
-
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
-
-    stream = Terminal()
-    with Progress(100, 50, stream) as progress:
-        progress.update(_record(60))
-    assert "60/100" in stream.getvalue()
-    assert "1,234 Gaussians" in stream.getvalue()
+@pytest.mark.parametrize(("difference", "psnr"), [(0.1, 20.0), (0.0, None)])
+def test_a_quality_that_is_no_number_is_null(tmp_path: Path, difference: float, psnr: float | None) -> None:
+    record = record_of(step_done(1, 1, difference))
+    assert record.psnr == (None if psnr is None else pytest.approx(psnr, abs=1e-4))

@@ -85,7 +85,7 @@ def test_a_cap_holds_where_motion_adds_some(tmp_path: Path) -> None:
     cap = free - config.model.num_random_moving
     trainer = assemble(limited(config, max_gaussians=cap))
     assert cap - config.model.num_random_moving <= largest_count(trainer) <= cap
-    assert trainer.model.num_moving(cap) > 0
+    assert trainer.num_moving > 0
 
 
 def test_without_limits_the_run_is_the_same(still: Path, tmp_path: Path) -> None:

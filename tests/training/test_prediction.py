@@ -9,7 +9,7 @@ import torch
 from tiny_people import NET, people
 
 from dyngs.api.train import train
-from dyngs.config import Config, DataConfig
+from dyngs.config import Config, DataConfig, HumanPredictorModel
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint
 from dyngs.training.prediction import NetworkTrainer, assemble_network, captures_in, mean_colours, rate_at
@@ -32,6 +32,12 @@ def config(folder: Path, run: Path, **changes: object) -> Config:
     )
 
 
+def assembled(config: Config) -> NetworkTrainer:
+    """The trainer of its network, before the first step."""
+    assert isinstance(config.model, HumanPredictorModel)
+    return assemble_network(config, config.model)
+
+
 def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, tmp_path: Path) -> None:
     whole = train(config(folder, tmp_path / "whole"))
     again = train(config(folder, tmp_path / "again"))
@@ -43,14 +49,13 @@ def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, tmp_path: Path) ->
     before, after = (load_checkpoint(path).part("model.network") for path in (middle, last))
     assert any(not torch.equal(before[name], after[name]) for name in before)
     with pytest.raises(DyngsError, match="not of this network"):
-        assemble_network(config(folder, tmp_path, widths=(8, 16))).restore(load_checkpoint(last))
+        assembled(config(folder, tmp_path, widths=(8, 16))).restore(load_checkpoint(last))
 
 
 def test_training_lowers_the_loss(folder: Path, tmp_path: Path) -> None:
     """Of the same person, pictures and background, before and after 20 steps."""
     long = config(folder, tmp_path)
-    trainer = assemble_network(long.model_copy(update={"train": long.train.model_copy(update={"steps": 30})}))
-    assert isinstance(trainer, NetworkTrainer)
+    trainer = assembled(long.model_copy(update={"train": long.train.model_copy(update={"steps": 30})}))
     losses = [trainer.step().loss for _ in range(24)]
     assert sum(losses[-8:]) < 0.9 * sum(losses[:8])
     assert trainer.num_gaussians > 500
@@ -59,7 +64,7 @@ def test_training_lowers_the_loss(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("factor", [1e25, float("nan")])
 def test_a_gradient_too_large_to_square_leaves_the_step_out(folder: Path, tmp_path: Path, factor: float) -> None:
     """Its length, which is to be cut, is infinite: weights and moments stay as they are, and the next step is good."""
-    trainer = assemble_network(config(folder, tmp_path))
+    trainer = assembled(config(folder, tmp_path))
     trainer.step()
     before = {name: x.clone() for name, x in trainer.network.state_dict().items()}
     loss = factor * sum(x.sum() for x in trainer.network.parameters())
@@ -73,7 +78,7 @@ def test_a_gradient_too_large_to_square_leaves_the_step_out(folder: Path, tmp_pa
 
 
 def test_choices_are_as_many_as_asked_for(folder: Path, tmp_path: Path) -> None:
-    trainer = assemble_network(config(folder, tmp_path, inputs=4, views=2))
+    trainer = assembled(config(folder, tmp_path, source_sets=4, source_views=2))
     assert [len(person.choices) for person in trainer.people] == [4, 4]
     assert {len(choice) for person in trainer.people for choice in person.choices} == {2}
     assert [person.sitter.name for person in trainer.people] == ["p1", "p2"]
@@ -81,7 +86,7 @@ def test_choices_are_as_many_as_asked_for(folder: Path, tmp_path: Path) -> None:
 
 def test_mean_colours_are_those_of_the_people(folder: Path, tmp_path: Path) -> None:
     """Of one person they are what is seen; of two they lie between; the atlas is filled everywhere."""
-    trainer = assemble_network(config(folder, tmp_path))
+    trainer = assembled(config(folder, tmp_path))
     one, other, both = (mean_colours(some, 32) for some in ([trainer.people[0]], trainer.people[1:], trainer.people))
     assert torch.equal(both, trainer.mean)
     low, high = torch.minimum(one, other), torch.maximum(one, other)
@@ -101,6 +106,6 @@ def test_what_cannot_be_trained_on_is_refused(folder: Path, tmp_path: Path) -> N
         captures_in(DataConfig.model_validate({"root": tmp_path}))
     (tmp_path / "junk").mkdir()
     with pytest.raises(DyngsError, match="junk: no capture found"):
-        assemble_network(config(tmp_path, tmp_path / "run"))
+        assembled(config(tmp_path, tmp_path / "run"))
     with pytest.raises(DyngsError, match="multiple of 4"):
-        assemble_network(config(folder, tmp_path / "run", resolution=30))
+        assembled(config(folder, tmp_path / "run", resolution=30))

@@ -1,18 +1,19 @@
-"""One step: any model that keeps the protocol is trained, on the right background, and bad gradients do no harm."""
+"""One step: any kind of scene is trained, on the right background, and bad gradients do no harm."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from moving_scene import TRAIN_TIMES, write_timed_capture
 from torch import Tensor
 
-from dyngs.build import assemble
+from dyngs.build import assemble, restored_scene
 from dyngs.config import (
     AutoColour,
     Config,
@@ -30,9 +31,9 @@ from dyngs.errors import DyngsError
 from dyngs.files.tensor_file import write_tensors
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.rendering import RenderOptions, render
-from dyngs.runs.checkpoint import _KIND, load_checkpoint, stored_scene
-from dyngs.scene import moment_of, num_colour_values
-from dyngs.static.training import Drawn
+from dyngs.runs.checkpoint import _KIND, load_checkpoint
+from dyngs.scene import Moment, Scene, SceneTraining
+from dyngs.state import Role, State, with_role
 from dyngs.training.trainer import Trainer
 
 
@@ -55,8 +56,36 @@ def _trainer(capture: Path, **data: object) -> Trainer:
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class _LiftedScene(Scene):
+    """A scene of another kind: all Gaussians are drawn a little higher than they are stored."""
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        return ()
+
+    @property
+    def is_still(self) -> bool:
+        return False
+
+    @property
+    def rows(self) -> Tensor:
+        return torch.arange(len(self))
+
+    def moment(self, time: float | None) -> Moment:
+        return Moment(self.gaussians.replace(means=self.gaussians.means + torch.tensor([0.0, 0.0, 0.1])), time)
+
+    def edited(self, edit: TopologyEdit) -> _LiftedScene:
+        return replace(self, gaussians=self.gaussians.edited(edit))
+
+    def _model_state(self) -> State:
+        return {}
+
+
 class _Lifted:
-    """A model of another kind: all Gaussians are drawn a little higher than they are stored."""
+    """How it is trained; what it has done is part of its state."""
+
+    moves_by = ("field", "model.deform")
 
     def __init__(self) -> None:
         self.steps: list[int] = []
@@ -65,47 +94,64 @@ class _Lifted:
     def trains_on(self, time: float | None, step: int) -> bool:
         return True
 
-    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
-        lifted = parameters.replace(means=parameters.means + torch.tensor([0.0, 0.0, 0.1]))
-        penalties = {"height": self.penalty * parameters.means[:, 2].abs().sum()} if self.penalty else {}
-        return Drawn(lifted, penalties)
+    def moment(self, scene: _LiftedScene, picture: Picture, step: int) -> Moment:
+        penalties = {"height": self.penalty * scene.gaussians.means[:, 2].abs().sum()} if self.penalty else {}
+        return replace(scene.moment(picture.time), penalties=penalties)
 
-    def after_step(self, parameters: Gaussians, step: int, result: EditResult | None) -> int:
+    def optimize(self, scene: _LiftedScene, step: int) -> int:
         self.steps.append(step)
         return 3
 
-    def edit(self, parameters: Gaussians, step: int) -> EditResult | None:
+    def after_step(self, scene: _LiftedScene, step: int, edited: bool) -> _LiftedScene:
+        return scene
+
+    def grown(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
         return None
 
-    def num_moving(self, num_gaussians: int) -> int:
-        return num_gaussians
+    def window(self, step: int) -> tuple[float, float]:
+        return 0.0, 1.0
 
-    def state(self) -> dict[str, Tensor]:
-        return {"steps": torch.tensor(self.steps)}
+    def extend(self, scene: _LiftedScene, seen: tuple[float, float], step: int) -> None:
+        raise NotImplementedError
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        self.steps = state["steps"].tolist()
+    def all_moving(self, scene: _LiftedScene, extent: float) -> _LiftedScene:
+        return scene
+
+    def follow(self, edit: TopologyEdit) -> None: ...
+
+    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> _LiftedScene:
+        self.steps = tensors["steps"].tolist()
+        return _LiftedScene(gaussians=gaussians, options=like.options, background=like.background)
+
+    def state(self) -> State:
+        return with_role({"steps": torch.tensor(self.steps)}, Role.TRAINING)
 
 
-def test_a_model_of_another_kind_is_trained(capture: Path) -> None:
-    trainer = _trainer(capture)
-    trainer.model = _Lifted()
+def _trained_by(trainer: Trainer, training: SceneTraining[Any]) -> Trainer:
+    """``trainer`` with its Gaussians in a scene of another kind."""
+    trainer.scene = _LiftedScene(gaussians=trainer.optimizer.parameters)
+    trainer.training = training
+    return trainer
+
+
+def test_a_scene_of_another_kind_is_trained(capture: Path) -> None:
+    training = _Lifted()
+    trainer = _trained_by(_trainer(capture), training)
     before = trainer.scene.gaussians.means.detach().clone()
     losses = [trainer.step().loss for _ in range(30)]
-    assert trainer.model.steps == list(range(1, 31))
+    assert training.steps == list(range(1, 31))
     assert sum(losses[-4:]) < sum(losses[:4])
     assert not torch.equal(trainer.scene.gaussians.means, before)
-    other = _trainer(capture)
-    other.model = _Lifted()
+    other = _trained_by(_trainer(capture), _Lifted())
     other.restore(trainer.checkpoint())
     assert other.step().loss == trainer.step().loss
     assert trainer.bad_gradients == 3 * 31
 
 
-def test_penalties_of_the_model_are_part_of_the_loss(capture: Path) -> None:
-    plain, penalized = (_trainer(capture) for _ in range(2))
-    plain.model, penalized.model = _Lifted(), _Lifted()
-    penalized.model.penalty = 0.01
+def test_penalties_of_the_training_are_part_of_the_loss(capture: Path) -> None:
+    penalizing = _Lifted()
+    penalizing.penalty = 0.01
+    plain, penalized = _trained_by(_trainer(capture), _Lifted()), _trained_by(_trainer(capture), penalizing)
     heights = plain.optimizer.parameters.means.detach()[:, 2].abs()
     assert penalized.step().loss == pytest.approx(plain.step().loss + 0.01 * float(heights.sum()), rel=1e-5)
     for _ in range(20):
@@ -116,28 +162,27 @@ def test_penalties_of_the_model_are_part_of_the_loss(capture: Path) -> None:
 class _Growing(_Lifted):
     """It wants each Gaussian once more after step 2."""
 
-    def edit(self, parameters: Gaussians, step: int) -> EditResult | None:
+    def grown(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
         assert self.steps[-1] == step, "it has followed the step already"
         if step != 2:
             return None
-        num = len(parameters)
-        return EditResult(TopologyEdit(torch.arange(2 * num) % num, torch.arange(2 * num) >= num))
+        num = len(scene)
+        edit = TopologyEdit(torch.arange(2 * num) % num, torch.arange(2 * num) >= num)
+        return scene.edited(edit), EditResult(edit)
 
 
-def test_a_model_may_change_the_set(capture: Path) -> None:
+def test_a_kind_of_scene_may_change_the_set(capture: Path) -> None:
     """At once, and the run goes on with it; new rows have no moments."""
-    trainer = _trainer(capture)
-    trainer.model = _Growing()
+    trainer = _trained_by(_trainer(capture), _Growing())
     counts = []
     for _ in range(4):
         trainer.step()
         counts.append(len(trainer.scene.gaussians))
         if trainer.done == 2:
-            moments = trainer.optimizer.state()["exp_avg_sq.means"]
+            moments = trainer.optimizer.state()["exp_avg_sq.means"].tensor
             assert moments[:50].any()
             assert not moments[50:].any()
-            other = _trainer(capture)
-            other.model = _Growing()
+            other = _trained_by(_trainer(capture), _Growing())
             other.restore(trainer.checkpoint())
     assert counts == [50, 100, 100, 100]
     for _ in range(2):
@@ -228,32 +273,33 @@ def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> Non
     for _ in range(30):
         trainer.step()
     assert trainer.scene.gaussians.sh_degree == 0
-    scene = stored_scene(trainer.checkpoint(), trainer.config.model)
+    scene, network = restored_scene(trainer.checkpoint(), trainer.config.model), trainer.colours.network
+    assert network is not None
     camera = trainer.pictures[0].cameras
-    gaussians, shader = trainer.scene.gaussians.detach(), trainer.colours.shader(None, None)
-    drawn = moment_of(scene, None).seen_by(camera, RenderOptions()).rgb
+    gaussians, shader = trainer.scene.gaussians.detach(), network.shader(None, None)
+    drawn = scene.render(camera, options=RenderOptions()).rgb
     assert torch.equal(drawn, render(gaussians, camera, shader=shader).rgb.detach())
     assert not torch.equal(drawn, render(gaussians, camera).rgb)
     assert scene.colour is not None
-    assert num_colour_values(scene) == 3 * len(gaussians) + scene.colour.num_values
+    assert scene.num_colour_values == 3 * len(gaussians) + scene.colour.num_values
 
 
 class _Exploding(_Lifted):
     """From step 3 on it draws positions and rotations that are not finite."""
 
-    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
+    def moment(self, scene: _LiftedScene, picture: Picture, step: int) -> Moment:
         if step < 3:
-            return super().gaussians_at(parameters, batch, step)
-        factor = float("nan")
-        return Drawn(parameters.replace(means=parameters.means * factor, quats=parameters.quats * factor))
+            return super().moment(scene, picture, step)
+        now, factor = scene.gaussians, float("nan")
+        return Moment(now.replace(means=now.means * factor, quats=now.quats * factor), picture.time)
 
 
 class _Overweight(_Lifted):
     """From step 3 on it has an infinite penalty."""
 
-    def gaussians_at(self, parameters: Gaussians, batch: Picture, step: int) -> Drawn:
+    def moment(self, scene: _LiftedScene, picture: Picture, step: int) -> Moment:
         self.penalty = 0.0 if step < 3 else float("inf")
-        return super().gaussians_at(parameters, batch, step)
+        return super().moment(scene, picture, step)
 
 
 def _stops_in_step_3(trainer: Trainer) -> str:
@@ -271,8 +317,7 @@ def _stops_in_step_3(trainer: Trainer) -> str:
 @pytest.mark.parametrize("timed", [False, True])
 def test_what_is_not_finite_is_named_in_one_line(capture: Path, tmp_path: Path, timed: bool) -> None:
     """Step, view, attributes, and the time; the parameters stay as they were."""
-    trainer = _trainer(write_timed_capture(tmp_path / "timed") if timed else capture)
-    trainer.model = _Exploding()
+    trainer = _trained_by(_trainer(write_timed_capture(tmp_path / "timed") if timed else capture), _Exploding())
     time = "(0|0.25|0.5|0.75|1)" if timed else "0"
     assert re.fullmatch(
         rf"step 3, view 'train/r_00\d': the field makes means, quats at {time} not finite; lower .*model\.deform",
@@ -281,21 +326,18 @@ def test_what_is_not_finite_is_named_in_one_line(capture: Path, tmp_path: Path, 
 
 
 def test_a_term_that_is_not_finite_is_named_in_one_line(capture: Path) -> None:
-    trainer = _trainer(capture)
-    trainer.model = _Overweight()
-    message = _stops_in_step_3(trainer)
+    message = _stops_in_step_3(_trained_by(_trainer(capture), _Overweight()))
     assert re.fullmatch(
         r"step 3, view 'train/r_00\d': the loss term 'height' is inf; lower its weight or rate", message
     )
 
 
-def test_only_times_that_the_model_wants_are_trained_on(tmp_path: Path) -> None:
+def test_only_times_that_the_training_wants_are_trained_on(tmp_path: Path) -> None:
     class _Early(_Lifted):
         def trains_on(self, time: float | None, step: int) -> bool:
             return time is not None and time <= 0.1 * step
 
-    trainer = _trainer(write_timed_capture(tmp_path))
-    trainer.model = _Early()
+    trainer = _trained_by(_trainer(write_timed_capture(tmp_path)), _Early())
     seen = [trainer.step().picture.time for _ in range(40)]
     assert all(time is not None and time <= 0.1 * (i + 1) for i, time in enumerate(seen))
     assert set(seen[20:]) == set(TRAIN_TIMES)

@@ -1,0 +1,53 @@
+"""Steps of a training that learns nothing, for what listens to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from moving_scene import camera
+
+from dyngs.data.loader import Picture
+from dyngs.errors import DyngsError
+from dyngs.training.events import StepDone, StepReport
+from dyngs.training.loop import Loop, Stopwatch
+from dyngs.training.state import Checkpoint, CheckpointInfo
+
+PICTURE = Picture("view", camera(2, 2), torch.zeros(2, 2, 3), None, None, None)
+
+
+@dataclass
+class Counting:
+    """Counts its steps; ``findings`` and ``failures`` say what happens in which."""
+
+    done: int = 0
+    bad_gradients: int = 0
+    num_gaussians: int = 1234
+    num_moving: int = 56
+    has_test_views: bool = False
+    findings: dict[int, str] = field(default_factory=dict)
+    failures: dict[int, str] = field(default_factory=dict)
+
+    def step(self) -> StepReport:
+        step = self.done + 1
+        if step in self.failures:
+            raise DyngsError(self.failures[step])
+        self.done = step
+        return report_of(step, finding=self.findings.get(step))
+
+    def checkpoint(self) -> Checkpoint:
+        return Checkpoint(CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), "black", "classic"), {})
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        self.done = checkpoint.info.step
+
+
+def report_of(step: int, difference: float = 0.1, finding: str | None = None) -> StepReport:
+    """The report of ``step``: a loss of 0.5 and a picture that is wrong by ``difference`` everywhere."""
+    truth = torch.zeros(2, 2, 3)
+    return StepReport(step, 0.5, PICTURE, truth + difference, truth, finding)
+
+
+def step_done(step: int, total: int, difference: float = 0.1) -> StepDone:
+    """The event of ``step`` of ``total``."""
+    return StepDone(report_of(step, difference), Loop(Counting(step), total, Stopwatch()))
