@@ -7,9 +7,9 @@ import math
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.deform.scene import TrainedScene
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions
+from dyngs.static.scene import StaticScene
 from dyngs.view.camera_paths import CameraPath
 from dyngs.view.render_job import DEFAULT_OPTIONS, RenderJob
 
@@ -39,5 +39,5 @@ def balls_job(
     cameras: Cameras, options: RenderOptions = DEFAULT_OPTIONS, background: torch.Tensor | None = None
 ) -> RenderJob:
     """The two balls seen by ``cameras``."""
-    scene = TrainedScene(two_balls(), torch.zeros(0, dtype=torch.long))
+    scene = StaticScene(gaussians=two_balls())
     return RenderJob(scene, CameraPath(cameras), options, background)

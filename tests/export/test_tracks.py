@@ -6,15 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from moving_scene import MOVING_ROWS, TRAIN_TIMES, Sliding, moving_scene, row_of_balls, still_scene
 
-from dyngs.deform.scene import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.export import tracks as export_tracks
 from dyngs.export.tracks import Tracks, tracks_of, write_tracks
+from dyngs.static.scene import StaticScene
 
 
 def expected(times: tuple[float, ...], speed: float = 1.0) -> np.ndarray:
@@ -88,7 +87,7 @@ def test_sizes_beyond_the_limit_are_refused_before_memory_is_taken(monkeypatch: 
         tracks_of(moving_scene(Sliding()), (0.0,) * 5)
     monkeypatch.undo()
     with pytest.raises(DyngsError, match=r"6\.0 GB"):
-        tracks_of(TrainedScene(row_of_balls(5), torch.zeros(0).long()), range(100_000_000))
+        tracks_of(StaticScene(gaussians=row_of_balls(5)), range(100_000_000))
 
 
 def test_fields_are_the_arrays_of_the_file() -> None:

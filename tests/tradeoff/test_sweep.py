@@ -13,7 +13,6 @@ from tiny_fields import busy_config, write_tiny_capture
 from dyngs.api.train import train
 from dyngs.config import DynamicModel
 from dyngs.config.io import load_resolved, save_config
-from dyngs.deform.scene import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run, render_options
 from dyngs.runs.checkpoint import is_compact, load_run
@@ -117,7 +116,6 @@ def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Measurement], r
     assert is_compact(folder)
     assert len(chosen.scene) == points[0].num_gaussians / 2
     assert chosen.config.data.downscale == 2 * load_resolved(runs.run_dir).data.downscale
-    assert isinstance(chosen.scene, TrainedScene)
     assert chosen.scene.masks is not None
     assert render_options(chosen.config.model) == render_options_of(variant, load_resolved(runs.run_dir).model)
     for single in (Variant(sh_degree=0), Variant(alpha_min=0.02), Variant(storage=2.0)):
@@ -151,7 +149,6 @@ def test_masks_that_a_run_has_stay(points: list[Measurement], runs: VariantRuns,
     assert run_settings(masked.run_dir).mask_times == 3
     for variant in (Variant(prune=0.5), Variant(prune=0.5, finetune=1)):
         scene = load_run(masked.folder(variant)).scene
-        assert isinstance(scene, TrainedScene)
         assert scene.masks is not None
         assert len(scene.masks.times) == 3
 

@@ -14,7 +14,7 @@ from dyngs.errors import DyngsError
 from dyngs.export.ply import SplatFile, read_ply, write_ply
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions
-from dyngs.scene import Moment
+from dyngs.static.scene import StaticScene
 from dyngs.view.job_of_ply import job_of_ply, splat_options
 from dyngs.view.render_job import RenderJobOptions, render_frame
 
@@ -69,6 +69,7 @@ def test_exported_file_is_drawn_like_the_run(tmp_path) -> None:
     splat = read_ply(write_ply(tmp_path / "a.ply", two_balls(), RasterizeMode.ANTIALIASED, eps2d=0.1))
     options = splat_options(splat)
     assert (options.mode, options.eps2d) == (RasterizeMode.ANTIALIASED, 0.1)
-    wanted, got = (render_frame(Moment(x), cameras_around(1), options) for x in (two_balls(), splat.gaussians))
+    scenes = [StaticScene(gaussians=x) for x in (two_balls(), splat.gaussians)]
+    wanted, got = (render_frame(scene, scene.moment(None), cameras_around(1), options) for scene in scenes)
     np.testing.assert_array_equal(got.rgb, wanted.rgb)
     assert splat_options(SplatFile(two_balls())) == RenderOptions()

@@ -12,7 +12,6 @@ from two_balls import balls_job, cameras_around, two_balls
 
 from dyngs.camera import Cameras
 from dyngs.rendering import RenderOptions, render
-from dyngs.scene import moment_of
 from dyngs.view.camera_paths import static_path
 from dyngs.view.render_job import RenderJob, job_frames, render_frame, resize_cameras
 
@@ -66,7 +65,7 @@ def test_each_frame_shows_the_scene_at_its_time() -> None:
     scene, times = moving_scene(Sliding()), (0.0, 0.3, 1.0)
     frames = list(job_frames(RenderJob(scene, static_path(camera(), times))))
     for frame, time in zip(frames, times, strict=True):
-        np.testing.assert_array_equal(frame.rgb, render_frame(moment_of(scene, time), camera()).rgb)
+        np.testing.assert_array_equal(frame.rgb, render_frame(scene, scene.moment(time), camera()).rgb)
     assert np.abs(frames[0].rgb - frames[2].rgb).max() > 0.1
 
 
