@@ -15,7 +15,7 @@ from dyngs.config import DynamicModel
 from dyngs.config.io import load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run, render_options
-from dyngs.runs.checkpoint import is_compact, load_run
+from dyngs.runs.checkpoint import has_only_scene_file, load_run
 from dyngs.tradeoff.measure import render_options_of
 from dyngs.tradeoff.measurements import Measurement, read_measurement
 from dyngs.tradeoff.report import write_report
@@ -113,7 +113,7 @@ def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Measurement], r
     variant = Variant(prune=0.5, mask_times=3, storage=2.0, mode="antialiased", alpha_min=0.02, scale=0.5)
     folder = write_chosen(runs, variant)
     chosen = load_run(folder)
-    assert is_compact(folder)
+    assert has_only_scene_file(folder)
     assert len(chosen.scene) == points[0].num_gaussians / 2
     assert chosen.config.data.downscale == 2 * load_resolved(runs.run_dir).data.downscale
     assert chosen.scene.masks is not None
@@ -136,7 +136,7 @@ def test_another_field_moves_the_same(
 ) -> None:
     before = load_resolved(run_dir, ["model.deform.fourier=4", "model.deform.move_scales=false"])
     save_config(before, tmp_path / "config.yaml")
-    changed = load_resolved(tmp_path, field_changes(before.model, variant)).model
+    changed = load_resolved(tmp_path, field_changes(before, variant)).model
     assert isinstance(changed, DynamicModel)
     assert changed.deform.kind == kind
     assert {name: getattr(changed.deform, name) for name in size} == size
