@@ -86,18 +86,18 @@ class VisibilityMasks:
 
 def matched(rows: Tensor, active: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Places in ``rows`` of what is in both, and their places in ``active``; both ascending indices below ``count``."""
-    place = torch.full((count,), -1)
-    place[rows] = torch.arange(len(rows))
+    place = torch.full((count,), -1, device=rows.device)
+    place[rows] = torch.arange(len(rows), device=rows.device)
     found = place[active]
     places = torch.nonzero(found >= 0)[:, 0]
     return found[places], places
 
 
 def _places() -> Tensor:
-    return 2 ** torch.arange(BITS, dtype=torch.int64)
+    return 2 ** torch.arange(BITS, dtype=torch.int64, device="cpu")
 
 
 def _unpacked(bits: Tensor, count: int) -> Tensor:
     """(K, N) bool of packed bits (K, ceil(N / 8))."""
-    places = torch.arange(BITS, dtype=torch.uint8)
+    places = torch.arange(BITS, dtype=torch.uint8, device=bits.device)
     return ((bits[..., None] >> places) & 1).bool().flatten(1)[:, :count]

@@ -146,6 +146,29 @@ def test_only_ops_imports_the_native_core() -> None:
     assert [name for name in importers if not name.startswith("dyngs/ops/")] == []
 
 
+FACTORIES = {"zeros", "ones", "full", "empty", "tensor", "arange", "linspace", "logspace", "eye", "rand", "randn"} | {
+    "randint",
+    "randperm",
+    "tril_indices",
+    "triu_indices",
+}
+"""Functions of torch that make a tensor on the CPU unless told otherwise."""
+
+
+def test_every_tensor_is_made_on_a_named_device() -> None:
+    """A tensor made without ``device`` lies on the CPU, whatever it is to be used with. Say ``device="cpu"`` where it
+    belongs there."""
+    found = []
+    for path in PYTHON_FILES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
+                continue
+            made = ast.unparse(node.func.value) == "torch" and node.func.attr in FACTORIES
+            if made and "device" not in {keyword.arg for keyword in node.keywords}:
+                found.append(f"{relative(path)}:{node.lineno}")
+    assert found == []
+
+
 @pytest.mark.parametrize("path", TEST_FILES, ids=relative)
 def test_every_test_file_mirrors_a_source_file(path: Path) -> None:
     if path.name in WITHOUT_MIRROR:

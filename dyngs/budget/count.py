@@ -51,7 +51,10 @@ class CountLimit:
         """Return what a checkpoint must hold: nothing where nothing was removed."""
         if not self.before:
             return {}
-        return {"before": torch.tensor(self.before), "lost": torch.tensor(self.lost, dtype=torch.float64)}
+        return {
+            "before": torch.tensor(self.before, device="cpu"),
+            "lost": torch.tensor(self.lost, dtype=torch.float64, device="cpu"),
+        }
 
     def restore(self, stored: Mapping[str, Tensor]) -> None:
         """Take over what ``state`` returned."""

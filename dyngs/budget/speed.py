@@ -119,7 +119,7 @@ class SpeedLimit:
     def state(self) -> dict[str, Tensor]:
         """Return what a checkpoint must hold."""
         return {
-            name: torch.tensor(x, dtype=torch.float64 if isinstance(x, float) else None)
+            name: torch.tensor(x, dtype=torch.float64 if isinstance(x, float) else None, device="cpu")
             for name, x in asdict(self.found).items()
         }
 
@@ -263,7 +263,7 @@ def drawing_seconds(trainer: Trainer, scene: Scene, views: int = VIEWS) -> float
     config = trainer.config
     chosen = [trainer.pictures.views[i] for i in evenly_spaced(len(trainer.pictures), views)]
     cameras = training_cameras(chosen, config.data)
-    drawing = Drawing(scene, render_options(config.model), torch.zeros(3))
+    drawing = Drawing(scene, render_options(config.model), torch.zeros(3, device=scene.gaussians.means.device))
     drawing.picture(cameras[0], chosen[0].time)
     least = [math.inf] * len(chosen)
     for _ in range(ROUNDS):
@@ -289,7 +289,7 @@ def least_seconds(trainer: Trainer, scene: Scene, limit: float) -> float:
 
 def _few(trainer: Trainer) -> Scene:
     """Return ``FEW`` of the Gaussians of ``trainer``, all of them moving if any will move."""
-    kept = torch.tensor(evenly_spaced(trainer.num_gaussians, FEW))
+    kept = torch.tensor(evenly_spaced(trainer.num_gaussians, FEW), device="cpu")
     return trainer.training.all_moving(trainer.scene.select(kept), trainer.extent)
 
 

@@ -38,7 +38,7 @@ def with_harmonics(gaussians: Gaussians, shader: Shader, degree: int = 3) -> Bak
     directions = sphere(DIRECTIONS).to(gaussians.means.dtype)
     basis = harmonics_basis(directions, degree)
     solver = torch.linalg.pinv(basis)
-    shown = torch.ones(1, len(gaussians), 2, dtype=torch.int32)
+    shown = torch.ones(1, len(gaussians), 2, dtype=torch.int32, device=gaussians.means.device)
     far = _FAR * max(1.0, float(gaussians.means.abs().max())) if len(gaussians) else 1.0
     sh = gaussians.sh.new_zeros(len(gaussians), num_sh_terms(degree), 3)
     squares = 0.0
@@ -54,14 +54,14 @@ def with_harmonics(gaussians: Gaussians, shader: Shader, degree: int = 3) -> Bak
 
 def sphere(count: int) -> Tensor:
     """(count, 3) unit vectors spread evenly over all directions: a Fibonacci lattice."""
-    z = 1 - (2 * torch.arange(count, dtype=torch.float64) + 1) / count
-    angle = math.pi * (3 - math.sqrt(5)) * torch.arange(count, dtype=torch.float64)
+    z = 1 - (2 * torch.arange(count, dtype=torch.float64, device="cpu") + 1) / count
+    angle = math.pi * (3 - math.sqrt(5)) * torch.arange(count, dtype=torch.float64, device="cpu")
     radius = (1 - z * z).sqrt()
     return torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1)
 
 
 def _eye(center: Tensor) -> Cameras:
     """A camera at ``center`` (3,)."""
-    pose = torch.eye(4, dtype=center.dtype)
+    pose = torch.eye(4, dtype=center.dtype, device=center.device)
     pose[:3, 3] = -center
-    return Cameras(pose[None], torch.eye(3, dtype=center.dtype)[None], 1, 1)
+    return Cameras(pose[None], torch.eye(3, dtype=center.dtype, device=center.device)[None], 1, 1)

@@ -102,7 +102,7 @@ class ColourNetwork:
 def box_around(means: Tensor) -> Tensor:
     """(2, 3) centre and half sides of the box that holds ``means`` (N, 3) but their outer percent; no side is zero."""
     if not len(means):
-        return torch.stack([torch.zeros(3), torch.ones(3)])
+        return torch.stack([torch.zeros(3, device=means.device), torch.ones(3, device=means.device)])
     ordered = means.detach().sort(dim=0).values
     last = len(ordered) - 1
     low, high = ordered[round(0.01 * last)], ordered[round(0.99 * last)]

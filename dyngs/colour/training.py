@@ -224,5 +224,5 @@ def _start_values(widths: list[int], generator: torch.Generator) -> dict[str, Te
     for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
         weight = glorot(fan_in, fan_out, generator)
         values[f"weight{i}"] = torch.zeros_like(weight) if i == len(widths) - 2 else weight
-        values[f"bias{i}"] = torch.zeros(fan_out)
+        values[f"bias{i}"] = torch.zeros(fan_out, device=weight.device)
     return values

@@ -87,11 +87,14 @@ def find_view_dependent(
         tolerance: dB that may be given away.
     """
     means, changes = _mean_and_change(seen, options)
-    errors, worths = [], torch.zeros(len(changes))
-    everywhere, nowhere = torch.ones(len(changes)), torch.zeros(len(changes))
+    errors, worths = [], torch.zeros(len(changes), device=changes.device)
+    everywhere, nowhere = (
+        torch.ones(len(changes), device=changes.device),
+        torch.zeros(len(changes), device=changes.device),
+    )
     for view in held_out:
         errors.append([_squared_error(view, means, x, options, background).item() for x in (nowhere, everywhere)])
-        half = torch.full((len(changes),), 0.5, requires_grad=True)
+        half = torch.full((len(changes),), 0.5, requires_grad=True, device=changes.device)
         (slope,) = torch.autograd.grad(_squared_error(view, means, half, options, background), half)
         worths -= slope
     without, with_all = (math.fsum(column) for column in zip(*errors, strict=True))
@@ -110,16 +113,20 @@ def first_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance:
         tolerance: dB by which the error may be above the lowest along the ranking; none is chosen if that suffices.
     """
     order = changes.argsort(descending=True, stable=True)
-    errors = without - torch.cat([torch.zeros(1), worths[order].double().cumsum(0)])
+    errors = without - torch.cat([torch.zeros(1, device=worths.device), worths[order].double().cumsum(0)])
     enough = errors <= errors.clamp_min(1e-12).min() * 10 ** (tolerance / 10)
-    keeps = torch.zeros(len(changes), dtype=torch.bool)
+    keeps = torch.zeros(len(changes), dtype=torch.bool, device=changes.device)
     keeps[order[: int(enough.int().argmax())]] = True
     return keeps
 
 
 def _mean_and_change(seen: Iterable[MeasuredView], options: RenderOptions) -> tuple[Tensor, Tensor]:
     """(N, 3) mean of what the harmonics add to the base colour in the views, and (N,) how much that varies."""
-    weight, total, squares = torch.zeros(1, 1), torch.zeros(1, 3), torch.zeros(1)
+    weight, total, squares = (
+        torch.zeros(1, 1, device="cpu"),
+        torch.zeros(1, 3, device="cpu"),
+        torch.zeros(1, device="cpu"),
+    )
     for view in seen:
         share = contributions(view.gaussians, view.camera, options)[0]
         added = _added(view.gaussians, view.camera, share, options)

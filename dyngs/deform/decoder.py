@@ -39,7 +39,7 @@ class Decoder:
             fan_out = self.widths[i + 1]
             weight = glorot(fan_in, fan_out, generator)
             values[f"weight{i}"] = torch.zeros_like(weight) if i == last else weight
-            values[f"bias{i}"] = torch.zeros(fan_out)
+            values[f"bias{i}"] = torch.zeros(fan_out, device="cpu")
         return values
 
     def __call__(self, features: Tensor, parameters: Parameters) -> Tensor:

@@ -34,9 +34,11 @@ class Hexplane(NetworkField):
         for level, multiplier in enumerate(options.levels):
             side = options.resolution * multiplier
             low, high = SPACE_RANGE
-            space = torch.rand((3, side, side, options.channels), generator=generator) * (high - low) + low
+            space = (
+                torch.rand((3, side, side, options.channels), generator=generator, device="cpu") * (high - low) + low
+            )
             tensors[f"space{level}"] = space
-            tensors[f"time{level}"] = torch.ones(3, rows, side, options.channels)
+            tensors[f"time{level}"] = torch.ones(3, rows, side, options.channels, device="cpu")
         hidden = [options.width] * options.depth + [options.width * len(head_sizes(options))]
         self.decoder = Decoder(options.channels * len(options.levels), hidden, options)
         rates = dict.fromkeys(tensors, options.lr_planes * setup.extent)

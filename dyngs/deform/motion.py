@@ -42,11 +42,11 @@ def measure_motion(field: DeformationField, gaussians: Gaussians, times: Sequenc
         times: in [0, 1]; at most ``MAX_SAMPLES`` evenly chosen ones are looked at.
         px_size: (M,) world units that one pixel covers, in the nearest training view.
     """
-    chosen = torch.linspace(0, len(times) - 1, min(len(times), MAX_SAMPLES)).round().long().tolist()
+    chosen = torch.linspace(0, len(times) - 1, min(len(times), MAX_SAMPLES), device="cpu").round().long().tolist()
     samples = [field.offsets(gaussians.means, times[i]) for i in chosen]
     mean = _mean(samples)
     longest = gaussians.scales.amax(1)
-    score = torch.zeros(len(gaussians))
+    score = torch.zeros(len(gaussians), device=gaussians.means.device)
     for sample in samples:
         stray = (sample.means - mean.means).norm(dim=1)
         if sample.quats is not None and mean.quats is not None:

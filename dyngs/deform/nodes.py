@@ -51,7 +51,7 @@ def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
     tree, places, points = _tree(positions), positions.double().numpy(), means.detach().double().numpy()
     count = min(FOLLOWED, len(positions))
     gaps = torch.from_numpy(tree.query(places, k=count)[0]).reshape(len(positions), -1)
-    radii = gaps[:, 1:].mean(1) if count > 1 else torch.ones(len(positions), dtype=torch.float64)
+    radii = gaps[:, 1:].mean(1) if count > 1 else torch.ones(len(positions), dtype=torch.float64, device=gaps.device)
     followed = torch.from_numpy(tree.query(points, k=count)[1]).reshape(len(points), -1)
     floor = max(1e-6 * float(radii.max()), 1e-12)
     return Nodes(positions, radii.clamp_min(floor).to(positions), followed)
@@ -71,14 +71,14 @@ def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
         chosen = [int((points - points.mean(0)).square().sum(1).argmin())]
         apart = (points - points[chosen[0]]).square().sum(1)
     else:
-        return torch.zeros(0, dtype=torch.long)
+        return torch.zeros(0, dtype=torch.long, device=points.device)
     while len(chosen) < min(count, len(points)):
         farthest = int(apart.argmax())
         if float(apart[farthest]) <= 0:
             break
         chosen.append(farthest)
         apart = torch.minimum(apart, (points - points[farthest]).square().sum(1))
-    return torch.tensor(chosen, dtype=torch.long)
+    return torch.tensor(chosen, dtype=torch.long, device=points.device)
 
 
 def follow(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:

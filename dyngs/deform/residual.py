@@ -87,9 +87,9 @@ def _errors_in(
     gaussians: Gaussians, picture: Picture, options: RenderOptions, background: Tensor, expected: Tensor
 ) -> tuple[Tensor, Tensor]:
     """(N,) sums of errors and of weights over one picture."""
-    counts = torch.ones(expected.shape[:2]) if picture.mask is None else picture.mask
+    counts = torch.ones(expected.shape[:2], device=expected.device) if picture.mask is None else picture.mask
     error = (expected - picture.composite(background)) * counts[..., None]
-    flat = torch.zeros(len(gaussians), 1, 3, requires_grad=True)
+    flat = torch.zeros(len(gaussians), 1, 3, requires_grad=True, device=gaussians.means.device)
     blended = render(gaussians.replace(sh=flat), picture.cameras, options).rgb[0]
     (signed,) = torch.autograd.grad(blended, flat, error, retain_graph=True)
     (weight,) = torch.autograd.grad(blended, flat, counts[..., None].expand_as(error).contiguous())

@@ -20,7 +20,7 @@ from dyngs.static.scene import filter_state, filtered, stored_filter, stored_tim
 from dyngs.tensor_checks import require_ascending, require_indices
 from dyngs.visibility import VisibilityMasks, matched
 
-_NONE = torch.zeros(0, dtype=torch.long)
+_NONE = torch.zeros(0, dtype=torch.long, device="cpu")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class DynamicScene(Scene):
         if not own:
             return DynamicScene(gaussians=gaussians, seen_at=times, filter_std=std)
         masks = VisibilityMasks.restored(part_of(tensors, "masks"), count)
-        rows = tensors.get("rows", torch.arange(count))
+        rows = tensors.get("rows", torch.arange(count, device=gaussians.means.device))
         require_ascending("rows", require_indices("rows", rows, (None,), count))
         field = restored_field(options.deform, own, len(rows))
         return DynamicScene(gaussians=gaussians, seen_at=times, field=field, moving=rows, masks=masks, filter_std=std)
@@ -102,8 +102,8 @@ class DynamicScene(Scene):
         return filtered(deformed(part.gaussians, offsets, part.rows), part.filter_std), offsets
 
     def edited(self, edit: TopologyEdit) -> DynamicScene:
-        position = torch.full((len(self),), -1)
-        position[self.moving] = torch.arange(len(self.moving))
+        position = torch.full((len(self),), -1, device=self.moving.device)
+        position[self.moving] = torch.arange(len(self.moving), device=self.moving.device)
         descent = position[edit.source]
         rows = torch.nonzero(descent >= 0)[:, 0]
         field = self.field

@@ -21,16 +21,27 @@ SOLID = 0.05
 def seeded(gaussians: Gaussians, count: int, extent: float, generator: torch.Generator) -> EditResult:
     """The edit that adds ``count`` faint grey Gaussians, spread evenly in the box of ``gaussians``."""
     center, half_size = box_of(gaussians, extent)
-    places = center + half_size * (2 * torch.rand((count, 3), generator=generator) - 1)
+    places = center + half_size * (2 * torch.rand((count, 3), generator=generator, device="cpu") - 1)
     spacing = float((2 * half_size).prod() / max(count, 1)) ** (1 / 3)
-    source = torch.cat([torch.arange(len(gaussians)), torch.zeros(count, dtype=torch.long)])
-    is_new = torch.arange(len(source)) >= len(gaussians)
+    source = torch.cat(
+        [
+            torch.arange(len(gaussians), device=gaussians.means.device),
+            torch.zeros(count, dtype=torch.long, device=gaussians.means.device),
+        ]
+    )
+    is_new = torch.arange(len(source), device=gaussians.means.device) >= len(gaussians)
     changes = {
         "means": torch.cat([gaussians.means, places]),
-        "quats": torch.cat([gaussians.quats, torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(count, 4)]),
-        "log_scales": torch.cat([gaussians.log_scales, torch.full((count, 3), math.log(SEED_SIZE * spacing))]),
-        "logit_opacities": torch.cat([gaussians.logit_opacities, torch.full((count,), SEED_LOGIT)]),
-        "sh": torch.cat([gaussians.sh, torch.zeros(count, *gaussians.sh.shape[1:])]),
+        "quats": torch.cat(
+            [gaussians.quats, torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=gaussians.means.device).expand(count, 4)]
+        ),
+        "log_scales": torch.cat(
+            [gaussians.log_scales, torch.full((count, 3), math.log(SEED_SIZE * spacing), device=gaussians.means.device)]
+        ),
+        "logit_opacities": torch.cat(
+            [gaussians.logit_opacities, torch.full((count,), SEED_LOGIT, device=gaussians.means.device)]
+        ),
+        "sh": torch.cat([gaussians.sh, torch.zeros(count, *gaussians.sh.shape[1:], device=gaussians.means.device)]),
     }
     return EditResult(TopologyEdit(source, is_new), changes)
 
@@ -44,7 +55,7 @@ def box_of(gaussians: Gaussians, extent: float) -> tuple[Tensor, Tensor]:
     solid = (now.opacities >= SOLID) & now.means.isfinite().all(1)
     means = now.means[solid] if bool(solid.any()) else now.means.nan_to_num()
     if not len(means):
-        return torch.zeros(3), torch.full((3,), extent)
+        return torch.zeros(3, device=means.device), torch.full((3,), extent, device=means.device)
     ordered = means.sort(dim=0).values
     low, high = ordered[int(0.01 * (len(ordered) - 1))], ordered[math.ceil(0.99 * (len(ordered) - 1))]
     half_size = (0.5 * BOX_MARGIN * (high - low)).clamp_min(max(1e-3 * extent, 1e-6))

@@ -26,7 +26,7 @@ from dyngs.parameters import Parameters
 from dyngs.state import Role, State, StateTensor, moved_to, part_of, prefixed
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
-NOTHING = torch.zeros(0, 3)
+NOTHING = torch.zeros(0, 3, device="cpu")
 SPAN = 4
 """Control points that a pose depends on: the splines are cubic."""
 LR = {"quats": 6e-3, "log_scales": 1e-3, "logit_opacities": 1e-2, "colors": 2e-3}
@@ -49,7 +49,7 @@ class Skeleton(NetworkField):
         self.num_pieces = options.pieces or min(max(1, round(PIECES_PER_TIME * setup.num_times)), MAX_KEY_TIMES)
         self.buffers = {"positions": NOTHING}
         sizes = head_sizes(options)
-        tensors = {name: torch.zeros(0, self.num_points, size) for name, size in sizes.items()}
+        tensors = {name: torch.zeros(0, self.num_points, size, device="cpu") for name, size in sizes.items()}
         rates = {
             "means": options.lr_means * setup.extent,
         } | LR
@@ -133,8 +133,8 @@ class Skeleton(NetworkField):
         low = 0 if seen[0] <= 0 else math.floor(seen[0] * self.num_pieces) + 1
         high = last if seen[1] >= 1 else math.ceil(seen[1] * self.num_pieces) + SPAN - 3
         reach = min(2, high - low)
-        after = torch.arange(1, last - high + 1)[:, None]
-        before = torch.arange(low, 0, -1)[:, None]
+        after = torch.arange(1, last - high + 1, device="cpu")[:, None]
+        before = torch.arange(low, 0, -1, device="cpu")[:, None]
         for x in (points.data for points in self._splines().values()):
             x[:, high + 1 :] = x[:, high, None] + after * ((x[:, high] - x[:, high - reach]) / max(reach, 1))[:, None]
             x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
@@ -162,12 +162,12 @@ class Skeleton(NetworkField):
     def _place(self, means: Tensor) -> None:
         """Drop nodes that nothing follows, add some where they are missing, and let ``means`` (M, 3) follow."""
         old = self.buffers["positions"]
-        kept = torch.zeros(0, dtype=torch.long)
+        kept = torch.zeros(0, dtype=torch.long, device=means.device)
         if len(old):
             kept = nodes_at(old, means).followed[:, 0].unique()
         added = means[spread_out(means, self.options.nodes - len(kept), old[kept])]
-        source = torch.cat([kept, torch.zeros(len(added), dtype=torch.long)])
-        is_new = torch.arange(len(source)) >= len(kept)
+        source = torch.cat([kept, torch.zeros(len(added), dtype=torch.long, device=kept.device)])
+        is_new = torch.arange(len(source), device=source.device) >= len(kept)
         started = self._motion_at(added)
         own = self._splines()
         values = {name: torch.cat([x.detach()[kept], started[name]]) for name, x in own.items()}
@@ -208,4 +208,4 @@ def cubic_shares(place: float) -> Tensor:
     """(4,) shares of the control points around a piece of a uniform cubic B-spline, at ``place`` in [0, 1] of it."""
     rest = 1 - place
     middle = [(3 * x**3 - 6 * x**2 + 4) / 6 for x in (place, rest)]
-    return torch.tensor([rest**3 / 6, *middle, place**3 / 6])
+    return torch.tensor([rest**3 / 6, *middle, place**3 / 6], device="cpu")

@@ -153,7 +153,7 @@ class DynamicTraining:
         threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(found.usual > threshold)[:, 0]
         result = seeded(now.detach(), self.options.num_random_moving, self.capture.extent, self._generator)
-        added = torch.arange(len(now), len(now) + self.options.num_random_moving)
+        added = torch.arange(len(now), len(now) + self.options.num_random_moving, device=rows.device)
         moving = torch.cat([rows, added])
         center, half_size = box_of(now, self.capture.extent)
         setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
@@ -168,7 +168,7 @@ class DynamicTraining:
         count, means = len(scene), scene.gaussians.means.detach()
         setup = FieldSetup(means.mean(0), torch.full_like(means[0], extent), len(self.times), count, extent)
         field = new_field(self.options.deform, setup, torch.Generator())
-        return replace(scene, moving=torch.arange(count), field=field)
+        return replace(scene, moving=torch.arange(count, device=means.device), field=field)
 
     def follow(self, edit: TopologyEdit) -> None:
         """Do nothing: nothing is kept per Gaussian."""
@@ -206,7 +206,7 @@ class DynamicTraining:
         if self.options.time_jitter == 0:
             return time
         gap = 1 / max(len(self.times) - 1, 1)
-        noise = float(torch.randn((), generator=self._generator)) * self.options.time_jitter * gap
+        noise = float(torch.randn((), generator=self._generator, device="cpu")) * self.options.time_jitter * gap
         return min(max(time + noise * max(0.0, 1 - step / self.schedule.rates.steps), 0.0), 1.0)
 
     def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:

@@ -30,7 +30,9 @@ class Trajectory(NetworkField):
         self.options, self.setup = options, setup
         self.num_terms = options.polynomial + 2 * options.fourier
         sizes = head_sizes(options)
-        tensors = {name: torch.zeros(setup.num_moving, self.num_terms, size) for name, size in sizes.items()}
+        tensors = {
+            name: torch.zeros(setup.num_moving, self.num_terms, size, device="cpu") for name, size in sizes.items()
+        }
         rates = dict.fromkeys(sizes, LR_OTHERS)
         rates["means"] = options.lr_means * setup.extent
         self.parameters = Parameters(tensors, rates, LR_DECAY, Role.PER_MOVING)
@@ -59,4 +61,4 @@ def basis(time: float, polynomial: int, fourier: int) -> Tensor:
     values = legendre[1 : polynomial + 1]
     for k in range(1, fourier + 1):
         values += [math.sin(2 * math.pi * k * time) / k, math.cos(2 * math.pi * k * time) / k]
-    return torch.tensor(values, dtype=torch.float64)
+    return torch.tensor(values, dtype=torch.float64, device="cpu")

@@ -157,7 +157,7 @@ def _middles(num_times: int) -> list[int]:
 def _signed_error(drawing: Drawing, picture: Picture) -> tuple[Tensor, Tensor]:
     """(H, W, 3) render minus truth, and (H, W) what counts: R' - R - (G' - G) is the difference of two of them."""
     truth = picture.composite(drawing.background).clamp(0, 1)
-    counts = torch.ones(truth.shape[:2]) if picture.mask is None else picture.mask
+    counts = torch.ones(truth.shape[:2], device=truth.device) if picture.mask is None else picture.mask
     return drawing.picture(picture.cameras, picture.time) - truth, counts
 
 

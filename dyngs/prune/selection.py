@@ -31,7 +31,7 @@ class Pruning:
 def best(scores: Tensor, share: float) -> Tensor:
     """(N,) bool: all but the lowest ``share`` of ``scores`` (N,), at least one; of equal ones the first."""
     count = min(max(1, math.ceil(len(scores) * (1 - share) - 1e-9)), len(scores))
-    kept = torch.zeros(len(scores), dtype=torch.bool)
+    kept = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
     kept[torch.sort(scores, descending=True, stable=True).indices[:count]] = True
     return kept
 

@@ -89,7 +89,7 @@ def prune_(trainer: Trainer) -> Pruned:
     """Prune and mask the Gaussians of ``trainer``, which from here on leaves their number alone."""
     options = trainer.config.prune
     trainer.scene = trainer.scene.unmasked()
-    pruning = Pruning(torch.ones(len(trainer.scene), dtype=torch.bool), 0.0, 0.0)
+    pruning = Pruning(torch.ones(len(trainer.scene), dtype=torch.bool, device="cpu"), 0.0, 0.0)
     whole = trainer.scene
     if options.share > 0:
         pruning = _pruning(trainer)

@@ -99,8 +99,8 @@ class DefaultDensifier:
 
     def __init__(self, options: DefaultStrategy, schedule: DensifySchedule, extent: float) -> None:
         self.options, self.schedule, self.extent = options, schedule, extent
-        self.grad_sum = torch.zeros(0)
-        self.seen = torch.zeros(0)
+        self.grad_sum = torch.zeros(0, device="cpu")
+        self.seen = torch.zeros(0, device="cpu")
 
     def wants_signal(self, step: int) -> bool:
         return step < self.schedule.stop
@@ -109,8 +109,8 @@ class DefaultDensifier:
         if not self.wants_signal(step):
             return
         if len(self.seen) != probe_grad.shape[1]:
-            self.grad_sum = torch.zeros(probe_grad.shape[1])
-            self.seen = torch.zeros(probe_grad.shape[1])
+            self.grad_sum = torch.zeros(probe_grad.shape[1], device=probe_grad.device)
+            self.seen = torch.zeros(probe_grad.shape[1], device=probe_grad.device)
         grad = probe_grad[..., 2:] if self.options.absgrad else probe_grad[..., :2]
         x, y = grad[..., 0] * (0.5 * size[0]), grad[..., 1] * (0.5 * size[1])
         length = torch.hypot(x, y)
@@ -123,7 +123,7 @@ class DefaultDensifier:
         parameters = parameters.detach()
         if self.schedule.densifies_at(step) and len(self.seen) == len(parameters):
             result = self._densify(step, parameters, generator)
-            self.grad_sum, self.seen = torch.zeros(0), torch.zeros(0)
+            self.grad_sum, self.seen = torch.zeros(0, device="cpu"), torch.zeros(0, device="cpu")
         elif resets:
             result = EditResult(None)
         else:
@@ -151,12 +151,12 @@ class DefaultDensifier:
         plan = plan_edit(parameters, self.grad_sum / self.seen.clamp_min(1), self.options, self.extent, max_scale)
         kept, cloned, split = (torch.nonzero(mask)[:, 0] for mask in (plan.kept, plan.cloned, plan.split))
         source = torch.cat([kept, cloned, split, split])
-        is_new = torch.ones(len(source), dtype=torch.bool)
+        is_new = torch.ones(len(source), dtype=torch.bool, device=source.device)
         is_new[: len(kept)] = False
         means, log_scales = parameters.means[source], parameters.log_scales[source]
         children = slice(len(kept) + len(cloned), None)
         sizes = log_scales[children].clamp_max(MAX_LOG_VARIANCE / 2).exp()
-        noise = torch.randn((2 * len(split), 3), generator=generator) * sizes
+        noise = torch.randn((2 * len(split), 3), generator=generator, device="cpu").to(sizes.device) * sizes
         means[children] += rotate(parameters.quats[source[children]], noise)
         log_scales[children] -= math.log(SPLIT_SHRINK)
         return EditResult(TopologyEdit(source, is_new), {"means": means, "log_scales": log_scales})

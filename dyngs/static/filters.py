@@ -29,14 +29,14 @@ def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
         cameras: the training cameras, with the intrinsics of the pictures that are trained on.
     """
     means = means.detach()
-    nearest = torch.full((len(means),), torch.inf)
+    nearest = torch.full((len(means),), torch.inf, device=means.device)
     focal = max(float(group.intrinsics[:, 0, 0].max()) for group in cameras)
     for group in cameras:
         for pose, intrinsics in zip(group.cam_from_world, group.intrinsics, strict=True):
             depth = _visible_depth(means, pose, intrinsics, group.width, group.height)
             nearest = torch.minimum(nearest, depth)
     seen = torch.isfinite(nearest)
-    farthest = nearest[seen].max() if bool(seen.any()) else torch.tensor(1.0)
+    farthest = nearest[seen].max() if bool(seen.any()) else torch.tensor(1.0, device=means.device)
     return torch.where(seen, nearest, farthest) * (FILTER_VARIANCE**0.5 / focal)
 
 

@@ -95,7 +95,7 @@ def initial_gaussians(
         xyz = torch.from_numpy(scene.points[finite].astype(np.float64))
         base = (torch.from_numpy(scene.points_rgb[finite].astype(np.float64)) / 255 - 0.5) / SH_C0
         if len(xyz) > start.max_gaussians:
-            chosen = torch.randperm(len(xyz), generator=generator)[: start.max_gaussians].sort().values
+            chosen = torch.randperm(len(xyz), generator=generator, device="cpu")[: start.max_gaussians].sort().values
             xyz, base = xyz[chosen], base[chosen]
         if len(xyz) > 0:
             return _isotropic(xyz, base, start, sh_degree)
@@ -108,25 +108,25 @@ def _random_points(
 ) -> tuple[Tensor, Tensor]:
     """Positions (N, 3) float64 uniform in a cube, and base colour coefficients (N, 3) just above mid grey (3DGS)."""
     count = min(options.num_random, max_points)
-    center, half_extent = torch.zeros(3, dtype=torch.float64), options.half_extent
+    center, half_extent = torch.zeros(3, dtype=torch.float64, device="cpu"), options.half_extent
     if options.kind != "random" and not scene.around_origin:
         center = torch.from_numpy(scene.camera_centers.mean(axis=0))
         half_extent = CUBE_PER_EXTENT * scene.extent
-    unit = torch.rand((count, 3), generator=generator, dtype=torch.float64) * 2 - 1
-    base = torch.rand((count, 3), generator=generator, dtype=torch.float64) / 255
+    unit = torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") * 2 - 1
+    base = torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") / 255
     return unit * half_extent + center, base
 
 
 def _isotropic(xyz: Tensor, base: Tensor, start: StartValues, sh_degree: int) -> Gaussians:
     n = len(xyz)
     log_scale = 0.5 * mean_squared_neighbour_distance(xyz).log() + math.log(start.scale_factor)
-    sh = torch.zeros((n, num_sh_terms(sh_degree), 3))
+    sh = torch.zeros((n, num_sh_terms(sh_degree), 3), device="cpu")
     sh[:, 0] = base.float()
     return Gaussians(
         means=xyz.float(),
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0], device="cpu").repeat(n, 1),
         log_scales=log_scale.float()[:, None].repeat(1, 3),
-        logit_opacities=torch.full((n,), math.log(start.opacity / (1 - start.opacity))),
+        logit_opacities=torch.full((n,), math.log(start.opacity / (1 - start.opacity)), device="cpu"),
         sh=sh,
     )
 
@@ -140,7 +140,7 @@ def mean_squared_neighbour_distance(xyz: Tensor) -> Tensor:
 
     neighbours = min(3, len(xyz) - 1)
     if neighbours < 1:
-        return torch.full((len(xyz),), 1e-2, dtype=torch.float64)
+        return torch.full((len(xyz),), 1e-2, dtype=torch.float64, device="cpu")
     points = xyz.double().numpy()
     distances, _ = KDTree(points).query(points, k=neighbours + 1)
     squared = torch.from_numpy(np.square(distances[:, 1:]).mean(axis=1))

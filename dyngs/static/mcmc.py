@@ -49,7 +49,7 @@ class McmcDensifier:
             return None
         n = len(opacities)
         dead = torch.nonzero(~alive)[:, 0]
-        source, is_new = torch.arange(n), ~alive
+        source, is_new = torch.arange(n, device=opacities.device), ~alive
         if len(dead) > 0:
             picks = torch.multinomial(
                 torch.where(alive, opacities, 0.0), len(dead), replacement=True, generator=generator
@@ -61,7 +61,7 @@ class McmcDensifier:
         if added > 0:
             picks = torch.multinomial(opacities, added, replacement=True, generator=generator)
             opacities, log_scales, shared = self._share(opacities, log_scales, picks)
-            is_new = torch.cat([is_new | shared, torch.ones(added, dtype=torch.bool)])
+            is_new = torch.cat([is_new | shared, torch.ones(added, dtype=torch.bool, device=opacities.device)])
             source = torch.cat([source, source[picks]])
             opacities = torch.cat([opacities, opacities[picks]])
             log_scales = torch.cat([log_scales, log_scales[picks]])
@@ -85,9 +85,9 @@ class McmcDensifier:
         quats, log_scales, logits = (
             x.detach()[rows] for x in (parameters.quats, parameters.log_scales, parameters.logit_opacities)
         )
-        eta = torch.randn((len(rows), 3), generator=generator)
+        eta = torch.randn((len(rows), 3), generator=generator, device="cpu").to(quats.device)
         variances = (2 * log_scales).clamp_max(MAX_LOG_VARIANCE).exp()
-        inverse = quats * torch.tensor([1.0, -1.0, -1.0, -1.0])
+        inverse = quats * torch.tensor([1.0, -1.0, -1.0, -1.0], device=quats.device)
         shake = rotate(quats, rotate(inverse, eta) * variances)
         opacities = torch.nn.functional.logsigmoid(logits).exp()  # unlike sigmoid, the same on any number of threads
         weight = 1 / (1 + (NOISE_STEEPNESS * (opacities - NOISE_OPACITY)).exp())
@@ -133,8 +133,8 @@ def relocated(opacities: Tensor, copies: Tensor, min_opacity: float = 0.005) -> 
     copies = copies.clamp(1, MAX_COPIES)
     thinner = -torch.expm1(torch.log1p(-opacities) / copies)
     thinner = thinner.clamp(min_opacity, 1 - eps)
-    j = torch.arange(1, MAX_COPIES + 1, dtype=torch.float64)
-    profile = _binomials()[copies][:, 1:] * torch.where(j % 2 == 1, 1.0, -1.0) / j.sqrt()
+    j = torch.arange(1, MAX_COPIES + 1, dtype=torch.float64, device=opacities.device)
+    profile = _binomials().to(copies.device)[copies][:, 1:] * torch.where(j % 2 == 1, 1.0, -1.0) / j.sqrt()
     powers = (thinner.log()[:, None] * j).exp()  # torch.pow depends on the number of threads
     return thinner, opacities / (profile * powers).sum(1)
 
@@ -142,4 +142,4 @@ def relocated(opacities: Tensor, copies: Tensor, min_opacity: float = 0.005) -> 
 def _binomials() -> Tensor:
     """(51, 51) table of C(N, j), float64."""
     rows = [[float(math.comb(n, j)) for j in range(MAX_COPIES + 1)] for n in range(MAX_COPIES + 1)]
-    return torch.tensor(rows, dtype=torch.float64)
+    return torch.tensor(rows, dtype=torch.float64, device="cpu")

@@ -105,7 +105,9 @@ class GaussianOptimizer:
 
     def _harmonics_rates(self) -> Tensor:
         """(K * 3,) one rate per coefficient."""
-        rates = torch.full((self.parameters.sh.shape[1], 3), self.options.lr_sh_rest)
+        rates = torch.full(
+            (self.parameters.sh.shape[1], 3), self.options.lr_sh_rest, device=self.parameters.means.device
+        )
         rates[0] = self.options.lr_sh_dc
         return rates.reshape(-1)
 
@@ -113,7 +115,7 @@ class GaussianOptimizer:
         """(N,) bool; opacity or position: a Gaussian at full opacity gets no gradient on its opacity alone."""
         opacity_grad, means_grad = self.parameters.logit_opacities.grad, self.parameters.means.grad
         if opacity_grad is None or means_grad is None:
-            return torch.ones(len(self.parameters), dtype=torch.bool)
+            return torch.ones(len(self.parameters), dtype=torch.bool, device=self.parameters.means.device)
         return (opacity_grad != 0) | seen_rows(means_grad)
 
 

@@ -61,7 +61,7 @@ def coarseness_of(visibility: Tensor) -> Tensor:
         visibility: (N,) sums of its blending weights over pictures.
     """
     if not len(visibility):
-        return torch.zeros(0, dtype=torch.uint8)
+        return torch.zeros(0, dtype=torch.uint8, device=visibility.device)
     most = torch.quantile(visibility[:: max(len(visibility) // 2**20, 1)].double(), MOST_VISIBLE).clamp_min(1e-30)
     octaves = -0.5 * (visibility.double() / most).clamp(1e-30, 1.0).log2()
     return octaves.round().clamp_max(MAX_COARSENESS).to(torch.uint8)

@@ -16,11 +16,11 @@ def evaluation_background(choice: str, has_alpha: bool) -> tuple[str, Tensor]:
         has_alpha: of the capture; decides what "auto" means.
     """
     resolved = {"auto": "white" if has_alpha else "black", "random": "black"}.get(choice, choice)
-    return resolved, torch.full((3,), _BACKGROUNDS[resolved])
+    return resolved, torch.full((3,), _BACKGROUNDS[resolved], device="cpu")
 
 
 def background_colour(name: str, generator: torch.Generator | None = None) -> Tensor:
     """(3,) of a run's "white", "black" or "random" background; random ones need a generator, else they are black."""
     if name == "random" and generator is not None:
-        return torch.rand(3, generator=generator)
-    return torch.full((3,), _BACKGROUNDS["black" if name == "random" else name])
+        return torch.rand(3, generator=generator, device="cpu")
+    return torch.full((3,), _BACKGROUNDS["black" if name == "random" else name], device="cpu")

@@ -98,5 +98,5 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
 
 def _field_values(options: DeformField, num_times: int, num_moving: int) -> int:
     """Numbers that a field learns."""
-    setup = FieldSetup(torch.zeros(3), torch.ones(3), num_times, num_moving, 1.0)
+    setup = FieldSetup(torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0)
     return new_field(options, setup, torch.Generator()).parameters.num_values

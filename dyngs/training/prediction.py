@@ -116,7 +116,7 @@ class NetworkTrainer:
         )
         scene, training = scene_of(human_options(self.model), avatar, Rates(1))
         moment = training.moment(scene, targets[0], step)
-        total = torch.zeros(())
+        total = torch.zeros((), device=self.mean.device)
         for picture in targets:
             rendering = scene.render(picture.cameras, moment, options=drawing, background=background)
             truth = picture.composite(background)
@@ -165,7 +165,7 @@ class NetworkTrainer:
         others = [i for i in range(len(views)) if i not in inputs] or inputs
         frame = views[others[self._draw(len(others))]].frame
         shown = [i for i in others if views[i].frame == frame]
-        order = torch.randperm(len(shown), generator=self.generator).tolist()
+        order = torch.randperm(len(shown), generator=self.generator, device="cpu").tolist()
         return [person.pictures[shown[i]] for i in order[: self.model.target_views]]
 
     def _update(self, loss: Tensor, step: int) -> None:
@@ -180,7 +180,7 @@ class NetworkTrainer:
         self.optimizer.step()
 
     def _draw(self, count: int) -> int:
-        return int(torch.randint(count, (1,), generator=self.generator))
+        return int(torch.randint(count, (1,), generator=self.generator, device="cpu"))
 
 
 def assemble_network(config: Config, model: HumanPredictorModel) -> NetworkTrainer:
@@ -278,7 +278,10 @@ def mean_colours(people: list[Filmed], resolution: int) -> Tensor:
 
     Where nobody is seen: the mean of all that is.
     """
-    total, count = torch.zeros(3, resolution, resolution), torch.zeros(1, resolution, resolution)
+    total, count = (
+        torch.zeros(3, resolution, resolution, device="cpu"),
+        torch.zeros(1, resolution, resolution, device="cpu"),
+    )
     for person in people:
         sitter = person.sitter
         maps = person.look(spread_views(sitter, MEAN_VIEWS))
@@ -298,7 +301,7 @@ def rate_at(model: HumanPredictorModel, step: int, steps: int) -> float:
 
 def _choices(sitter: CapturedPerson, model: HumanPredictorModel, generator: torch.Generator) -> list[list[int]]:
     """Views to predict from: of a random moment each, one of them random, the others such that much is seen."""
-    firsts = torch.randint(len(sitter.views), (model.source_sets,), generator=generator).tolist()
+    firsts = torch.randint(len(sitter.views), (model.source_sets,), generator=generator, device="cpu").tolist()
     return [spread_views(sitter, model.source_views, first) for first in firsts]
 
 

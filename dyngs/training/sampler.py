@@ -15,7 +15,7 @@ class ViewSampler:
 
     def __init__(self, num_views: int) -> None:
         self.num_views = num_views
-        self._order = torch.zeros(0, dtype=torch.long)
+        self._order = torch.zeros(0, dtype=torch.long, device="cpu")
         self._position = 0
 
     def next(self, generator: torch.Generator, wanted: Callable[[int], bool]) -> int:
@@ -25,7 +25,7 @@ class ViewSampler:
         """
         while True:
             if self._position >= len(self._order):
-                self._order = torch.randperm(self.num_views, generator=generator)
+                self._order = torch.randperm(self.num_views, generator=generator, device="cpu")
                 self._position = 0
             self._position += 1
             index = int(self._order[self._position - 1])
@@ -33,7 +33,7 @@ class ViewSampler:
                 return index
 
     def state(self) -> dict[str, Tensor]:
-        return {"order": self._order, "position": torch.tensor([self._position])}
+        return {"order": self._order, "position": torch.tensor([self._position], device="cpu")}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Take over what ``state()`` returned. Raises KeyError, or ValueError for what is no order of the views."""

@@ -84,7 +84,11 @@ class Trainer:
         picture = self.pictures[index].shrunk(divisor)
         background = background_colour(self.background, self.generator)
         moment = self.training.moment(scene, picture, step)
-        probe = torch.zeros(1, len(scene), 4, requires_grad=True) if self.densifier.wants_signal(step) else None
+        probe = (
+            torch.zeros(1, len(scene), 4, requires_grad=True, device=scene.gaussians.means.device)
+            if self.densifier.wants_signal(step)
+            else None
+        )
         if scene.num_moving:
             _require_finite(moment.gaussians, step, picture, self.training.moves_by)
         rendering = scene.render(
@@ -97,7 +101,7 @@ class Trainer:
         terms |= moment.penalties
         terms |= self.densifier.regularizers(scene.gaussians) | self.colours.penalties(scene.gaussians)
         loss = _finite_sum(terms, step, picture)
-        sum(terms.values(), torch.zeros(())).backward()
+        sum(terms.values(), torch.zeros((), device=scene.gaussians.means.device)).backward()
         if probe is not None and probe.grad is not None:
             size = (picture.cameras.width, picture.cameras.height)
             # Fewer Gaussians suit small pictures: a gradient counts for less there.

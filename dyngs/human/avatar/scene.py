@@ -178,7 +178,7 @@ class HumanScene(Scene):
     def part(self, which: str) -> HumanScene:
         """Return all of it, or nothing: a person moves as a whole."""
         count = len(self) if (which == "still") == self.is_still else 0
-        return self.select(torch.arange(count))
+        return self.select(torch.arange(count, device=self.gaussians.means.device))
 
     def playing(self, clip: MotionClip) -> HumanScene:
         """Return the same person in another clip, whose poses are given as those of training were.
