@@ -7,6 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dyngs.state import tensors_of
 from dyngs.visibility import VisibilityMasks, matched
 
 TIMES = (0.0, 0.25, 0.5, 1.0)
@@ -47,7 +48,7 @@ def test_they_follow_the_gaussians() -> None:
 
 def test_through_a_checkpoint() -> None:
     masks, seen = some_masks()
-    again = VisibilityMasks.restored(masks.state())
+    again = VisibilityMasks.restored(tensors_of(masks.state()))
     assert again is not None
     assert (again.times, again.count) == (TIMES, 19)
     assert torch.equal(again.seen, seen)

@@ -1,4 +1,4 @@
-"""What colours learn beside harmonics, their rates, and the entropy of opacities."""
+"""What is learned of colours beside harmonics, its rates, when harmonics are measured, and the entropy of opacities."""
 
 from __future__ import annotations
 
@@ -7,12 +7,21 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import random_scene
+from torch import Tensor
 
 from dyngs.colour.network import network_of
-from dyngs.colour.training import Colours, NetworkTraining, opacity_entropy, rate_factor
-from dyngs.config import NetworkColour, ShColour
-from dyngs.gaussians import Gaussians
-from dyngs.rendering import render
+from dyngs.colour.training import (
+    AutoTraining,
+    ColourTraining,
+    NetworkTraining,
+    TrainingLooks,
+    opacity_entropy,
+    rate_factor,
+)
+from dyngs.config import AutoColour, NetworkColour, ShColour
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.rendering import RenderOptions, render
+from dyngs.state import tensors_of
 
 
 def gaussians() -> Gaussians:
@@ -26,11 +35,16 @@ def colours(seed: int = 0, **options: object) -> NetworkTraining:
     return NetworkTraining(NetworkColour.model_validate(options), 60, box, generator, sees_time=True)
 
 
+def stored(learner: NetworkTraining) -> dict[str, Tensor]:
+    """What a checkpoint has of colours: of the scene, and of its training."""
+    return {name: x.clone() for name, x in tensors_of(learner.network.state() | learner.state()).items()}
+
+
 def test_plain_colours_do_nothing() -> None:
-    plain = Colours(ShColour())
-    assert plain.shader(0.3, None) is None
+    plain = ColourTraining(ShColour())
+    assert plain.network is None
     assert plain.penalties(gaussians()) == {}
-    assert plain.after_step(1) == 0
+    assert plain.optimize(1) == 0
     assert plain.state() == {}
     assert plain.frozen_rest() is None
     assert not plain.holds_out(5, 1)
@@ -38,7 +52,7 @@ def test_plain_colours_do_nothing() -> None:
 
 def test_an_untrained_network_shows_the_base_colours() -> None:
     camera = random_scene(views=1).to(torch.float32).cameras
-    drawn = [render(gaussians(), camera, shader=s).rgb for s in (None, colours().shader(0.4, None))]
+    drawn = [render(gaussians(), camera, shader=s).rgb for s in (None, colours().network.shader(0.4))]
     torch.testing.assert_close(drawn[0], drawn[1], rtol=0, atol=1e-6)  # base + 0 in another order of float32 sums
 
 
@@ -50,10 +64,10 @@ def test_it_learns_what_depends_on_the_view() -> None:
     learner, drawn = colours(warm_up=5), gaussians()
     losses = []
     for step in range(1, 61):
-        error = (learner.shader(0.5, None)(drawn, cameras, shown) - target).square().mean()
+        error = (learner.network.shader(0.5)(drawn, cameras, shown) - target).square().mean()
         error.backward()
         losses.append(float(error.detach()))
-        assert learner.after_step(step) == 0
+        assert learner.optimize(step) == 0
     assert losses[-1] < 0.1 * losses[0]
 
 
@@ -68,10 +82,10 @@ def test_the_rate_warms_up_and_falls_by_thirds() -> None:
 
 def test_a_bad_gradient_is_left_out_and_counted() -> None:
     learner = colours()
-    before = {name: x.clone() for name, x in learner.state().items()}
+    before = stored(learner)
     learner.network.layers[-1].bias.grad = torch.tensor([1.0, float("nan"), 1.0])
-    assert learner.after_step(1) == 1
-    after = learner.state()
+    assert learner.optimize(1) == 1
+    after = stored(learner)
     assert (after["bias2"] != before["bias2"]).tolist() == [True, False, True]
     assert all(x.isfinite().all() for x in after.values() if x.is_floating_point())
 
@@ -82,19 +96,67 @@ def test_state_goes_round_and_training_goes_on_alike() -> None:
 
     def train(learner: NetworkTraining, first: int, last: int) -> None:
         for step in range(first, last + 1):
-            (learner.shader(0.1, None)(gaussians(), cameras, shown) - 0.3).square().mean().backward()
-            learner.after_step(step)
+            (learner.network.shader(0.1)(gaussians(), cameras, shown) - 0.3).square().mean().backward()
+            learner.optimize(step)
 
     whole, resumed = colours(), colours(seed=5)
     train(whole, 1, 5)
-    resumed.load_state({name: x.clone() for name, x in whole.state().items()})
+    resumed.restore(stored(whole), 30)
     train(whole, 6, 10)
     train(resumed, 6, 10)
-    for name, x in whole.state().items():
-        assert torch.equal(x, resumed.state()[name]), name
-    found = network_of(whole.state())
+    for name, x in stored(whole).items():
+        assert torch.equal(x, stored(resumed)[name]), name
+    found = network_of(stored(whole))
     assert found is not None
     assert torch.equal(found.layers[1].weight, whole.network.layers[1].weight)
+
+
+def test_every_eighth_view_is_held_out_until_it_is_measured() -> None:
+    colours = AutoTraining(AutoColour(measure_at=0.5), 100, 20)
+    assert [i for i in range(20) if colours.holds_out(i, 50)] == [5, 13]
+    assert not any(colours.holds_out(i, 51) for i in range(20))
+    assert measured_steps(colours) == [50]
+    few = AutoTraining(AutoColour(), 100, 5)
+    assert not few.held_out
+    assert measured_steps(few) == [], "too few views to spare one"
+
+
+def measured_steps(colours: AutoTraining) -> list[int]:
+    """Steps of 100 after which views are looked at; here there are none to look at."""
+    looked: list[int] = []
+    for step in range(101):
+
+        def looks(step: int = step) -> TrainingLooks:
+            looked.append(step)
+            return TrainingLooks((), lambda _: iter(()), RenderOptions(), torch.zeros(3))
+
+        found = colours.measured(step, looks)
+        assert (found is None) == (step not in looked)
+        assert found is None or (found.rows is None and "all harmonics stay" in found.text)
+    return looked
+
+
+def test_the_frozen_follow_the_set_and_go_round() -> None:
+    colours = AutoTraining(AutoColour(), 100, 20)
+    assert colours.frozen_rest() is None
+    colours.freeze(torch.tensor([True, False, True]))
+    colours.follow(TopologyEdit(torch.tensor([1, 2, 2]), torch.tensor([False, False, True])))
+    assert colours.frozen_rest() is not None
+    other = AutoTraining(AutoColour(), 100, 20)
+    other.restore(tensors_of(colours.state()), 3)
+    frozen = other.frozen_rest()
+    assert frozen is not None
+    assert frozen.tolist() == [False, True, True]
+    with pytest.raises(ValueError, match="frozen"):
+        other.restore(tensors_of(colours.state()), 4)
+    colours.freeze(torch.ones(3, dtype=torch.bool))
+    assert colours.frozen_rest() is None, "where no harmonics are stored none need to be kept at zero"
+
+
+@pytest.mark.parametrize("measure_at", [0.0, 1.0])
+def test_it_is_measured_within_the_run(measure_at: float) -> None:
+    with pytest.raises(ValueError, match="measure_at"):
+        AutoColour(measure_at=measure_at)
 
 
 @given(st.floats(-1e4, 1e4))
@@ -118,6 +180,6 @@ def test_the_entropy_pushes_away_from_one_over_e() -> None:
 
 def test_the_entropy_is_weighted_and_of_nothing_zero() -> None:
     some = gaussians()
-    (term,) = Colours(ShColour(opacity_entropy=0.5)).penalties(some).values()
+    (term,) = ColourTraining(ShColour(opacity_entropy=0.5)).penalties(some).values()
     assert float(term) == pytest.approx(0.5 * float(opacity_entropy(some.logit_opacities)))
     assert float(opacity_entropy(torch.zeros(0))) == 0

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.colour.view_dependence import AutoTraining, Finding, Look, find_view_dependent, first_worthwhile
-from dyngs.config import AutoColour
+from dyngs.colour.view_dependence import Finding, MeasuredView, find_view_dependent, first_worthwhile
 from dyngs.conventions import SH_C0
-from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, render
 
 BLACK = torch.zeros(3)
@@ -41,8 +39,8 @@ def noise(seed: int) -> Tensor:
     return torch.randn(24, 3, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def looks(angles: list[float], model: Gaussians, truth: Gaussians, mask: Tensor | None = None) -> list[Look]:
-    return [Look(model, camera(a), render(truth, camera(a)).rgb[0], mask) for a in angles]
+def looks(angles: list[float], model: Gaussians, truth: Gaussians, mask: Tensor | None = None) -> list[MeasuredView]:
+    return [MeasuredView(model, camera(a), render(truth, camera(a)).rgb[0], mask) for a in angles]
 
 
 def find(model: Gaussians, truth: Gaussians, tolerance: float = 0.05, mask: Tensor | None = None) -> Finding:
@@ -111,31 +109,6 @@ def test_the_fewest_that_are_worth_nearly_everything(seed: int, count: int, tole
     assert all(error > limit - 1e-5 for error in errors[:chosen])
 
 
-def test_every_eighth_view_is_held_out_until_it_is_measured() -> None:
-    colours = AutoTraining(AutoColour(measure_at=0.5), 100, 20)
-    assert [i for i in range(20) if colours.holds_out(i, 50)] == [5, 13]
-    assert not any(colours.holds_out(i, 51) for i in range(20))
-    assert [step for step in range(1, 101) if colours.measures_after(step)] == [50]
-    few = AutoTraining(AutoColour(), 100, 5)
-    assert not few.held_out
-    assert not any(few.measures_after(step) for step in range(101)), "too few views to spare one"
-
-
-def test_the_frozen_follow_the_set_and_go_round() -> None:
-    colours = AutoTraining(AutoColour(), 100, 20)
-    assert colours.frozen_rest() is None
-    colours.freeze(torch.tensor([True, False, True]))
-    colours.follow(TopologyEdit(torch.tensor([1, 2, 2]), torch.tensor([False, False, True])))
-    assert colours.frozen_rest() is not None
-    other = AutoTraining(AutoColour(), 100, 20)
-    other.load_state(colours.state())
-    frozen = other.frozen_rest()
-    assert frozen is not None
-    assert frozen.tolist() == [False, True, True]
-    colours.freeze(torch.ones(3, dtype=torch.bool))
-    assert colours.frozen_rest() is None, "where no harmonics are stored none need to be kept at zero"
-
-
 def test_in_words() -> None:
     keeps = torch.arange(100) < 12
     some = Finding(keeps, torch.zeros(100, 3), 0.35, 0.31)
@@ -153,9 +126,3 @@ def test_it_does_not_touch_what_it_looks_at() -> None:
     before = model.sh.clone()
     find(model, balls(rest))
     assert torch.equal(model.sh, before)
-
-
-@pytest.mark.parametrize("measure_at", [0.0, 1.0])
-def test_it_is_measured_within_the_run(measure_at: float) -> None:
-    with pytest.raises(ValueError, match="measure_at"):
-        AutoColour(measure_at=measure_at)

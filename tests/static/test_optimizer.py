@@ -7,6 +7,7 @@ import torch
 
 from dyngs.config import OptimConfig
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.state import part_of, tensors_of
 from dyngs.static.optimizer import ADAM_EPS, GaussianOptimizer
 
 
@@ -17,6 +18,17 @@ def _gaussians(n: int, seed: int = 0) -> Gaussians:
         return torch.randn(shape, generator=generator)
 
     return Gaussians(draw(n, 3), draw(n, 4), draw(n, 3), draw(n), draw(n, 4, 3))
+
+
+def _stored(optimizer: GaussianOptimizer) -> dict[str, torch.Tensor]:
+    """Copies of parameters and moments."""
+    tensors = {f"gaussians.{name}": x.detach() for name, x in optimizer.parameters.tensors().items()}
+    return {name: x.clone() for name, x in (tensors | tensors_of(optimizer.state())).items()}
+
+
+def _restored(tensors: dict[str, torch.Tensor]) -> GaussianOptimizer:
+    parameters = Gaussians(**part_of(tensors, "gaussians"))
+    return GaussianOptimizer(_gaussians(2, seed=9), OptimConfig()).restored(parameters, tensors)
 
 
 def _set_gradients(optimizer: GaussianOptimizer, seed: int, unseen: list[int] | None = None) -> dict[str, torch.Tensor]:
@@ -57,10 +69,10 @@ def test_unseen_gaussians_are_left_alone_unless_dense() -> None:
         optimizer = GaussianOptimizer(start, OptimConfig(sparse=sparse))
         _set_gradients(optimizer, 1)
         optimizer.step(1, 0.1, dense=dense)
-        before = {name: x.clone() for name, x in optimizer.state().items()}
+        before = _stored(optimizer)
         _set_gradients(optimizer, 2, unseen=[1, 3])
         optimizer.step(2, 0.1, dense=dense)
-        for name, x in optimizer.state().items():
+        for name, x in _stored(optimizer).items():
             changed = (x != before[name]).reshape(5, -1).any(1).tolist()
             assert changed == [True, moves, True, moves, True], name
 
@@ -93,10 +105,10 @@ def test_dropped_harmonics_stay_zero(frozen: tuple[bool, ...]) -> None:
     optimizer = GaussianOptimizer(_gaussians(3), OptimConfig())
     _set_gradients(optimizer, 1)
     optimizer.step(1, 0.1, dense=True)
-    before = {name: x.clone() for name, x in optimizer.state().items()}
+    before = _stored(optimizer)
     rows, base = torch.tensor(frozen), torch.full((3, 3), 0.7)
     optimizer.drop_rest(base, rows)
-    after = optimizer.state()
+    after = _stored(optimizer)
     assert torch.equal(after["gaussians.sh"][rows, 0], base[rows])
     assert not after["gaussians.sh"][rows, 1:].any()
     for name, x in before.items():
@@ -106,8 +118,7 @@ def test_dropped_harmonics_stay_zero(frozen: tuple[bool, ...]) -> None:
             assert torch.equal(after[name][~rows], x[~rows]), name
     terms = 1 if all(frozen) else before["gaussians.sh"].shape[1]
     assert optimizer.parameters.sh.shape == (3, terms, 3)
-    other = GaussianOptimizer(_gaussians(3), OptimConfig())
-    other.load_state({name: x.clone() for name, x in after.items()})
+    other = _restored(after)
     for each in (optimizer, other):
         for x in each.parameters.tensors().values():
             x.grad = torch.ones_like(x)
@@ -120,12 +131,12 @@ def test_an_edit_moves_parameters_and_moments() -> None:
     optimizer = GaussianOptimizer(_gaussians(4), OptimConfig())
     _set_gradients(optimizer, 1)
     optimizer.step(1, 0.1, dense=True)
-    before = {name: x.clone() for name, x in optimizer.state().items()}
+    before = _stored(optimizer)
     source, is_new = torch.tensor([0, 2, 2, 3]), torch.tensor([False, False, True, True])
     changes = {"means": torch.full((4, 3), 7.0)}
     edit = EditResult(TopologyEdit(source, is_new), changes, frozenset({"logit_opacities"}))
     optimizer.apply(edit)
-    after = optimizer.state()
+    after = _stored(optimizer)
     assert torch.equal(after["gaussians.means"], changes["means"])
     for name in ("quats", "log_scales", "logit_opacities", "sh"):
         assert torch.equal(after[f"gaussians.{name}"], before[f"gaussians.{name}"][source])
@@ -140,10 +151,10 @@ def test_a_reset_without_an_edit_keeps_all_else() -> None:
     optimizer = GaussianOptimizer(_gaussians(3), OptimConfig())
     _set_gradients(optimizer, 1)
     optimizer.step(1, 0.1, dense=True)
-    before = {name: x.clone() for name, x in optimizer.state().items()}
+    before = _stored(optimizer)
     lowered = torch.full((3,), -4.0)
     optimizer.apply(EditResult(None, {"logit_opacities": lowered}, frozenset({"logit_opacities"})))
-    changed = {name for name, x in optimizer.state().items() if not torch.equal(x, before[name])}
+    changed = {name for name, x in _stored(optimizer).items() if not torch.equal(x, before[name])}
     assert changed == {"gaussians.logit_opacities", "exp_avg.logit_opacities", "exp_avg_sq.logit_opacities"}
     assert torch.equal(optimizer.parameters.logit_opacities.detach(), lowered)
 
@@ -152,11 +163,23 @@ def test_state_goes_round_to_the_bit() -> None:
     first = GaussianOptimizer(_gaussians(6), OptimConfig())
     _set_gradients(first, 1)
     first.step(1, 0.1, dense=True)
-    second = GaussianOptimizer(_gaussians(2, seed=9), OptimConfig())
-    second.load_state({name: x.clone() for name, x in first.state().items()})
+    second = _restored(_stored(first))
     for optimizer in (first, second):
         _set_gradients(optimizer, 2)
         optimizer.step(2, 0.05, dense=False)
-    assert all(torch.equal(x, second.state()[name]) for name, x in first.state().items())
+    assert all(torch.equal(x, _stored(second)[name]) for name, x in _stored(first).items())
     with pytest.raises(KeyError):
-        second.load_state({})
+        first.restored(first.parameters, {})
+
+
+def test_a_restored_one_leaves_what_it_was_given() -> None:
+    """A checkpoint in memory, or the optimizer that it was taken from."""
+    first = GaussianOptimizer(_gaussians(4), OptimConfig())
+    _set_gradients(first, 1)
+    first.step(1, 0.1, dense=True)
+    before = _stored(first)
+    second = first.restored(first.parameters, tensors_of(first.state()))
+    _set_gradients(second, 2)
+    second.step(2, 0.1, dense=True)
+    assert all(torch.equal(x, before[name]) for name, x in _stored(first).items())
+    assert not torch.equal(second.parameters.means, first.parameters.means)

@@ -1,13 +1,16 @@
-"""The static model: parameters pass through, or filtered with what the cameras can resolve."""
+"""How a static scene is trained: on every picture, and its 3D filter is kept until it is due."""
 
 from __future__ import annotations
 
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.data.loader import Picture
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.state import part_of, tensors_of
 from dyngs.static.filters import filter_std, fuse_filter
-from dyngs.static.training import StaticScene
+from dyngs.static.scene import StaticScene
+from dyngs.static.training import FilterUpdate, StaticTraining
 
 INTRINSICS = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
 
@@ -22,46 +25,61 @@ def _camera() -> Cameras:
     return Cameras(torch.eye(4)[None], INTRINSICS[None], 100, 100)
 
 
+def _picture(time: float | None = None) -> Picture:
+    return Picture("view", _camera(), torch.zeros(100, 100, 3), None, None, time)
+
+
 def test_without_filter_parameters_pass_through() -> None:
-    model, gaussians = StaticScene(), _gaussians(2.0)
-    drawn = model.gaussians_at(gaussians, None, 1)
-    assert drawn.gaussians is gaussians
-    assert drawn.penalties == {}
-    assert model.after_step(gaussians, 1, EditResult(None)) == 0
-    assert model.state() == {}
+    training, gaussians = StaticTraining(FilterUpdate()), _gaussians(2.0)
+    scene = training.first_scene(gaussians)
+    moment = training.moment(scene, _picture(), 1)
+    assert moment.gaussians is gaussians
+    assert moment.penalties == {}
+    assert training.optimize(scene, 1) == 0
+    assert training.after_step(scene, 1, True) is scene
+    assert part_of(scene.state(), "model") == {}
+    assert training.state() == {}
 
 
 def test_nothing_depends_on_time() -> None:
-    model = StaticScene()
-    assert all(model.trains_on(time, step) for time in (None, 0.0, 1.0) for step in (1, 1000))
-    assert model.num_moving(7) == 0
+    training = StaticTraining(FilterUpdate())
+    assert all(training.trains_on(time, step) for time in (None, 0.0, 1.0) for step in (1, 1000))
+    assert training.window(1) == (0.0, 1.0)
+    scene = training.first_scene(_gaussians(2.0, 7))
+    assert scene.num_moving == 0
+    assert training.all_moving(scene, 1.0) is scene
+    drawn = [training.moment(scene, _picture(time), 1).gaussians for time in (None, 0.0, 1.0)]
+    assert all(x is scene.gaussians for x in drawn)
 
 
 def test_the_set_is_left_to_the_strategy() -> None:
-    assert all(StaticScene().edit(_gaussians(2.0), step) is None for step in (1, 2, 100))
+    training = StaticTraining(FilterUpdate())
+    assert all(training.grown(training.first_scene(_gaussians(2.0)), step) is None for step in (1, 2, 100))
 
 
 def test_the_filter_is_kept_until_it_is_due() -> None:
-    model = StaticScene([_camera()], range(100, 200, 100))
+    training = StaticTraining(FilterUpdate([_camera()], range(100, 200, 100)))
     near, far = _gaussians(2.0), _gaussians(4.0)
     with_near, with_far = (fuse_filter(far, filter_std(x.means, [_camera()])) for x in (near, far))
 
-    def drawn(gaussians: Gaussians) -> Gaussians:
-        return model.gaussians_at(gaussians, None, 1).gaussians
+    def drawn(scene: StaticScene) -> Gaussians:
+        return training.moment(scene.with_gaussians(far), _picture(), 1).gaussians
 
-    drawn(near)
-    model.after_step(far, 50, None)
-    assert torch.equal(drawn(far).log_scales, with_near.log_scales)
-    model.after_step(far, 100, None)
-    assert torch.equal(drawn(far).log_scales, with_far.log_scales)
-    model.after_step(near, 101, EditResult(TopologyEdit.select(torch.ones(3, dtype=torch.bool))))
-    assert torch.equal(drawn(far).log_scales, with_near.log_scales)
-    model.after_step(far, 102, EditResult(None))  # opacities were reset: where cameras look may have changed
-    assert torch.equal(drawn(far).log_scales, with_far.log_scales)
+    scene = training.after_step(training.first_scene(near).with_gaussians(far), 50, False)
+    assert torch.equal(drawn(scene).log_scales, with_near.log_scales)
+    scene = training.after_step(scene, 100, False)
+    assert torch.equal(drawn(scene).log_scales, with_far.log_scales)
+    edited = scene.with_gaussians(near).edited(TopologyEdit.select(torch.ones(3, dtype=torch.bool)))
+    scene = training.after_step(edited, 101, True)
+    assert torch.equal(drawn(scene).log_scales, with_near.log_scales)
+    scene = training.after_step(scene.with_gaussians(far), 102, True)
+    assert torch.equal(drawn(scene).log_scales, with_far.log_scales), "where cameras look may have changed"
 
 
 def test_state_goes_round() -> None:
-    first, second = StaticScene([_camera()]), StaticScene([_camera()])
-    drawn = first.gaussians_at(_gaussians(2.0), None, 1).gaussians
-    second.load_state(first.state())
-    assert torch.equal(second.gaussians_at(_gaussians(4.0), None, 1).gaussians.log_scales[0], drawn.log_scales[0])
+    training = StaticTraining(FilterUpdate([_camera()]))
+    first = training.first_scene(_gaussians(2.0))
+    stored = part_of(tensors_of(first.state()), "model")
+    second = training.restored(_gaussians(4.0), stored, first)
+    drawn = (training.moment(scene, _picture(), 1).gaussians.log_scales for scene in (first, second))
+    assert torch.equal(*drawn)
