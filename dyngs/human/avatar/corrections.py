@@ -74,7 +74,7 @@ def new_corrections(options: HumanModel, clip: MotionClip, skeleton: Skeleton, a
     }
     if options.pose_offsets:
         zeros["pose_dirs"] = anchors.weights.new_zeros(len(anchors), 27)
-    roles = dict.fromkeys(zeros, Role.SHARED) | dict.fromkeys(("weights", "pose_dirs"), Role.PER_GAUSSIAN)
+    roles = {name: Role.PER_GAUSSIAN if name in ("weights", "pose_dirs") else Role.SHARED for name in zeros}
     return Parameters(zeros, LR | {"trans": LR["trans"] * unit}, LR_DECAY, roles)
 
 

@@ -1,4 +1,4 @@
-"""A trained avatar by itself: equal poses give equal pictures, and corrections that were learned are applied once."""
+"""An avatar by itself: equal poses give equal pictures, and corrections that were learned are applied once."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from dyngs.camera import Cameras
 from dyngs.config import HumanModel
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import texel_gaussians
-from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_pose
+from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_pose, correction_penalties
 from dyngs.human.avatar.posing import Skeleton
-from dyngs.human.avatar.scene import HumanScene, trained_avatar
-from dyngs.human.avatar.training import HumanScene, Subject
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.avatar.subject import Subject
+from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.motion.captured import CapturedMotion
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.load import default_template
-from dyngs.parameters import Parameters
 from dyngs.rendering import render
+from dyngs.state import part_of, tensors_of
 from dyngs.static.rates import Rates
 
 
@@ -34,17 +35,25 @@ def random_clip(frames: int, seed: int = 0) -> MotionClip:
     return MotionClip(times, 0.3 * torch.randn(frames, 55, 3, generator=generator), 0.1 * trans, torch.ones(frames))
 
 
-def stirred() -> tuple[HumanScene, Gaussians, HumanScene]:
-    """A model whose corrections are not zero, its Gaussians, and what is stored of it."""
+OPTIONS = HumanModel(sh_degree=0)
+
+
+def stirred() -> HumanScene:
+    """A person whose corrections are not zero."""
     body = default_template()
     gaussians, anchors = texel_gaussians(atlas_texels(body, 24), (0.0,), 0)
     gaussians = gaussians.replace(sh=torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(1)))
     subject = Subject(Skeleton(body.joints, body.parents), anchors, CapturedMotion(random_clip(4), (0, 1, 2, 3)))
-    model = HumanScene(HumanModel(sh_degree=0), subject, Rates(10))
+    scene = HumanTraining(OPTIONS, subject.footage.frames, Rates(10)).first_scene(gaussians, subject)
     generator = torch.Generator().manual_seed(2)
-    for x in model.corrections.learned.values().values():
+    for x in scene.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)
-    return model, gaussians, trained_avatar(gaussians, model.state())
+    return scene
+
+
+def reloaded(scene: HumanScene) -> HumanScene:
+    """The scene of what is stored of it."""
+    return HumanScene.restored(OPTIONS, scene.gaussians, part_of(tensors_of(scene.state()), "model"))
 
 
 def seen(gaussians: Gaussians) -> Tensor:
@@ -55,7 +64,7 @@ def seen(gaussians: Gaussians) -> Tensor:
 
 
 def test_two_clips_of_the_same_pose_give_the_same_picture() -> None:
-    _, _, scene = stirred()
+    scene = reloaded(stirred())
     one, other = random_clip(3, seed=5), random_clip(6, seed=6)
     for name in ("poses", "trans", "scale"):
         getattr(other, name)[4] = getattr(one, name)[1]
@@ -66,13 +75,13 @@ def test_two_clips_of_the_same_pose_give_the_same_picture() -> None:
 
 
 def test_baked_corrections_are_those_of_training() -> None:
-    model, _, scene = stirred()
-    clip = model.subject.footage.clip
-    for row in range(len(clip)):
-        posing = corrected_pose(model.corrections.learned, clip, row)
-        torch.testing.assert_close(axis_angle_to_matrix(scene.clip.poses[row]), posing.rotations, rtol=0, atol=1e-5)
-        torch.testing.assert_close(scene.clip.trans[row], posing.trans)
-        torch.testing.assert_close(scene.clip.scale[row], posing.scale)
+    trained = stirred()
+    played = reloaded(trained).moves_as
+    for row in range(len(trained.clip)):
+        posing = corrected_pose(trained.learned, trained.clip, row)
+        torch.testing.assert_close(axis_angle_to_matrix(played.poses[row]), posing.rotations, rtol=0, atol=1e-5)
+        torch.testing.assert_close(played.trans[row], posing.trans)
+        torch.testing.assert_close(played.scale[row], posing.scale)
 
 
 def test_other_clips_get_what_holds_for_all_poses() -> None:
@@ -88,7 +97,7 @@ def test_other_clips_get_what_holds_for_all_poses() -> None:
 
 
 def test_parts_are_all_or_nothing() -> None:
-    _, _, scene = stirred()
+    scene = reloaded(stirred())
     assert len(scene.part("moving")) == len(scene)
     assert len(scene.part("still")) == 0
     still = scene.playing(random_clip(1))
@@ -98,11 +107,10 @@ def test_parts_are_all_or_nothing() -> None:
 
 
 def test_penalties_pull_corrections_back() -> None:
-    model, _, _ = stirred()
-    terms = model.corrections.penalties()
+    learned = stirred().learned
+    terms = correction_penalties(learned, OPTIONS)
     assert set(terms) == {"pose", "skinning weights"}
-    sum(terms.values()).backward()  # type: ignore[union-attr]
-    learned: Parameters = model.corrections.learned
+    torch.stack(list(terms.values())).sum().backward()
     for name in ("poses", "turns", "joints", "weights"):
         grad = learned[name].grad
         assert grad is not None

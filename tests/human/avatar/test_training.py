@@ -6,20 +6,19 @@ from pathlib import Path
 
 import pytest
 import torch
-from dyngs.train.step import Trainer
 from synthetic_bodies import model, write_npz
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.build import assemble
+from dyngs.build import assemble, restored_scene
 from dyngs.config import Config, DataConfig, DefaultStrategy, HumanModel, OptimConfig, RunConfig, TrainConfig
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.gaussians import EditResult, TopologyEdit
+from dyngs.gaussians import TopologyEdit
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.training import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.runs.checkpoint import load_run, save_checkpoint, stored_scene
+from dyngs.runs.checkpoint import load_run, save_checkpoint
+from dyngs.training.trainer import Trainer
 from dyngs.view.animation import in_rest_pose, with_motion
 
 BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.11)
@@ -50,8 +49,8 @@ def tiny(capture: Path, run_dir: Path | None = None, steps: int = 10, **changes:
 
 
 def human(trainer: Trainer) -> HumanScene:
-    assert isinstance(trainer.model, HumanScene)
-    return trainer.model
+    assert isinstance(trainer.scene, HumanScene)
+    return trainer.scene
 
 
 def tensors_after(trainer: Trainer, steps: int) -> dict[str, Tensor]:
@@ -82,11 +81,11 @@ def test_a_seed_decides_every_byte_and_resuming_changes_none(capture: Path, pose
 
 def test_training_learns_and_evaluates_on_both_splits(capture: Path, tmp_path: Path) -> None:
     config = tiny(capture, tmp_path / "run", steps=60)
-    start = stored_scene(assemble(config).checkpoint(), config.model)
+    start = restored_scene(assemble(config).checkpoint(), config.model)
     run = load_run(train(config))
     assert isinstance(run.scene, HumanScene)
     assert isinstance(start, HumanScene)
-    assert float((run.scene.clip.poses - start.clip.poses).abs().max()) > 0
+    assert float((run.scene.moves_as.poses - start.moves_as.poses).abs().max()) > 0
     for split in ("test", "pose"):
         report = evaluate_run(tmp_path / "run", split)
         assert report.psnr > 18
@@ -102,11 +101,11 @@ def test_what_is_played_back_is_what_was_trained(
 ) -> None:
     body = write_npz(tmp_path / "model.npz", model("smplx")) if own_body else None
     trainer = assemble(tiny(capture, pose_offsets=pose_offsets, body=body))
-    assert (human(trainer).subject.shapes is not None) == own_body
+    assert (human(trainer).shapes is not None) == own_body
     tensors_after(trainer, 8)
-    parameters, picture = trainer.scene.gaussians, trainer.pictures[4]
-    drawn = human(trainer).gaussians_at(parameters, picture, trainer.done + 1).gaussians
-    scene = stored_scene(trainer.checkpoint(), trainer.config.model)
+    picture = trainer.pictures[4]
+    drawn = trainer.training.moment(trainer.scene, picture, trainer.done + 1).gaussians
+    scene = restored_scene(trainer.checkpoint(), trainer.config.model)
     played = scene.at(picture.time)
     torch.testing.assert_close(played.means, drawn.means.detach(), rtol=0, atol=1e-5)
     torch.testing.assert_close(played.log_scales.sum(1), drawn.log_scales.detach().sum(1), rtol=0, atol=1e-4)
@@ -117,14 +116,13 @@ def test_what_is_played_back_is_what_was_trained(
 def test_anchors_and_weights_follow_the_set(capture: Path) -> None:
     trainer = assemble(tiny(capture))
     tensors_after(trainer, 3)
-    model = human(trainer)
-    points, weights = model.anchors.points, model.corrections.learned["weights"].detach().clone()
+    scene = human(trainer)
+    points, weights = scene.anchors.points, scene.learned["weights"].detach().clone()
     source = torch.tensor([5, 2, 2, 9])
-    is_new = torch.tensor([False, False, True, False])
-    model.after_step(trainer.scene.gaussians, 0, EditResult(TopologyEdit(source, is_new)))
-    assert torch.equal(model.anchors.points, points[source])
-    assert torch.equal(model.corrections.learned["weights"].detach(), weights[source])
-    assert len(trainer.model.state()["anchors.size"]) == 4
+    edited = scene.edited(TopologyEdit(source, torch.tensor([False, False, True, False])))
+    assert torch.equal(edited.anchors.points, points[source])
+    assert torch.equal(edited.learned["weights"].detach(), weights[source])
+    assert len(edited.state()["model.anchors.size"].tensor) == 4
 
 
 def test_without_refinement_nothing_is_learned_about_the_fit(capture: Path) -> None:
@@ -134,14 +132,14 @@ def test_without_refinement_nothing_is_learned_about_the_fit(capture: Path) -> N
 
 def test_penalties_are_zero_at_the_start_and_grow_with_offsets(capture: Path) -> None:
     trainer = assemble(tiny(capture))
-    parameters = trainer.scene.gaussians
-    model, picture = human(trainer), trainer.pictures[0]
-    first = model.gaussians_at(parameters, picture, 1).penalties
+    scene, picture, options = human(trainer), trainer.pictures[0], trainer.config.model
+    assert isinstance(options, HumanModel)
+    first = trainer.training.moment(scene, picture, 1).penalties
     assert first["offset"].item() == 0
     assert first["smoothness"].item() == 0
-    away = parameters.replace(means=parameters.means.detach() + torch.tensor([0.01, 0.0, 0.0]))
-    later = model.gaussians_at(away, picture, 1).penalties
-    assert later["offset"].item() == pytest.approx(model.options.offset_weight, rel=1e-4)
+    away = scene.gaussians.replace(means=scene.gaussians.means.detach() + torch.tensor([0.01, 0.0, 0.0]))
+    later = trainer.training.moment(scene.with_gaussians(away), picture, 1).penalties
+    assert later["offset"].item() == pytest.approx(options.offset_weight, rel=1e-4)
     assert later["smoothness"].item() == pytest.approx(0, abs=1e-9)
 
 

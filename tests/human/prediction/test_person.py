@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dyngs.train.predictor import human_options
 from tiny_people import NET, body, people, person
 
 from dyngs.config import DataConfig
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.human.prediction.person import CapturedPerson, captured_person, named_views, spread_views
+from dyngs.training.prediction import human_options
 
 
 @pytest.fixture(scope="module")
