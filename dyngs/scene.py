@@ -7,6 +7,7 @@ of scene is trained is the business of a ``SceneTraining``.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -19,6 +20,7 @@ from dyngs.camera import Cameras
 from dyngs.colour.network import ColourNetwork, Frame
 from dyngs.config import SceneModel
 from dyngs.data.loader import Picture
+from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.rendering import Rendering, RenderOptions, Shader, render
 from dyngs.state import Role, State, moved_to, prefixed, with_role
@@ -201,6 +203,13 @@ class Scene(ABC):
     @abstractmethod
     def _model_state(self) -> State:
         """Return what the kind of scene stores beside its Gaussians and colours."""
+
+
+def clamped_time(time: float | None) -> float:
+    """Return ``time`` within [0, 1]; None is 0. Raises DyngsError for NaN."""
+    if time is not None and math.isnan(time):
+        raise DyngsError("the time to draw is not a number; give one from 0 to 1")
+    return min(max(0.0 if time is None else time, 0.0), 1.0)
 
 
 def render_options(model: SceneModel) -> RenderOptions:

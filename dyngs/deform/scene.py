@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -12,9 +11,8 @@ from torch import Tensor
 from dyngs.config import DynamicModel
 from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.fields import field_state, restored_field
-from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.scene import Moment, Scene
+from dyngs.scene import Moment, Scene, clamped_time
 from dyngs.state import Role, State, StateTensor, part_of, prefixed
 from dyngs.static.scene import filter_state, filtered, stored_filter, stored_times, times_state
 from dyngs.tensor_checks import require_ascending, require_indices
@@ -163,10 +161,3 @@ class _Part:
     moving_means: Tensor
     asked: Tensor | None
     rows: Tensor | None
-
-
-def clamped_time(time: float | None) -> float:
-    """Return ``time`` within [0, 1]; None is 0. Raises DyngsError for NaN."""
-    if time is not None and math.isnan(time):
-        raise DyngsError("the time to draw is not a number; give one from 0 to 1")
-    return min(max(0.0 if time is None else time, 0.0), 1.0)

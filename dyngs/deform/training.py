@@ -81,7 +81,7 @@ class DynamicTraining:
     """See ``SceneTraining``.
 
     Attributes:
-        window: which of the times are trained on.
+        times: distinct times of the training views, ascending.
     """
 
     moves_by = ("field", "model.deform")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.scene import Moment, Scene
+from dyngs.scene import Moment, Scene, clamped_time
 from dyngs.state import Role, State, StateTensor, with_role
 from dyngs.static.filters import fuse_filter
 from dyngs.tensor_checks import require_moments, require_tensor
@@ -52,7 +52,7 @@ class StaticScene(Scene):
 
     def moment(self, time: float | None) -> Moment:
         """Return the Gaussians, fused with their 3D filter if there is one."""
-        return Moment(filtered(self.gaussians, self.filter_std), time)
+        return Moment(filtered(self.gaussians, self.filter_std), clamped_time(time))
 
     def edited(self, edit: TopologyEdit) -> StaticScene:
         std = None if self.filter_std is None else edit.apply(self.filter_std)

@@ -17,8 +17,8 @@ from dyngs.colour.network import (
     network_of,
 )
 from dyngs.gaussians import Gaussians
-from dyngs.human.pose.covariance import rotations_of
 from dyngs.ops.perceptron import Layer, reference_perceptron
+from dyngs.ops.quaternions import rotation_matrices
 from dyngs.ops.shading import Sight, num_inputs, reference_inputs
 from dyngs.rendering import RenderOptions, render
 
@@ -115,7 +115,7 @@ def test_colours_turn_with_a_body() -> None:
     """A body and a camera turned together look the same, if the network is told how the body was at rest."""
     scene, net = random_scene(n=5), network(sees_time=False)
     gaussians = plain(scene.gaussians)
-    turn = rotations_of(torch.tensor([[0.3, 0.5, -0.2, 0.7]], dtype=torch.float64))[0]
+    turn = rotation_matrices(torch.tensor([[0.3, 0.5, -0.2, 0.7]], dtype=torch.float64))[0]
     shown = torch.ones(2, 5, 2, dtype=torch.int32)
     at_rest = net.shader(None, Frame(gaussians.means, torch.eye(3, dtype=torch.float64)))
     w, x, y, z = torch.nn.functional.normalize(torch.tensor([0.3, 0.5, -0.2, 0.7], dtype=torch.float64), dim=0)

@@ -31,7 +31,7 @@ from dyngs.human.avatar.posing import (
 from dyngs.human.avatar.validation import require_avatar, require_shapes
 from dyngs.human.motion.clip import MotionClip
 from dyngs.parameters import Parameters
-from dyngs.scene import Moment, Scene
+from dyngs.scene import Moment, Scene, clamped_time
 from dyngs.state import Role, State, StateTensor, part_of, prefixed, with_role
 
 
@@ -141,10 +141,11 @@ class HumanScene(Scene):
 
     def moment(self, time: float | None) -> Moment:
         """Return the person at ``time`` of the clip, clamped to it; None is the first moment."""
-        posing = frame_pose(self.moves_as.at(time), 0)
+        now = clamped_time(time)
+        posing = frame_pose(self.moves_as.at(now), 0)
         offsets = rest_offsets(self.anchors, self.weights, posing, self.shapes, self.pose_dirs)
         gaussians = pose_gaussians(self.gaussians, self.weights, self.learned_skeleton, posing, offsets)
-        return Moment(gaussians, time, Frame(self.gaussians.means, posing.rotations[0]))
+        return Moment(gaussians, now, Frame(self.gaussians.means, posing.rotations[0]))
 
     def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that is learned.

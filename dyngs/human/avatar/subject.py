@@ -16,9 +16,6 @@ from dyngs.human.avatar.posing import BodyPose, PoseBlendShapes, Skeleton, frame
 from dyngs.human.motion.captured import CapturedMotion
 from dyngs.human.template.atlas import Texels
 
-NEIGHBOURS = 5
-CENTIMETRE = 0.01
-
 
 @dataclass(frozen=True)
 class Subject:
