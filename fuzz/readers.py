@@ -259,9 +259,7 @@ def played(scene: Scene, options: object) -> object:
     """Render a scene at two times."""
     from moving_scene import camera
 
-    from dyngs.scene import moment_of
-
-    return [moment_of(scene, time).seen_by(camera(8, 6), options) for time in (None, 0.6)]  # type: ignore[arg-type]
+    return [scene.render(camera(8, 6), time, options=options) for time in (None, 0.6)]  # type: ignore[arg-type]
 
 
 @cache

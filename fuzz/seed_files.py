@@ -12,10 +12,11 @@ from motion_files import Clip, as_local, glb_of, random_motion, skeleton, tiny_b
 from moving_scene import camera, row_of_balls
 from synthetic_bodies import model, write_npz, write_obj, write_pickle
 from tiny_captures import random_pixels, write_picture, write_video
-from tiny_fields import stirred_field, tiny_setup
+from tiny_fields import stirred_field
 
+from dyngs.build import restored_scene
 from dyngs.camera import Cameras
-from dyngs.config import Config, DataConfig, DynamicModel, StaticModel
+from dyngs.config import Config, DataConfig, DynamicModel, SceneModel, StaticModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.deform.fields import field_state
 from dyngs.export.avatar import _KIND as AVATAR_KIND
@@ -24,6 +25,8 @@ from dyngs.files.tensor_file import write_tensors
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
+from dyngs.scene import Scene
+from dyngs.state import tensors_of
 from dyngs.storage.file import SceneInfo, encoded
 from dyngs.view.camera_paths import CameraPath, write_path
 
@@ -152,7 +155,7 @@ def write_scene_file_still(root: Path) -> None:
     """A run that is only ``scene.dyngs``."""
     model = StaticModel()
     save_config(Config(data=DataConfig.model_validate({"root": "capture"}), model=model), root / RESOLVED_NAME)
-    (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _gaussians(), model, {}))
+    (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _scene(_gaussians(), model), {}))
 
 
 def write_scene_file_moving(root: Path) -> None:
@@ -160,7 +163,7 @@ def write_scene_file_moving(root: Path) -> None:
     config, tensors = _moving("trajectory")
     save_config(config, root / RESOLVED_NAME)
     steps = {f"gaussians.{name}": 0.01 for name in ("means", "quats", "log_scales", "logit_opacities", "sh_base")}
-    (root / "scene.dyngs").write_bytes(encoded(_scene_info(), tensors, config.model, steps))
+    (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _scene(tensors, config.model), steps))
 
 
 def write_person(root: Path) -> None:
@@ -272,6 +275,10 @@ def _gaussians() -> dict[str, torch.Tensor]:
     return {f"gaussians.{name}": x.contiguous() for name, x in row_of_balls().tensors().items()}
 
 
+def _scene(tensors: dict[str, torch.Tensor], model: SceneModel) -> Scene:
+    return restored_scene(Checkpoint(_INFO, tensors), model)
+
+
 def _scene_info() -> SceneInfo:
     return SceneInfo(step=7, extent=1.0, world_offset=(1, 0, 0), background="white", rasterize_mode="classic")
 
@@ -280,7 +287,7 @@ def _moving(kind: str) -> tuple[Config, dict[str, torch.Tensor]]:
     from tiny_fields import tiny_options
 
     config = Config(data=DataConfig.model_validate({"root": "capture"}), model=DynamicModel(deform=tiny_options(kind)))
-    state = field_state(stirred_field(kind, num_moving=2), tiny_setup(2))
+    state = tensors_of(field_state(stirred_field(kind, num_moving=2)))
     tensors = _gaussians() | {f"model.field.{name}": x.contiguous() for name, x in state.items()}
     tensors["model.rows"] = torch.tensor([1, 3])
     return config, tensors | {"model.times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)}

@@ -10,14 +10,15 @@ from typing import Any
 
 import torch
 from moving_scene import camera
-from tiny_fields import KINDS, cloud, stirred_field, tiny_options, tiny_setup
+from tiny_fields import KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
 from dyngs.colour.training import NetworkTraining
 from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.deform.fields import field_state
 from dyngs.rendering import RenderOptions
-from dyngs.scene import Scene, moment_of
+from dyngs.scene import Scene
+from dyngs.state import prefixed, tensors_of
 from dyngs.storage.coding import compressed
 from dyngs.storage.file import _DTYPES, MAGIC, MAX_HEADER, SceneInfo, _Header, _stored
 from dyngs.storage.tensors import Coding, Kind
@@ -115,7 +116,7 @@ def require_drawable(scene: Scene) -> None:
     """Nothing, if the pictures of a scene are finite; raises what drawing it raises."""
     for time in (None, 0.0, 0.37, 1.0):
         for options in (RenderOptions(), RenderOptions(near=0.01, depth="expected")):
-            drawn = moment_of(scene, time).seen_by(camera(), options, torch.ones(3))
+            drawn = scene.render(camera(), time, options=options, background=torch.ones(3))
             assert bool(drawn.rgb.isfinite().all()), "a picture is not finite"
 
 
@@ -134,15 +135,14 @@ def contents(kind: str) -> tuple[Tensors, SceneModel]:
         gaussians = gaussians.replace(sh=gaussians.sh[:, :1].contiguous())
         box, options = torch.stack([torch.zeros(3), torch.ones(3)]), NetworkColour(width=8, depth=2)
         colours = NetworkTraining(options, 10, box, torch.Generator().manual_seed(0), sees_time=True)
-        state |= {f"colour.{name}": x for name, x in colours.state().items()}
+        state |= tensors_of(prefixed("colour", colours.network.state() | colours.state()))
     elif kind != "static":
         field = "trajectory" if kind == "masked" else kind
         model = DynamicModel(deform=tiny_options(field))
-        stored = field_state(stirred_field(field, len(_ROWS)), tiny_setup(len(_ROWS)))
-        state |= {f"field.{name}": x for name, x in stored.items()}
+        state |= tensors_of(prefixed("field", field_state(stirred_field(field, len(_ROWS)))))
         state |= {"rows": torch.tensor(_ROWS), "times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)}
     if kind == "masked":
         masks = VisibilityMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])
-        state |= {f"masks.{name}": x for name, x in masks.state().items()}
+        state |= tensors_of(prefixed("masks", masks.state()))
     tensors = {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
     return {name: x.contiguous() for name, x in (tensors | {f"model.{n}": x for n, x in state.items()}).items()}, model

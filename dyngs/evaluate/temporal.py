@@ -92,7 +92,7 @@ def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> Metri
     Smooth motion has little of it, flickering much. Where moments are not evenly spaced, R_k is compared with the
     straight line between its neighbours: 2 |w R_{k-1} + (1 - w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} -
     t_{k-1}), which is the same for even ones. Of more than 60 moments, 20 triples of neighbours are taken, evenly
-    evenly_spaced. A scene in which nothing moves has 0.
+    spaced. A scene in which nothing moves has 0.
 
     Args:
         drawing: what is drawn.

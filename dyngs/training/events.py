@@ -41,7 +41,7 @@ class StepReport:
 
     @cached_property
     def psnr(self) -> float:
-        """Of the picture, dB; NaN or infinite where its mask leaves nothing, or it is exact."""
+        """Of the picture, dB, at most 100; NaN where its mask leaves nothing, or it is not finite."""
         return psnr(self.rendered, self.truth, self.picture.mask)
 
 

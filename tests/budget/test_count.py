@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from limited import limited
 from tiny_fields import busy_config
 
 from dyngs.api.train import train
-from dyngs.budget.count import STAGES, CountLimit, stage
+from dyngs.budget.count import CountLimit
 from dyngs.build import assemble
 from dyngs.config import (
     BudgetConfig,
@@ -30,7 +29,6 @@ from dyngs.runs.checkpoint import checkpoint_paths, load_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-PLAIN = Config(data=DataConfig(root=Path("nowhere")))
 KINDS = ("default", "mcmc", "trajectory", "human")
 
 
@@ -58,21 +56,6 @@ def config_of(kind: str, captures: dict[str, Path], run_dir: Path, budget: Budge
         return config
     model = HumanModel(resolution=24, scaffold_heights=(0.0, 0.02), min_silhouette_share=0.0, sh_degree=0)
     return config.model_copy(update={"data": DataConfig(root=captures["person"]), "model": model})
-
-
-@given(steps=st.integers(1, 10**4), tuning=st.integers(0, 10**3), share=st.floats(0, 2))
-def test_stages_only_come_and_the_last_is_the_end(steps: int, tuning: int, share: float) -> None:
-    compact = PruneConfig(share=0.5, steps=tuning) if tuning else PruneConfig()
-    config = PLAIN.model_copy(update={"train": TrainConfig(steps=steps), "prune": compact})
-    total = config.total_steps
-    around = sorted({min(max(x, 0), total) for x in (0, steps // 2, steps - 1, steps, steps + 1, total - 1, total)})
-    found = [stage(config, step) for step in around]
-    assert found == sorted(found)
-    assert found[0] == 0 < found[-1]
-    assert total == 1 or found[-2] < found[-1] or around[-2] == total
-    timed = stage(config, steps - 1, share)
-    assert timed >= stage(config, steps - 1)
-    assert tuning or timed >= sum(share >= x for x in STAGES)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -113,9 +96,11 @@ def test_room_in_a_file_is_a_limit(
 
 def test_the_line_says_whether_it_mattered(captures: dict[str, Path], tmp_path: Path) -> None:
     trainer = assemble(config_of("default", captures, tmp_path, BudgetConfig(max_gaussians=160)))
-    assert "asked for at most 160 Gaussians, got 150; it held growth back" in CountLimit(160).reached(trainer)
-    assert "150; it cost nothing" in CountLimit(300).reached(trainer)
+    assert (
+        "asked for at most 160 Gaussians, got 150; it held growth back" in CountLimit(limited(trainer), 160).reached()
+    )
+    assert "150; it cost nothing" in CountLimit(limited(trainer), 300).reached()
     person = assemble(config_of("human", captures, tmp_path, BudgetConfig()))
     count = len(person.optimizer.parameters)
     person.config = person.config.model_copy(update={"strategy": DefaultStrategy(max_gaussians=count + 2)})
-    assert "it cost nothing" in CountLimit(count + 1).reached(person), "growth was not held back by it"
+    assert "it cost nothing" in CountLimit(limited(person), count + 1).reached(), "growth was not held back by it"

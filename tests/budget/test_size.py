@@ -64,7 +64,7 @@ def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_pat
         assert f"asked {asked:g}" in str(report)
         scene = load_run(file.parent).scene
         assert len(scene) == report.num_kept
-        drawn = quality_of(trainer, scene, [trainer.pictures[i] for i in range(4)], None)
+        drawn = quality_of(trainer, scene, [trainer.pictures[i] for i in range(4)])
         assert drawn == pytest.approx(report.after), "what is said is what the file shows"
     after = trainer.checkpoint().tensors
     assert {name.partition(".")[0] for name in before.keys() - after.keys()} <= {"strategy"}

@@ -9,6 +9,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from limited import limited, said
+from steps import report_of
 from tiny_fields import busy_config
 
 from dyngs.api.train import train
@@ -16,12 +18,13 @@ from dyngs.budget.speed import (
     ACCEPTED,
     GOAL,
     ROUNDS,
+    Measured,
     SpeedLimit,
     allowed,
     drawing_seconds,
     least_seconds,
 )
-from dyngs.build import assemble
+from dyngs.build import assemble, restored_scene
 from dyngs.config import (
     BudgetConfig,
     Config,
@@ -38,8 +41,9 @@ from dyngs.config import (
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.evaluate.temporal import Drawing
-from dyngs.runs.checkpoint import checkpoint_paths, load_run, stored_scene
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.scene import Scene
+from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -105,12 +109,12 @@ def with_saves(config: Config, every: int) -> Config:
 
 @given(count=st.integers(1, 10**6), wanted=st.integers(1, 10**6), most=st.integers(1, 10**7))
 def test_as_many_are_allowed_as_are_drawn_in_time(count: int, wanted: int, most: int) -> None:
-    limit = SpeedLimit(fps_of(wanted), base=BASE, seconds=BASE + EACH * count)
+    found, fps = Measured(base=BASE, seconds=BASE + EACH * count), fps_of(wanted)
     config = PLAIN.model_copy(update={"strategy": DefaultStrategy(max_gaussians=most)})
     # One more or less: times are rounded where the base is most of them.
-    assert allowed(limit, count, config) == pytest.approx(min(wanted, most), rel=1e-6, abs=1)
-    assert allowed(SpeedLimit(1.0, base=BASE, seconds=BASE), count, config) == most, "it takes no time"
-    assert allowed(SpeedLimit(1e9, base=BASE, seconds=1.0), count, config) == 1
+    assert allowed(found, fps, count, config) == pytest.approx(min(wanted, most), rel=1e-6, abs=1)
+    assert allowed(Measured(base=BASE, seconds=BASE), 1.0, count, config) == most, "it takes no time"
+    assert allowed(Measured(base=BASE, seconds=1.0), 1e9, count, config) == 1
 
 
 @pytest.mark.usefixtures("machine")
@@ -182,41 +186,50 @@ def test_what_is_impossible_is_refused_and_what_is_named_is_not(still: Path, tmp
 def test_what_never_grows_does_not_begin_to(person: Path, tmp_path: Path) -> None:
     """After a removal there is room that the strategy did not ask for."""
     config = human_config(person, tmp_path)
-    limit, trainer = SpeedLimit(fps_of(80), base=BASE), assemble(config)
-    while trainer.done < 8:
-        trainer.step()
-        limit.after_step(trainer)
-    assert limit.before > len(trainer.scene.gaussians)
-    assert limit.cap == config.strategy.growth_limit == 0
+    trainer = assemble(config)
+    run = limited(trainer)
+    limit = SpeedLimit(run, fps_of(80))
+    limit.found.base = BASE
+    run.loop.subscribe(limit)
+    run.loop.run(lambda: trainer.done >= 8)
+    assert limit.found.before > len(trainer.scene.gaussians)
+    assert limit.found.cap == config.strategy.growth_limit == 0
 
 
 @pytest.mark.usefixtures("machine")
 def test_only_at_the_end_are_some_removed_where_time_is_short(still: Path, tmp_path: Path) -> None:
-    limit = SpeedLimit(fps_of(90), base=BASE, seconds=BASE + 120 * EACH, removing=10.0)
-    trainer = assemble(still_config(still, tmp_path))
-    lines = {}
-    while trainer.done < 20:
-        trainer.step()
-        lines[trainer.done] = limit.after_step(trainer, used=80.0, given=100.0)
-        limit.cap = 10**6  # growth is not what this is about
-        limit.hold(trainer)
-    assert [step for step, line in lines.items() if line is not None] == [20]
+    run = limited(assemble(still_config(still, tmp_path)), given=100.0, used=80.0)
+    limit = SpeedLimit(run, fps_of(90))
+    limit.found = Measured(base=BASE, seconds=BASE + 120 * EACH, removing=10.0)
+
+    def let_grow(event: Event) -> None:
+        if isinstance(event, StepDone):
+            limit.found.cap = 10**6  # growth is not what this is about
+            limit.hold()
+
+    run.loop.subscribe(limit, let_grow)
+    texts = said(run)
+    run.loop.run()
+    assert [text.partition(":")[0] for text in texts] == ["step 20"]
 
 
 def test_a_machine_that_becomes_too_slow_is_told_of(
     still: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After the run, which is complete; nothing was removed in vain."""
-    limit = SpeedLimit(100.0, base=1e-3, seconds=1e-3)
     trainer = assemble(still_config(still, tmp_path))
+    run = limited(trainer)
+    limit, texts = SpeedLimit(run, 100.0), said(run)
+    limit.found = Measured(base=1e-3, seconds=1e-3)
     while trainer.done < trainer.config.train.steps:
         trainer.step()
     count = len(trainer.scene.gaussians)
     monkeypatch.setattr("dyngs.budget.speed.drawing_seconds", lambda *_: 1.0)
-    assert limit.after_step(trainer) is None
+    limit(StepDone(report_of(trainer.done), run.loop))
+    assert texts == []
     assert len(trainer.scene.gaussians) == count
     with pytest.raises(DyngsError, match=r"budget.min_fps=100: drawn at 1 per second"):
-        limit.reached(trainer)
+        limit.reached()
 
 
 @pytest.mark.parametrize("kind", ["still", "trajectory", "human"])
@@ -244,7 +257,7 @@ def test_a_drawing_takes_the_median_of_what_views_take_undisturbed(
 ) -> None:
     """A clock that only drawing advances: four views take 1, 2, 3 and 4 s, and each is disturbed all times but one."""
     trainer, clock, drawn = assemble(still_config(still, tmp_path)), [0.0], [0]
-    scene, size = stored_scene(trainer.checkpoint(), trainer.config.model), trainer.pictures[0].cameras
+    scene, size = restored_scene(trainer.checkpoint(), trainer.config.model), trainer.pictures[0].cameras
 
     def picture(drawing: Drawing, cameras: object, moment: float | None) -> torch.Tensor:
         turn = drawn[0] - 1  # the first is the warm-up
@@ -265,5 +278,5 @@ def test_too_slow_is_measured_again(
 ) -> None:
     trainer, values = assemble(still_config(still, tmp_path)), iter(measured)
     monkeypatch.setattr("dyngs.budget.speed.drawing_seconds", lambda *_: next(values))
-    scene = stored_scene(trainer.checkpoint(), trainer.config.model)
+    scene = restored_scene(trainer.checkpoint(), trainer.config.model)
     assert least_seconds(trainer, scene, 2.0) == found

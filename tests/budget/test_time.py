@@ -5,19 +5,21 @@ from __future__ import annotations
 import itertools
 import time
 from pathlib import Path
+from typing import cast
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from steps import Counting
 from tiny_fields import busy_config, write_tiny_capture
 
-from dyngs.api.train import train
+from dyngs.api.train import _Run, train
+from dyngs.budget.run import LimitedRun
 from dyngs.budget.time import (
     AIM,
     FEWEST_STEPS,
     Deadline,
-    deadline_of,
     first_fit,
     fitting_steps,
     refitted,
@@ -29,8 +31,10 @@ from dyngs.build import assemble
 from dyngs.config import AutoColour, BudgetConfig, Config, DataConfig, DynamicModel, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
-from dyngs.runs.checkpoint import load_run
-from dyngs.training.trainer import StepReport, Trainer
+from dyngs.runs.checkpoint import latest_checkpoint, load_run
+from dyngs.training.events import StepReport
+from dyngs.training.loop import Loop, Stopwatch
+from dyngs.training.trainer import Trainer
 
 PLAIN = Config(data=DataConfig(root=Path("nowhere")))
 SHRUNK = PLAIN.model_copy(update={"train": TrainConfig(steps=7000, initial_downscale=4)})
@@ -67,10 +71,18 @@ def test_sharper_pictures_take_longer() -> None:
     assert small < (1 / (0.3 + 0.7 / 16)) * seconds_left(PLAIN, 10, 7000, 0.1)
 
 
+def simulated(seconds: float, most_steps: int, *, fits: bool) -> Deadline:
+    """The deadline of a run of ``seconds`` that trains nothing."""
+    trainer = Counting()
+    loop = Loop(trainer, most_steps, Stopwatch())
+    run = LimitedRun(Path("nowhere"), PLAIN, loop, cast(Trainer, trainer), given=seconds)
+    return Deadline(run, most_steps, fits=fits, refit_seconds=0.0, save=lambda: None, on_refit=lambda: None)
+
+
 @pytest.mark.parametrize("factor", [0.3, 1.0, 4.0])
 def test_a_run_whose_steps_change_pace_fills_its_time(factor: float) -> None:
     """A simulated machine: steps that take ``factor`` times as long from a third of the run on."""
-    deadline, config, now = Deadline(100.0, 100_000, fits=True), with_steps(PLAIN, 5000), 0.0
+    deadline, config, now = simulated(100.0, 100_000, fits=True), with_steps(PLAIN, 5000), 0.0
     for done in itertools.count():
         found = deadline.steps(config, done, now)
         config = with_steps(config, found)
@@ -81,7 +93,7 @@ def test_a_run_whose_steps_change_pace_fills_its_time(factor: float) -> None:
 
 
 def test_a_settled_number_of_steps_ends_only_with_the_time() -> None:
-    deadline, now = Deadline(10.0, 1000, fits=False), 0.0
+    deadline, now = simulated(10.0, 1000, fits=False), 0.0
     config = with_steps(PLAIN, 1000)
     for done in range(1000):
         found = deadline.steps(config, done, now)
@@ -90,7 +102,9 @@ def test_a_settled_number_of_steps_ends_only_with_the_time() -> None:
         assert found == 1000
         now += 0.05
     assert 9.8 < now <= 10.0
-    assert "200" in deadline.kept(200, now) or "199" in deadline.kept(199, now)
+    deadline.run.trainer.done = done
+    assert done in (199, 200)
+    assert deadline.reached().endswith(f": {done} steps")
 
 
 def test_what_happens_once_is_neither_missed_nor_redone() -> None:
@@ -102,12 +116,19 @@ def test_what_happens_once_is_neither_missed_nor_redone() -> None:
     assert same_phase(with_steps(thrifty, 1000), with_steps(thrifty, 1200), 650)
 
 
-def test_no_limit_no_deadline() -> None:
-    assert deadline_of(PLAIN, None) is None
-    found = deadline_of(timed(PLAIN, 2), 300)
-    assert (found and (found.seconds, found.most_steps, found.fits)) == (120, 300, True)
-    settled = deadline_of(timed(PLAIN, 2), None)
-    assert settled is not None
+def test_no_limit_no_deadline(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The number of steps that were asked for is kept in mind; that of a resumed run is settled."""
+    _slowed(monkeypatch, 0.1)
+    config = busy_config(moving, tmp_path / "run", "trajectory")
+    assert _Run(config, tmp_path / "free", None).limits == {}
+    run = _Run(timed(config, 2), tmp_path / "run", None)
+    (found,) = run.limits.values()
+    assert isinstance(found, Deadline)
+    assert (found.run.given, found.most_steps, found.fits) == (120, config.train.steps, True)
+    run.loop.run(lambda: run.loop.trainer.done >= 2)
+    run._save()
+    (settled,) = _Run(timed(config, 2), tmp_path / "run", latest_checkpoint(tmp_path / "run")).limits.values()
+    assert isinstance(settled, Deadline)
     assert not settled.fits
 
 

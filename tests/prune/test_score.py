@@ -1,4 +1,4 @@
-"""Scores of Gaussians whose worth is known."""
+"""Scores of Gaussians whose importance is known."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import torch
 from moving_scene import Blinking, Sliding, camera, moving_scene, row_of_balls, still_scene
 
 from dyngs.deform.field import Offsets
-from dyngs.deform.scene import TrainedScene
-from dyngs.prune.score import Survey, Worth, worth
+from dyngs.prune.score import Importance, ScoringViews, importance
 from dyngs.rendering import RenderOptions, contributions, sensitivities
+from dyngs.scene import Scene
+from dyngs.static.scene import StaticScene
 
 BLACK = torch.zeros(3)
 
 
-def survey(scene: TrainedScene, times: tuple[float | None, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)) -> Survey:
-    return Survey(scene.at, scene.shader_at, [camera(), camera(40, 28)], times, RenderOptions(), BLACK)
+def views(scene: Scene, times: tuple[float | None, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)) -> ScoringViews:
+    return ScoringViews(scene, [camera(), camera(40, 28)], times, RenderOptions(), BLACK)
 
 
 def test_sums_are_over_cameras_at_each_moment() -> None:
     scene = moving_scene(Sliding())
-    found = worth(survey(scene), slopes=True)
+    found = importance(views(scene), slopes=True)
     assert found.shares.shape == found.log_volumes.shape == found.opacities.shape == (5, 5)
     for k, time in ((0, 0.0), (3, 0.75)):
         both = [contributions(scene.at(time), c)[0] for c in (camera(), camera(40, 28))]
@@ -31,7 +32,7 @@ def test_sums_are_over_cameras_at_each_moment() -> None:
               for c in (camera(), camera(40, 28))]  # fmt: skip
     assert found.slopes is not None
     torch.testing.assert_close(found.slopes, torch.stack(slopes).sum(0))
-    assert worth(survey(scene), slopes=False).slopes is None
+    assert importance(views(scene), slopes=False).slopes is None
 
 
 def test_what_is_hidden_or_transparent_is_worth_least() -> None:
@@ -41,20 +42,18 @@ def test_what_is_hidden_or_transparent_is_worth_least() -> None:
     means[0] = torch.tensor([-0.5, 0.0, -1.0])  # before the second, which is at x = -0.5
     log_scales[0] = -1.0
     logits[0], logits[3] = 9.0, -4.0
-    scene = TrainedScene(
-        balls.replace(means=means, log_scales=log_scales, logit_opacities=logits), torch.zeros(0).long()
-    )
-    found = worth(survey(scene, (None,)), slopes=True)
+    scene = StaticScene(gaussians=balls.replace(means=means, log_scales=log_scales, logit_opacities=logits))
+    found = importance(views(scene, (None,)), slopes=True)
     assert found.slopes is not None
     for scores in (found.contribution, found.variation, found.slopes):
         assert set(scores.argsort()[:2].tolist()) == {1, 3}
 
 
-def constant(shares: list[list[float]], opacities: list[list[float]] | None = None) -> Worth:
+def constant(shares: list[list[float]], opacities: list[list[float]] | None = None) -> Importance:
     """K moments of N Gaussians of one size."""
     c = torch.tensor(shares)
     o = torch.full_like(c, 0.5) if opacities is None else torch.tensor(opacities)
-    return Worth(c, None, o, torch.zeros_like(c))
+    return Importance(c, None, o, torch.zeros_like(c))
 
 
 def test_in_a_still_scene_variation_is_twice_the_contribution() -> None:
@@ -81,13 +80,13 @@ def test_opacity_that_changes_is_the_profile() -> None:
 def test_larger_ones_weigh_a_little_more() -> None:
     """The tenth power: e^3 times the volume is e^0.3 times the score."""
     volumes = torch.tensor([[0.0, 3.0]])
-    found = Worth(torch.ones(1, 2), None, torch.ones(1, 2), volumes)
+    found = Importance(torch.ones(1, 2), None, torch.ones(1, 2), volumes)
     assert float(found.variation[1] / found.variation[0]) == pytest.approx(math.exp(0.3))
 
 
 def test_one_moment_and_nothing_at_all() -> None:
-    assert worth(survey(still_scene(), (None,)), slopes=False).variation.shape == (5,)
-    found = worth(survey(still_scene(0), (None,)), slopes=True)
+    assert importance(views(still_scene(), (None,)), slopes=False).variation.shape == (5,)
+    found = importance(views(still_scene(0), (None,)), slopes=True)
     assert found.variation.shape == found.contribution.shape == (0,)
 
 
@@ -96,6 +95,6 @@ def test_scores_are_finite_where_something_is_never_seen() -> None:
         def offsets(self, means, time, rows=None):
             return Offsets(torch.zeros(len(means), 3), logit_opacities=torch.full((len(means),), -200.0 * time))
 
-    found = worth(survey(moving_scene(Fading(), rows=(0, 1, 2, 3, 4))), slopes=True)
+    found = importance(views(moving_scene(Fading(), rows=(0, 1, 2, 3, 4))), slopes=True)
     for scores in (found.variation, found.temporal, found.contribution):
         assert scores.isfinite().all()

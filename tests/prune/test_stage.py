@@ -1,4 +1,4 @@
-"""The last stage of a run: exact, repeatable, the same as compacting the finished run, and drawn with masks."""
+"""The last stage of a run: exact, repeatable, the same as pruning the finished run, and drawn with masks."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
-from dyngs.data.frame_selection import spread
-from dyngs.deform.scene import TrainedScene
-from dyngs.deform.training import DynamicScene
-from dyngs.prune.stage import Compaction, compact_, distinct_cameras
+from dyngs.data.frame_selection import evenly_spaced
+from dyngs.deform.scene import DynamicScene
+from dyngs.prune.stage import Pruned, PruneStage, distinct_cameras, prune_
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
 from dyngs.static.fixed import FixedDensifier
+from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
+from dyngs.training.loop import Loop, Stopwatch
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -74,7 +75,6 @@ def test_a_moving_run_goes_on_with_half_of_it_and_resumes_exactly(kind: str, mov
     wanted = final_bytes(folder)
     paths[-1].unlink()
     assert final_bytes(train(load_resolved(folder), resume_from=folder)) == wanted
-    assert isinstance(run.scene, TrainedScene)
     if run.scene.is_still:
         return
     assert run.scene.masks is not None
@@ -101,7 +101,7 @@ def test_mcmc_stands_still_in_the_stage(still: Path, tmp_path: Path) -> None:
     strategy = McmcStrategy(start=1, stop=30_000, every=3, max_gaussians=90)
     trainer = trained(still_config(still, tmp_path, strategy=strategy))
     before = len(trainer.scene.gaussians)
-    found = compact_(trainer)
+    found = prune_(trainer)
     assert found.before == before
     assert isinstance(trainer.densifier, FixedDensifier)
     for _ in range(4):
@@ -120,13 +120,13 @@ def test_every_score_keeps_as_many(score: str, moving: Path, tmp_path: Path) -> 
     stage = STAGE.model_copy(update={"score": score})
     trainer = trained(moving_config(moving, tmp_path, "trajectory", stage))
     before = trainer.scene.gaussians.detach()
-    found = compact_(trainer)
+    found = prune_(trainer)
     after = trainer.scene.gaussians
     assert (found.before, found.after) == (len(before), len(after))
     assert found.after == len(before) - len(before) // 2
     assert _all_rows_of(after.means, before.means)
-    assert isinstance(trainer.model, DynamicScene)
-    assert trainer.model.num_moving(len(after)) <= len(after)
+    assert isinstance(trainer.scene, DynamicScene)
+    assert trainer.num_moving <= len(after)
 
 
 def _all_rows_of(some: Tensor, everything: Tensor) -> bool:
@@ -135,7 +135,7 @@ def _all_rows_of(some: Tensor, everything: Tensor) -> bool:
 
 def test_a_dear_prune_backs_off(moving: Path, tmp_path: Path) -> None:
     trainer = trained(moving_config(moving, tmp_path, stage=STAGE.model_copy(update={"share": 0.9, "max_loss": 0.0})))
-    found = compact_(trainer)
+    found = prune_(trainer)
     assert found.share < 0.9
     assert found.loss <= 0.0
     assert "not 90%" in str(found)
@@ -144,13 +144,12 @@ def test_a_dear_prune_backs_off(moving: Path, tmp_path: Path) -> None:
 def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
     """What no key time sees is not drawn, and receives no gradient."""
     trainer = trained(moving_config(moving, tmp_path, "trajectory"))
-    compact_(trainer)
-    model = trainer.model
-    assert isinstance(model, DynamicScene)
-    assert model.masks is not None
+    prune_(trainer)
+    scene = trainer.scene
+    assert scene.masks is not None
     picture = trainer.pictures[3]
-    drawn = model.gaussians_at(trainer.scene.gaussians, picture, trainer.done + 1)
-    active = model.masks.active(model.masks.interval(picture.time or 0.0))
+    drawn = trainer.training.moment(scene, picture, trainer.done + 1)
+    active = scene.masks.active(scene.masks.interval(picture.time or 0.0))
     assert len(drawn.gaussians) == len(active)
     drawn.gaussians.means.sum().backward()
     grad = trainer.scene.gaussians.means.grad
@@ -158,16 +157,39 @@ def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
     assert torch.equal(torch.nonzero(grad.any(1))[:, 0], active)
 
 
+def test_the_stage_begins_once_where_training_ends(still: Path, tmp_path: Path) -> None:
+    """After its last step, or where a run goes on from there; not in a run without the stage."""
+    for resumed in (False, True):
+        config = still_config(still, tmp_path)
+        trainer = trained(config) if resumed else assemble(config)
+        loop = Loop(trainer, config.total_steps, Stopwatch())
+        told: list[Event] = []
+        loop.subscribe(PruneStage(loop, lambda trainer=trainer: trainer), told.append)
+        loop.run()
+        (changed,) = [event for event in told if isinstance(event, TopologyChanged)]
+        assert changed == TopologyChanged(8, changed.before, changed.before - changed.before // 2)
+        assert [event.text.split(":")[0] for event in told if isinstance(event, Message)] == ["pruned"]
+        assert trainer.num_gaussians == changed.after
+        place = told.index(changed)
+        assert isinstance(told[place + 1], Started if resumed else StepDone)
+    plain = still_config(still, tmp_path, PruneConfig())
+    trainer, told = assemble(plain), []
+    loop = Loop(trainer, plain.total_steps, Stopwatch())
+    loop.subscribe(PruneStage(loop, lambda: trainer), told.append)
+    loop.run()
+    assert not [event for event in told if isinstance(event, TopologyChanged)]
+
+
 def test_what_it_says() -> None:
-    assert str(Compaction(1000, 200, 0.8, 0.8, 1.234, 1.0)) == (
-        "compacted: 1,000 -> 200 Gaussians, 80.0% removed, -1.23 dB before it is trained again"
+    assert str(Pruned(1000, 200, 0.8, 0.8, 1.234, 1.0)) == (
+        "pruned: 1,000 -> 200 Gaussians, 80.0% removed, -1.23 dB before it is trained again"
     )
-    assert str(Compaction(1000, 500, 0.8, 0.5, 1.0, 0.75)).endswith("; masks let 75% of them through")
+    assert str(Pruned(1000, 500, 0.8, 0.5, 1.0, 0.75)).endswith("; masks let 75% of them through")
 
 
 def test_cameras_of_a_standing_rig_are_taken_once() -> None:
     one, other = camera(), camera()
     moved = Cameras(other.cam_from_world + torch.tensor(0.5), other.intrinsics, other.width, other.height)
     assert distinct_cameras([one, moved, camera(), moved], 8) == [one, moved]
-    assert spread(10, 3) == [0, 3, 6]
-    assert spread(2, 3) == [0, 1]
+    assert evenly_spaced(10, 3) == [0, 3, 6]
+    assert evenly_spaced(2, 3) == [0, 1]

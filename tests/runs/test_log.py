@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -68,7 +69,7 @@ def test_it_listens_to_steps_and_scores(tmp_path: Path) -> None:
     assert lines[-1] == {"step": 12, "split": "test", "psnr": 21.0, "ssim": 0.9}
 
 
-@pytest.mark.parametrize(("difference", "psnr"), [(0.1, 20.0), (0.0, None)])
+@pytest.mark.parametrize(("difference", "psnr"), [(0.1, 20.0), (math.nan, None)])
 def test_a_quality_that_is_no_number_is_null(tmp_path: Path, difference: float, psnr: float | None) -> None:
     record = record_of(step_done(1, 1, difference))
     assert record.psnr == (None if psnr is None else pytest.approx(psnr, abs=1e-4))

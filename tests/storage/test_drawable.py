@@ -2,117 +2,137 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from moving_scene import camera
-from tiny_fields import KINDS, cloud, stirred_field, tiny_options, tiny_setup
+from tiny_fields import KINDS, cloud, stirred_field, tiny_options
 
-from dyngs.config import DynamicModel, StaticModel
-from dyngs.deform.fields import field_state
-from dyngs.deform.scene import trained_scene
+from dyngs.config import DynamicModel, HumanModel
+from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.rendering import render
-from dyngs.storage.drawable import completed, drawable, in_storage_order
+from dyngs.human.avatar.anchors import Anchors
+from dyngs.human.avatar.corrections import new_corrections
+from dyngs.human.avatar.posing import Skeleton
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.motion.clip import MotionClip
+from dyngs.scene import Scene
+from dyngs.state import Role, part_of
+from dyngs.static.scene import StaticScene
+from dyngs.storage.drawable import completed, drawable, stored_edit
 from dyngs.visibility import VisibilityMasks
 
 ROWS = (0, 2, 3, 6)
+ONE = torch.ones(1)
 
 
-def tensors_of(gaussians: Gaussians, state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Of a checkpoint."""
-    tensors = {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
-    return tensors | {f"model.{name}": x for name, x in state.items()}
+def moving(kind: str) -> tuple[DynamicScene, DynamicModel]:
+    """A scene of which some Gaussians move, and its model."""
+    field = stirred_field(kind, len(ROWS))
+    scene = DynamicScene(gaussians=cloud(9), seen_at=(0.0, 1.0), field=field, moving=torch.tensor(ROWS))
+    return scene, DynamicModel(deform=tiny_options(kind))
 
 
-def moving_tensors(kind: str) -> tuple[dict[str, torch.Tensor], DynamicModel]:
-    """A checkpoint's tensors in which some Gaussians move, and the model."""
-    setup = tiny_setup(len(ROWS))
-    state = {f"field.{name}": x for name, x in field_state(stirred_field(kind, len(ROWS)), setup).items()}
-    state |= {"rows": torch.tensor(ROWS), "times": torch.tensor([0.0, 1.0], dtype=torch.float64)}
-    return tensors_of(cloud(9), state), DynamicModel(deform=tiny_options(kind))
+def stored(scene: Scene) -> dict[str, torch.Tensor]:
+    """What a file holds of a scene, in its order."""
+    return drawable(scene.edited(stored_edit(scene, scene.gaussians.means.numpy())))
 
 
-def picture(tensors: dict[str, torch.Tensor], model: DynamicModel | StaticModel, time: float) -> torch.Tensor:
-    """What a checkpoint's tensors show at a time."""
-    parts = {
-        prefix: {n.removeprefix(f"{prefix}."): x for n, x in tensors.items() if n.startswith(f"{prefix}.")}
-        for prefix in ("gaussians", "model")
-    }
-    scene = trained_scene(Gaussians(**parts["gaussians"]), parts["model"], model)
-    return render(scene.at(time), camera()).rgb
+def read(tensors: dict[str, torch.Tensor], model: DynamicModel) -> DynamicScene:
+    """The scene of what a file holds."""
+    full = completed(tensors)
+    return DynamicScene.restored(model, Gaussians(**part_of(full, "gaussians")), part_of(full, "model"))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_stored_form_looks_the_same(kind: str) -> None:
-    tensors, model = moving_tensors(kind)
-    kept = drawable(tensors)
+    scene, model = moving(kind)
+    kept = stored(scene)
     assert not [name for name in kept if "exp_avg" in name]
-    stored = in_storage_order(kept, kept["gaussians.means"].numpy(), model)
+    again = read(kept, model)
     for time in (0.0, 0.7):
         # Blending goes by depth, not by order: what differs is the last bits of turned axes.
         torch.testing.assert_close(
-            picture(completed(stored), model, time), picture(tensors, model, time), atol=1e-5, rtol=0
+            again.render(camera(), time).rgb, scene.render(camera(), time).rgb, atol=1e-5, rtol=0
         )
 
 
 def test_what_moves_is_in_front_and_followed() -> None:
-    tensors, model = moving_tensors("trajectory")
-    kept = drawable(tensors)
-    stored = in_storage_order(kept, kept["gaussians.means"].numpy(), model)
-    assert stored["model.rows"].tolist() == list(range(len(ROWS)))
-    place = {tuple(mean): i for i, mean in enumerate(tensors["gaussians.means"].tolist())}
-    came_from = [ROWS.index(place[tuple(mean)]) for mean in stored["gaussians.means"][: len(ROWS)].tolist()]
+    scene, _ = moving("trajectory")
+    kept = stored(scene)
+    assert kept["model.rows"].tolist() == list(range(len(ROWS)))
+    place = {tuple(mean): i for i, mean in enumerate(scene.gaussians.means.tolist())}
+    came_from = [ROWS.index(place[tuple(mean)]) for mean in kept["gaussians.means"][: len(ROWS)].tolist()]
     name = "model.field.learned.means"
-    assert torch.equal(stored[name], tensors[name][came_from])
+    assert torch.equal(kept[name], scene.state()[name].tensor[came_from])
 
 
-def test_rows_that_are_not_understood_keep_the_order() -> None:
-    tensors = tensors_of(cloud(9), {"something.new": torch.arange(9)})
-    kept = drawable(tensors)
-    stored = in_storage_order(kept, kept["gaussians.means"].numpy(), StaticModel())
-    assert torch.equal(stored["gaussians.means"], tensors["gaussians.means"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_training_state_is_left_out(kind: str) -> None:
+    scene, _ = moving(kind)
+    for_training = {name for name, x in scene.state().items() if x.role is Role.TRAINING}
+    assert any("exp_avg" in name for name in for_training)
+    assert for_training.isdisjoint(drawable(scene))
+    still = StaticScene(gaussians=scene.gaussians)
+    assert {name for name in drawable(still) if not name.startswith("gaussians.")} == set()
 
 
-def test_training_state_is_left_out() -> None:
-    tensors = tensors_of(cloud(9), {"near": torch.zeros(9, 5), "learned.exp_avg.poses": torch.zeros(3)})
-    kept = drawable(tensors | {"exp_avg.means": torch.zeros(9, 3), "rng": torch.zeros(4)})
-    assert {name for name in kept if not name.startswith("gaussians.")} == set()
+def person(weights: torch.Tensor, corrections: torch.Tensor) -> HumanScene:
+    """Two Gaussians on two joints, with learned corrections of their weights (2, 2)."""
+    zeros, clip = torch.zeros(2), MotionClip(torch.zeros(1).double(), torch.zeros(1, 2, 3), torch.zeros(1, 3), ONE)
+    anchors = Anchors(
+        points=torch.zeros(2, 3),
+        size=torch.ones(2),
+        joints=torch.tensor([[0, 1], [0, 1]]),
+        weights=weights,
+        face=zeros.long(),
+        barycentric=torch.ones(2, 3) / 3,
+        uv=torch.zeros(2, 2),
+        height=zeros,
+    )
+    skeleton = Skeleton(torch.zeros(2, 3), (-1, 0))
+    learned = new_corrections(HumanModel(sh_degree=0), clip, skeleton, anchors)
+    learned.values()["weights"].copy_(corrections)
+    gaussians = cloud(2).replace(sh=torch.zeros(2, 1, 3))
+    return HumanScene(gaussians=gaussians, anchors=anchors, skeleton=skeleton, clip=clip, learned=learned)
 
 
 def test_corrections_of_skinning_weights_are_applied() -> None:
     weights = torch.tensor([[0.75, 0.25], [1.0, 0.0]])
     corrections = torch.tensor([[0.0, 3.0]]).log1p().repeat(2, 1)
-    state = {"anchors.weights": weights, "learned.weights": corrections}
-    full = completed(drawable(tensors_of(cloud(2), state)))
+    full = completed(drawable(person(weights, corrections)))
     torch.testing.assert_close(full["model.anchors.weights"], torch.tensor([[3 / 7, 4 / 7], [1.0, 0.0]]))
-    assert not full["model.learned.weights"].any()
+    again = HumanScene.restored(
+        HumanModel(sh_degree=0), Gaussians(**part_of(full, "gaussians")), part_of(full, "model")
+    )
+    assert not again.learned["weights"].any()
 
 
 def test_what_is_not_finite_is_refused() -> None:
-    tensors = tensors_of(cloud(3), {})
-    tensors["gaussians.means"][1, 1] = torch.nan
+    gaussians = cloud(3)
+    gaussians.means[1, 1] = torch.nan
     with pytest.raises(DyngsError, match="means is not finite"):
-        drawable(tensors)
+        drawable(StaticScene(gaussians=gaussians))
 
 
-def masked_tensors() -> tuple[dict[str, torch.Tensor], DynamicModel]:
-    """As ``moving_tensors``; each Gaussian is seen at one of three key times."""
-    tensors, model = moving_tensors("trajectory")
+def masked() -> tuple[DynamicScene, DynamicModel]:
+    """As ``moving``; each Gaussian is seen at one of three key times."""
+    scene, model = moving("trajectory")
     masks = VisibilityMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])
-    return tensors | {f"model.masks.{name}": x for name, x in masks.state().items()}, model
+    return replace(scene, masks=masks), model
 
 
 def test_masks_follow_their_gaussians() -> None:
-    tensors, model = masked_tensors()
-    kept = drawable(tensors)
-    stored = in_storage_order(kept, kept["gaussians.means"].numpy(), model)
-    assert not torch.equal(stored["gaussians.means"], kept["gaussians.means"])
+    scene, model = masked()
+    kept = stored(scene)
+    assert not torch.equal(kept["gaussians.means"], scene.gaussians.means)
+    again = read(kept, model)
     for time in (0.1, 0.8):
-        expected = picture(tensors, model, time)
-        torch.testing.assert_close(picture(completed(stored), model, time), expected, atol=1e-5, rtol=0)
-        unmasked = {name: x for name, x in tensors.items() if not name.startswith("model.masks.")}
-        assert not torch.allclose(picture(unmasked, model, time), expected, atol=1e-3)
+        expected = scene.render(camera(), time).rgb
+        torch.testing.assert_close(again.render(camera(), time).rgb, expected, atol=1e-5, rtol=0)
+        assert not torch.allclose(scene.unmasked().render(camera(), time).rgb, expected, atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -128,9 +148,8 @@ def test_masks_follow_their_gaussians() -> None:
     ],
 )
 def test_masks_of_other_gaussians_are_refused(name: str, value: torch.Tensor) -> None:
-    tensors, model = masked_tensors()
-    kept = drawable(tensors)
-    stored = in_storage_order(kept, kept["gaussians.means"].numpy(), model)
-    completed(stored)
+    scene, model = masked()
+    kept = stored(scene)
+    read(kept, model)
     with pytest.raises(ValueError, match="masks are not those of the Gaussians"):
-        completed(stored | {f"model.masks.{name}": value})
+        read(kept | {f"model.masks.{name}": value}, model)

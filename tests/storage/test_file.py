@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.config import StaticModel
 from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.state import part_of
+from dyngs.static.scene import StaticScene
 from dyngs.storage.coding import compressed, decompressed
 from dyngs.storage.file import MAGIC, MAX_HEADER, SceneInfo, decoded, encoded, read_scene, write_scene
 from dyngs.storage.tensors import COARSENESS
@@ -44,6 +47,13 @@ def small_scene(count: int = 3) -> dict[str, torch.Tensor]:
     return {f"gaussians.{name}": torch.randn(count, *shape, generator=generator) for name, shape in shapes.items()}
 
 
+def stored(tensors: dict[str, torch.Tensor], steps: Mapping[str, float] = STEPS, info: SceneInfo = INFO) -> bytes:
+    """The file of a static scene."""
+    own = {name: x for name, x in tensors.items() if name != COARSENESS}
+    scene = StaticScene(gaussians=Gaussians(**part_of(own, "gaussians")))
+    return encoded(info, scene, steps, tensors.get(COARSENESS))
+
+
 def with_header(data: bytes, old: bytes, new: bytes) -> bytes:
     """The file with ``old`` replaced in its header, and a checksum that fits."""
     start = len(MAGIC) + 4
@@ -58,7 +68,7 @@ def with_header(data: bytes, old: bytes, new: bytes) -> bytes:
 @given(scenes())
 @settings(deadline=None, max_examples=25)
 def test_stored_again_it_is_the_same_file(tensors: dict[str, torch.Tensor]) -> None:
-    data = encoded(INFO, tensors, StaticModel(), STEPS)
+    data = stored(tensors)
     found = decoded(data)
     assert found.info == INFO
     assert found.num_bytes == len(data)
@@ -66,12 +76,12 @@ def test_stored_again_it_is_the_same_file(tensors: dict[str, torch.Tensor]) -> N
         assert found.tensors[name].shape == x.shape
         assert found.tensors[name].dtype == x.dtype
         assert torch.isfinite(found.tensors[name].double()).all()
-    assert encoded(found.info, found.tensors, StaticModel(), found.steps) == data
+    assert stored(found.tensors, found.steps, found.info) == data
 
 
 def test_values_come_back_within_their_steps() -> None:
     tensors = small_scene(200)
-    found = decoded(encoded(INFO, tensors, StaticModel(), STEPS)).tensors
+    found = decoded(stored(tensors)).tensors
     order = [int((tensors["gaussians.means"] - mean).abs().sum(1).argmin()) for mean in found["gaussians.means"]]
     assert sorted(order) == list(range(200))
     for name, tolerance in (("means", 0.005), ("sh", 0.033)):  # half a step; 0.65 of one where zero is preferred
@@ -82,12 +92,12 @@ def test_values_come_back_within_their_steps() -> None:
 def test_a_crowd_of_equals_can_be_read_again() -> None:
     tensors = {name: x[:1].expand(80_000, *x.shape[1:]) for name, x in small_scene().items()}
     tensors["gaussians.sh"] = torch.zeros(80_000, 25, 3)
-    data = encoded(INFO, tensors, StaticModel(), STEPS)
+    data = stored(tensors)
     assert len(decoded(data).tensors["gaussians.sh"]) == 80_000
 
 
 def test_every_cut_and_every_flip_is_an_error(tmp_path: Path) -> None:
-    data = encoded(INFO, small_scene(), StaticModel(), STEPS)
+    data = stored(small_scene())
     for end in range(len(data)):
         with pytest.raises(DyngsError) as caught:
             decoded(data[:end])
@@ -107,7 +117,7 @@ def test_every_cut_and_every_flip_is_an_error(tmp_path: Path) -> None:
 @settings(deadline=None, max_examples=30)
 def test_a_forged_file_is_an_error_or_a_scene(source: st.DataObject) -> None:
     """Flips with a checksum that fits: whatever the reader finds, it says it in one line."""
-    data = bytearray(encoded(INFO, small_scene(), StaticModel(), STEPS)[:-32])
+    data = bytearray(stored(small_scene())[:-32])
     for _ in range(source.draw(st.integers(1, 4))):
         data[source.draw(st.integers(len(MAGIC), len(data) - 1))] ^= source.draw(st.integers(1, 255))
     told = None
@@ -134,13 +144,13 @@ def test_a_forged_file_is_an_error_or_a_scene(source: st.DataObject) -> None:
     ],
 )
 def test_a_forged_header_is_refused(old: bytes, new: bytes, said: str) -> None:
-    data = encoded(INFO, small_scene(), StaticModel(), STEPS)
+    data = stored(small_scene())
     with pytest.raises(DyngsError, match=said):
         decoded(with_header(data, old, new))
 
 
 def test_other_versions_and_other_files_are_told_apart() -> None:
-    data = encoded(INFO, small_scene(), StaticModel(), STEPS)
+    data = stored(small_scene())
     with pytest.raises(DyngsError, match="another version"):
         decoded(data[:6] + b"\x02" + data[7:])
     with pytest.raises(DyngsError, match="not a stored scene"):

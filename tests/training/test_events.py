@@ -10,7 +10,8 @@ from steps import report_of, step_done
 
 def test_the_quality_of_a_step_is_that_of_its_picture() -> None:
     assert report_of(1, 0.1).psnr == pytest.approx(20.0, abs=1e-4)
-    assert math.isinf(report_of(1, 0.0).psnr)
+    assert report_of(1, 0.0).psnr == 100.0, "the most there is"
+    assert math.isnan(report_of(1, math.nan).psnr)
 
 
 def test_a_step_is_the_last_by_the_number_of_steps_that_is_known_now() -> None:
