@@ -103,7 +103,6 @@ def test_a_settled_number_of_steps_ends_only_with_the_time() -> None:
         now += 0.05
     assert 9.8 < now <= 10.0
     deadline.run.trainer.done = done
-    assert done in (199, 200)
     assert deadline.reached().endswith(f": {done} steps")
 
 

@@ -25,7 +25,6 @@ from dyngs.storage.drawable import completed, drawable, stored_edit
 from dyngs.visibility import VisibilityMasks
 
 ROWS = (0, 2, 3, 6)
-ONE = torch.ones(1)
 
 
 def moving(kind: str) -> tuple[DynamicScene, DynamicModel]:
@@ -80,8 +79,9 @@ def test_training_state_is_left_out(kind: str) -> None:
 
 
 def person(weights: torch.Tensor, corrections: torch.Tensor) -> HumanScene:
-    """Two Gaussians on two joints, with learned corrections of their weights (2, 2)."""
-    zeros, clip = torch.zeros(2), MotionClip(torch.zeros(1).double(), torch.zeros(1, 2, 3), torch.zeros(1, 3), ONE)
+    """Two Gaussians on the first two of 24 joints, with learned corrections of their weights (2, 2)."""
+    times, poses = torch.zeros(1).double(), torch.zeros(1, 24, 3)
+    zeros, clip = torch.zeros(2), MotionClip(times, poses, torch.zeros(1, 3), torch.ones(1))
     anchors = Anchors(
         points=torch.zeros(2, 3),
         size=torch.ones(2),
@@ -92,7 +92,7 @@ def person(weights: torch.Tensor, corrections: torch.Tensor) -> HumanScene:
         uv=torch.zeros(2, 2),
         height=zeros,
     )
-    skeleton = Skeleton(torch.zeros(2, 3), (-1, 0))
+    skeleton = Skeleton(torch.zeros(24, 3), (-1, *[0] * 23))
     learned = new_corrections(HumanModel(sh_degree=0), clip, skeleton, anchors)
     learned.values()["weights"].copy_(corrections)
     gaussians = cloud(2).replace(sh=torch.zeros(2, 1, 3))
