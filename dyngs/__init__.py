@@ -9,12 +9,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dyngs.api.load import load
+    from dyngs.api.train import train
     from dyngs.camera import Cameras
     from dyngs.compat import rasterization
+    from dyngs.config.io import load_config
     from dyngs.data.read import read_capture
     from dyngs.errors import DyngsError
     from dyngs.gaussians import Gaussians
     from dyngs.rendering import Rendering, RenderOptions, contributions, render
+    from dyngs.scene import Scene
 
 __version__ = "0.1.0"
 __all__ = [
@@ -23,10 +27,14 @@ __all__ = [
     "Gaussians",
     "RenderOptions",
     "Rendering",
+    "Scene",
     "contributions",
+    "load",
+    "load_config",
     "rasterization",
     "read_capture",
     "render",
+    "train",
 ]
 
 _HOMES = {
@@ -35,10 +43,14 @@ _HOMES = {
     "Gaussians": "dyngs.gaussians",
     "RenderOptions": "dyngs.rendering",
     "Rendering": "dyngs.rendering",
+    "Scene": "dyngs.scene",
     "contributions": "dyngs.rendering",
+    "load": "dyngs.api.load",
+    "load_config": "dyngs.config.io",
     "rasterization": "dyngs.compat",
     "read_capture": "dyngs.data.read",
     "render": "dyngs.rendering",
+    "train": "dyngs.api.train",
 }
 
 

@@ -57,7 +57,7 @@ from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.scene import StaticScene
 from dyngs.static.training import FilterUpdate, StaticTraining
-from dyngs.training.background import evaluation_background
+from dyngs.training.background import background_colour, evaluation_background
 from dyngs.training.limits import within_cap
 from dyngs.training.loop import Trainable
 from dyngs.training.prediction import assemble_network
@@ -165,7 +165,8 @@ def restored_scene(checkpoint: Checkpoint, model: SceneModel) -> Scene:
         try:
             gaussians, own = Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
             colour = network_of(checkpoint.part("model.colour"))
-            return replace(_restored(model, gaussians, own), colour=colour, options=render_options(model))
+            scene, background = _restored(model, gaussians, own), background_colour(checkpoint.info.background)
+            return replace(scene, colour=colour, options=render_options(model), background=background)
         except KeyError as missing:
             raise DyngsError(f"{checkpoint.name} lacks {missing}; an earlier version wrote it: train anew") from None
 

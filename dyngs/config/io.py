@@ -44,7 +44,7 @@ _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 # ---------------------------------------------------------------------------------------------------- loading
 
 
-def load_config(preset: Path | None, overrides: Iterable[str] = ()) -> Config:
+def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Config:
     """Return the configuration of a preset with overrides laid over it.
 
     Args:
@@ -61,7 +61,7 @@ def load_config(preset: Path | None, overrides: Iterable[str] = ()) -> Config:
     """
     layers = _Layers()
     if preset is not None:
-        leaves = read_file(find_preset(preset))
+        leaves = read_file(find_preset(Path(preset)))
         for leaf in leaves:
             require_present(leaf)
         layers.add(leaves)

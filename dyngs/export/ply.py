@@ -13,7 +13,7 @@ get the coordinates of the original capture).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
@@ -26,6 +26,7 @@ from dyngs.errors import DyngsError, reading
 from dyngs.export.ply_header import PlyHeader, read_header
 from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
+from dyngs.rendering import RenderOptions
 
 _MODE_OF_NAME = {"default": RasterizeMode.CLASSIC, "mip": RasterizeMode.ANTIALIASED}
 _NAME_OF_MODE = {mode: name for name, mode in _MODE_OF_NAME.items()}
@@ -49,6 +50,12 @@ class SplatFile:
     eps2d: float | None = None
     world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     comments: tuple[str, ...] = ()
+
+
+def splat_options(splat: SplatFile) -> RenderOptions:
+    """Return the render options stated in the header of a splat file: its mode, and its low-pass filter if any."""
+    options = RenderOptions(mode=splat.mode)
+    return options if splat.eps2d is None else replace(options, eps2d=splat.eps2d)
 
 
 def write_ply(

@@ -10,8 +10,7 @@ import numpy as np
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background
-from dyngs.export.ply import SplatFile, read_ply
-from dyngs.rendering import RenderOptions
+from dyngs.export.ply import read_ply, splat_options
 from dyngs.static.scene import StaticScene
 from dyngs.view.camera_paths import CameraPath, frame_orbit_for_points, read_path, spiral_path
 from dyngs.view.render_job import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJob, RenderJobOptions, path_file, resize_cameras
@@ -42,12 +41,6 @@ def job_of_ply(file: Path, options: RenderJobOptions) -> RenderJob:
     _, background = evaluation_background(options.background or "black", has_alpha=False)
     scene = StaticScene(gaussians=splat.gaussians)
     return RenderJob(scene, path, splat_options(splat), background)
-
-
-def splat_options(splat: SplatFile) -> RenderOptions:
-    """Return the render options stated in the header of a splat file: its mode, and its low-pass filter if any."""
-    options = RenderOptions(mode=splat.mode)
-    return options if splat.eps2d is None else replace(options, eps2d=splat.eps2d)
 
 
 def _around_points(means: np.ndarray, options: RenderJobOptions) -> Cameras:

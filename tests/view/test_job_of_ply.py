@@ -11,11 +11,11 @@ from two_balls import cameras_around, two_balls
 
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
-from dyngs.export.ply import SplatFile, read_ply, write_ply
+from dyngs.export.ply import SplatFile, read_ply, splat_options, write_ply
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions
 from dyngs.static.scene import StaticScene
-from dyngs.view.job_of_ply import job_of_ply, splat_options
+from dyngs.view.job_of_ply import job_of_ply
 from dyngs.view.render_job import RenderJobOptions, render_frame
 
 
