@@ -9,6 +9,7 @@ from tiny_fields import cloud
 
 from dyngs.config import OptimConfig
 from dyngs.deform.seeds import box_of, seeded
+from dyngs.state import tensors_of
 from dyngs.static.optimizer import GaussianOptimizer
 
 
@@ -25,7 +26,7 @@ def test_seeds_are_faint_and_lie_in_the_box(count: int, seeds: int, degree: int,
     for x in optimizer.parameters.tensors().values():
         x.grad = torch.ones_like(x)
     optimizer.step(1, 0.1, dense=True)
-    before, moments = optimizer.parameters.detach(), optimizer.state()
+    before, moments = optimizer.parameters.detach(), tensors_of(optimizer.state())
     optimizer.apply(seeded(before, seeds, 2.0, torch.Generator().manual_seed(seed)))
     after = optimizer.parameters.detach()
     added = after.select(torch.arange(count, count + seeds))
@@ -33,7 +34,7 @@ def test_seeds_are_faint_and_lie_in_the_box(count: int, seeds: int, degree: int,
     for name, x in before.tensors().items():
         assert torch.equal(after.tensors()[name][:count], x), name
         for moment in ("exp_avg", "exp_avg_sq"):
-            stored = optimizer.state()[f"{moment}.{name}"]
+            stored = optimizer.state()[f"{moment}.{name}"].tensor
             assert torch.equal(stored[:count], moments[f"{moment}.{name}"])
             assert not stored[count:].any()
     center, half_size = box_of(before, 2.0)
