@@ -23,7 +23,7 @@ from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.rendering import Rendering, RenderOptions, Shader, render
-from dyngs.state import Role, State, moved_to, prefixed, with_role
+from dyngs.state import Role, State, fields_moved_to, prefixed, with_role
 from dyngs.visibility import VisibilityMasks
 
 S = TypeVar("S", bound="Scene")
@@ -198,7 +198,7 @@ class Scene(ABC):
 
     def to(self: S, device: torch.device | str) -> S:
         """Return the scene with its tensors on ``device``."""
-        return moved_to(self, device)
+        return fields_moved_to(self, device)
 
     @abstractmethod
     def _model_state(self) -> State:

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -58,14 +58,21 @@ def part_of(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def moved_to(value: T, device: torch.device | str) -> T:
-    """Return a copy of ``value`` whose tensors are on ``device``: dataclasses, containers, objects with a ``to``."""
-    if isinstance(value, Tensor):
-        return cast(T, value.to(device))
+    """Return a copy of ``value`` with its tensors on ``device``: by its own ``to`` if it has one, else by its parts."""
+    own: Any = value
+    if hasattr(value, "to"):
+        return own.to(device=device)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: moved_to(getattr(value, f.name), device) for f in dataclasses.fields(value) if f.init}
-        return cast(T, dataclasses.replace(value, **fields))
+        return fields_moved_to(value, device)
     if isinstance(value, tuple):
-        return cast(T, tuple(moved_to(x, device) for x in value))
+        return cast(T, tuple(moved_to(x, device) for x in own))
     if isinstance(value, dict):
-        return cast(T, {name: moved_to(x, device) for name, x in value.items()})
-    return value.to(device) if hasattr(value, "to") else value  # type: ignore[union-attr]
+        return cast(T, {name: moved_to(x, device) for name, x in own.items()})
+    return value
+
+
+def fields_moved_to(value: T, device: torch.device | str) -> T:
+    """Return a copy of the dataclass ``value`` with its fields on ``device``, as ``moved_to`` has them."""
+    own: Any = value
+    moved = {f.name: moved_to(getattr(value, f.name), device) for f in dataclasses.fields(own) if f.init}
+    return cast(T, dataclasses.replace(own, **moved))
