@@ -1,0 +1,94 @@
+"""A small scene of every kind, as after training."""
+
+from __future__ import annotations
+
+import torch
+from scenes import look_around
+from tiny_fields import KINDS as FIELDS
+from tiny_fields import cloud, stirred_field, tiny_options
+
+from dyngs.camera import Cameras
+from dyngs.colour.network import ColourNetwork, box_around
+from dyngs.config import DynamicModel, HumanModel
+from dyngs.deform.scene import DynamicScene
+from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.anchors import texel_gaussians
+from dyngs.human.avatar.posing import Skeleton
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.avatar.subject import Subject
+from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.motion.captured import CapturedMotion
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.template.atlas import atlas_texels
+from dyngs.human.template.load import default_template
+from dyngs.ops.perceptron import Layer
+from dyngs.ops.shading import num_inputs
+from dyngs.scene import Scene
+from dyngs.state import State, part_of, tensors_of
+from dyngs.static.rates import Rates
+from dyngs.static.scene import StaticScene
+from dyngs.visibility import VisibilityMasks
+
+KINDS = ("static", *FIELDS, "masked", "human")
+MOVING = torch.tensor([1, 4, 5, 8])
+SEEN_AT = (0.0, 0.5, 1.0)
+PERSON = HumanModel(sh_degree=0, pose_offsets=True)
+
+
+def scene_of_kind(kind: str) -> Scene:
+    """Nine Gaussians with a 3D filter, of which four may move, or a person; ``masked`` is a hexplane with masks."""
+    std = 0.01 + torch.arange(9.0) / 100
+    if kind == "static":
+        return StaticScene(gaussians=cloud(), filter_std=std, seen_at=SEEN_AT)
+    if kind == "human":
+        return _person()
+    masks = None
+    if kind == "masked":
+        seen = torch.rand(3, 9, generator=torch.Generator().manual_seed(1)) < 0.4
+        masks = VisibilityMasks.pack(SEEN_AT, seen)
+    field = stirred_field(_field(kind), len(MOVING))
+    return DynamicScene(
+        gaussians=cloud(), seen_at=SEEN_AT, field=field, moving=MOVING, filter_std=std, masks=masks, colour=_network()
+    )
+
+
+def restored(kind: str, state: State) -> Scene:
+    """The scene of what is stored, but for its colours."""
+    tensors = {name: x.clone() for name, x in tensors_of(state).items()}
+    gaussians, own = Gaussians.stored(part_of(tensors, "gaussians")), part_of(tensors, "model")
+    if kind == "static":
+        return StaticScene.restored(gaussians, own)
+    if kind == "human":
+        return HumanScene.restored(PERSON, gaussians, own)
+    return DynamicScene.restored(DynamicModel(deform=tiny_options(_field(kind))), gaussians, own)
+
+
+def onlooker() -> Cameras:
+    """One camera that sees all of them."""
+    intrinsics = torch.tensor([[30.0, 0, 18], [0, 30, 14], [0, 0, 1]])
+    return Cameras(look_around(1, torch.float32), intrinsics[None], 36, 28)
+
+
+def _field(kind: str) -> str:
+    return "hexplane" if kind == "masked" else kind
+
+
+def _network() -> ColourNetwork:
+    generator = torch.Generator().manual_seed(5)
+    inputs = num_inputs(sees_time=True, sees_normals=True)
+    sizes = ((8, inputs), (3, 8))
+    layers = [Layer(0.3 * torch.randn(size, generator=generator), torch.zeros(size[0])) for size in sizes]
+    return ColourNetwork(tuple(layers), box_around(cloud().means), True, True)
+
+
+def _person() -> HumanScene:
+    generator, body = torch.Generator().manual_seed(1), default_template()
+    gaussians, anchors = texel_gaussians(atlas_texels(body, 16), (0.0,), 0)
+    gaussians = gaussians.replace(sh=torch.randn(gaussians.sh.shape, generator=generator))
+    times, poses = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64), torch.randn(3, 55, 3, generator=generator)
+    clip = MotionClip(times, 0.3 * poses, 0.1 * torch.randn(3, 3, generator=generator), torch.ones(3))
+    subject = Subject(Skeleton(body.joints, body.parents), anchors, CapturedMotion(clip, (0, 1, 2)))
+    scene = HumanTraining(PERSON, (0, 1, 2), Rates(10)).first_scene(gaussians, subject)
+    for x in scene.learned.values().values():
+        x += 0.05 * torch.randn(x.shape, generator=generator)
+    return scene

@@ -1,0 +1,135 @@
+"""Adam of named tensors: torch's own, which leaves out rows that it must not touch."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from dyngs.adam import AdamState
+from dyngs.state import Role, tensors_of
+
+SHAPES = {"weight": (4, 5), "bias": (3,), "planes": (2, 3, 4, 2)}
+EPS = 1e-15
+
+
+def random(shape: tuple[int, ...], seed: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def start_values() -> dict[str, Tensor]:
+    return {name: random(shape, seed).requires_grad_() for seed, (name, shape) in enumerate(SHAPES.items())}
+
+
+def stepped(steps: int) -> tuple[AdamState, dict[str, Tensor]]:
+    """Moments and tensors after some steps."""
+    tensors = start_values()
+    adam = AdamState.zero(tensors)
+    for step in range(1, steps + 1):
+        for seed, (name, x) in enumerate(tensors.items()):
+            x.grad = random(x.shape, 10 * step + seed)
+            assert adam.step_(name, x, lr=0.1, step=step) == 0
+    return adam, tensors
+
+
+@pytest.mark.parametrize("along_last_axis", [False, True])
+def test_it_is_adam(along_last_axis: bool) -> None:
+    mine, theirs = start_values(), start_values()
+    adam, reference = AdamState.zero(mine), torch.optim.Adam(list(theirs.values()), lr=0.1, eps=EPS)
+    for step in range(1, 6):
+        for seed, name in enumerate(SHAPES):
+            grad = random(SHAPES[name], 10 * step + seed)
+            mine[name].grad, theirs[name].grad = grad, grad.clone()
+            update = adam.step_along_last_axis_ if along_last_axis else adam.step_
+            assert update(name, mine[name], lr=0.1, step=step) == 0
+        reference.step()
+    for name, x in theirs.items():
+        torch.testing.assert_close(mine[name], x, rtol=1e-5, atol=1e-6)
+        assert mine[name].grad is None
+
+
+def test_without_gradients_nothing_is_done() -> None:
+    adam, tensors = stepped(2)
+    before = {name: x.clone() for name, x in (tensors | tensors_of(adam.state())).items()}
+    for name, x in tensors.items():
+        assert adam.step_(name, x, lr=0.1, step=3) == adam.step_along_last_axis_(name, x, lr=0.1, step=3) == 0
+    assert all(torch.equal(x, before[name]) for name, x in (tensors | tensors_of(adam.state())).items())
+
+
+def test_rows_with_bad_gradients_are_left_out_and_counted() -> None:
+    """A row is all that belongs to one Gaussian, or, of arrays for all of them, the values along the last axis."""
+    for along_last_axis, left_out in ((False, 1), (True, 2)):
+        x = start_values()["planes"]
+        adam, before = AdamState.zero({"planes": x}), x.detach().clone()
+        x.grad = random(SHAPES["planes"], 1)
+        x.grad[1, 2, 3, 0], x.grad[1, 0, 0, 1] = float("nan"), float("inf")
+        update = adam.step_along_last_axis_ if along_last_axis else adam.step_
+        assert update("planes", x, lr=0.1, step=1) == left_out
+        stays = x.detach() == before
+        assert stays[1, 2, 3].all()
+        assert stays[1, 0, 0].all()
+        assert int(stays.sum()) == (4 if along_last_axis else 24)
+        assert all(m.isfinite().all() for m in (*adam.exp_avg.values(), *adam.exp_avg_sq.values()))
+
+
+def test_of_chosen_rows_only_those_are_updated() -> None:
+    x, rows = start_values()["weight"], torch.tensor([True, False, False, True])
+    adam, before = AdamState.zero({"weight": x}), x.detach().clone()
+    x.grad = torch.ones_like(x)
+    adam.step_("weight", x, lr=0.1, step=1, rows=rows)
+    assert torch.equal((x.detach() != before).all(1), rows)
+    assert torch.equal(adam.exp_avg["weight"].any(1), rows)
+
+
+def test_each_value_of_a_row_may_have_its_rate() -> None:
+    x = start_values()["weight"]
+    adam, before = AdamState.zero({"weight": x}), x.detach().clone()
+    x.grad = torch.ones_like(x)
+    rates = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.4])
+    adam.step_("weight", x, lr=rates, step=1)
+    torch.testing.assert_close(before - x.detach(), rates.expand(4, 5), rtol=0, atol=1e-6)
+
+
+def test_mapped_changes_both_moments_of_what_is_named() -> None:
+    adam, _ = stepped(2)
+    some, everything, nothing = (adam.mapped(torch.zeros_like, names) for names in (["bias"], None, []))
+    for part in ("exp_avg", "exp_avg_sq"):
+        before, found, all_zero, same = (getattr(one, part) for one in (adam, some, everything, nothing))
+        for name, x in before.items():
+            assert x.any(), "what is mapped stays as it is"
+            assert torch.equal(found[name], torch.zeros_like(x) if name == "bias" else x)
+            assert not all_zero[name].any()
+            assert torch.equal(same[name], x)
+
+
+def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
+    adam, tensors = stepped(2)
+    copies = {name: x.detach().clone().requires_grad_() for name, x in tensors.items()}
+    other = AdamState.restored(tensors_of(adam.state()), tensors)
+    for one, own in ((adam, tensors), (other, copies)):
+        for name, x in own.items():
+            x.grad = random(x.shape, 99)
+            one.step_(name, x, lr=0.1, step=3)
+    assert all(torch.equal(x, copies[name]) for name, x in tensors.items())
+    for name, x in tensors_of(adam.state()).items():
+        assert torch.equal(x, tensors_of(other.state())[name])
+        assert torch.equal(x, tensors_of(other.to("cpu").state())[name])
+
+
+def test_its_state_is_for_training_alone() -> None:
+    adam, _ = stepped(1)
+    state = adam.state()
+    assert set(state) == {f"{part}.{name}" for part in ("exp_avg", "exp_avg_sq") for name in SHAPES}
+    assert {x.role for x in state.values()} == {Role.TRAINING}
+
+
+@pytest.mark.parametrize("part", ["exp_avg", "exp_avg_sq"])
+def test_moments_that_do_not_fit_are_refused(part: str) -> None:
+    adam, tensors = stepped(1)
+    state, name = tensors_of(adam.state()), f"{part}.weight"
+    with pytest.raises(KeyError, match=name):
+        AdamState.restored({k: x for k, x in state.items() if k != name}, tensors)
+    bad = torch.full((4, 5), float("nan")), torch.zeros(5, 5), torch.zeros(4, 5, dtype=torch.float64)
+    for x in bad:
+        with pytest.raises(ValueError, match=name):
+            AdamState.restored(state | {name: x}, tensors)

@@ -1,0 +1,81 @@
+"""Named tensors with roles: put together, taken apart, and moved to a device with all that holds them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dyngs.state import Role, StateTensor, fields_moved_to, moved_to, part_of, prefixed, tensors_of, with_role
+
+NAMES = st.text("abc.", min_size=1, max_size=5)
+
+
+@given(st.dictionaries(NAMES, st.integers(0, 9)), st.sampled_from(Role), st.text("abc", min_size=1, max_size=3))
+def test_a_prefix_is_put_before_and_taken_away(values: dict[str, int], role: Role, prefix: str) -> None:
+    tensors = {name: torch.tensor([x]) for name, x in values.items()}
+    state = with_role(tensors, role)
+    assert all(x.role is role for x in state.values())
+    assert tensors_of(state) == tensors
+    assert part_of(prefixed(prefix, state), prefix) == state
+    assert tensors_of(prefixed(prefix, state)) == {f"{prefix}.{name}": x for name, x in tensors.items()}
+
+
+def test_a_part_has_the_whole_prefix() -> None:
+    x, y = torch.zeros(1), torch.ones(1)
+    assert part_of({"a.x": x, "ab.x": y, "x": y, "a": y, "b.a.x": y}, "a") == {"x": x}
+
+
+@dataclass(frozen=True)
+class Plain:
+    """Has no ``to``."""
+
+    x: Tensor
+    number: float = 1.0
+    cache: dict[str, Tensor] = field(default_factory=dict, init=False, compare=False)
+
+
+@dataclass(frozen=True)
+class Own:
+    """Keeps ``times`` on the CPU."""
+
+    times: Tensor
+    x: Tensor
+
+    def to(self, device: torch.device | str) -> Own:
+        return Own(self.times, self.x.to(device))
+
+
+def devices(value: Any) -> list[str]:
+    return [x.device.type for x in value]
+
+
+def test_what_is_moved_keeps_its_shape() -> None:
+    x = torch.arange(3.0)
+    value = {"a": (Plain(x, 2.0), Own(x, x)), "b": StateTensor(x, Role.SHARED), "c": (), "d": None, "e": "cpu"}
+    value["a"][0].cache["old"] = x
+    moved: Any = moved_to(value, "meta")
+    plain, own = moved["a"]
+    assert devices([plain.x, own.times, own.x, moved["b"].tensor]) == ["meta", "cpu", "meta", "meta"]
+    assert (plain.number, plain.cache, moved["b"].role) == (2.0, {}, Role.SHARED)
+    assert [moved[name] for name in "cde"] == [(), None, "cpu"]
+    assert devices([value["a"][0].x, value["b"].tensor]) == ["cpu", "cpu"], "what was given stays as it is"
+    assert moved_to(Role.SHARED, "meta") is Role.SHARED
+    assert moved_to(Plain, "meta") is Plain
+
+
+def test_on_its_own_device_nothing_is_copied() -> None:
+    x = torch.arange(3.0)
+    assert moved_to(x, "cpu") is x
+    assert moved_to(Plain(x), "cpu").x is x
+    assert fields_moved_to(Own(x, x), "cpu") == Own(x, x)
+
+
+def test_fields_are_moved_one_by_one() -> None:
+    """For a ``to`` that is made of it."""
+    x = torch.arange(3.0)
+    assert devices(vars(fields_moved_to(Own(x, x), "meta")).values()) == ["meta", "meta"]
