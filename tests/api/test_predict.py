@@ -78,7 +78,7 @@ def test_mistakes_are_told(made: Made, tmp_path: Path) -> None:
         network_config(run)
     with pytest.raises(DyngsError, match="not a run folder"):
         predict_person(tmp_path, made.capture, tmp_path / "out", 3)
-    with pytest.raises(DyngsError, match="no training view is 'x'"):
+    with pytest.raises(DyngsError, match="no training view is named 'x'"):
         predict_person(made.network, made.capture, tmp_path / "out", ("x",))
     for count in (0, TINY.num_cameras + 1):
         with pytest.raises(DyngsError, match=f"cannot choose {count} of its 8"):

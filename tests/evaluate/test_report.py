@@ -18,7 +18,6 @@ from dyngs.conventions import RasterizeMode
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Picture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.deform.scene import TrainedScene
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import (
     evaluate_run,
@@ -32,6 +31,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.metrics import Lpips, psnr
 from dyngs.rendering import RenderOptions, render
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
+from dyngs.static.scene import StaticScene
 
 NO_LPIPS = Lpips("alex", "no weights here")
 
@@ -46,8 +46,8 @@ def some_gaussians(count: int = 12, degree: int = 0) -> Gaussians:
     return Gaussians(uniform(count, 3), uniform(count, 4), uniform(count, 3) * 0.3 - 1.5, uniform(count) + 1, sh)
 
 
-def as_scene(gaussians: Gaussians) -> TrainedScene:
-    return TrainedScene(gaussians, torch.zeros(0, dtype=torch.long))
+def as_scene(gaussians: Gaussians) -> StaticScene:
+    return StaticScene(gaussians=gaussians)
 
 
 def camera(width: int = 20, height: int = 14, distance: float = 4.0) -> Cameras:
