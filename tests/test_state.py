@@ -21,7 +21,7 @@ def test_a_prefix_is_put_before_and_taken_away(values: dict[str, int], role: Rol
     state = with_role(tensors, role)
     assert all(x.role is role for x in state.values())
     assert tensors_of(state) == tensors
-    assert part_of(prefixed(prefix, state), prefix) == state
+    assert part_of(tensors_of(prefixed(prefix, state)), prefix) == tensors
     assert tensors_of(prefixed(prefix, state)) == {f"{prefix}.{name}": x for name, x in tensors.items()}
 
 

@@ -493,15 +493,15 @@ def test_a_reset_of_opacities_moves_no_rows() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("phase", ["coarse", "fine", "split"])
 def test_state_goes_round(kind: str, phase: str) -> None:
-    gaussians, options = flat_cloud(), {"deform": tiny_options(kind)}
-    run = new_run(gaussians, **options) if phase == "coarse" else begun(gaussians, **options)
+    gaussians, deform = flat_cloud(), tiny_options(kind)
+    run = new_run(gaussians, deform=deform) if phase == "coarse" else begun(gaussians, deform=deform)
     if phase != "coarse":
         assert run.scene.field is not None
         run.drawn_at(0.4)
         stir(run.scene.field, 0.1)
     if phase == "split":
         run.after_step(SPLIT)
-    other = new_run(gaussians, **options)  # type: ignore[arg-type]
+    other = new_run(gaussians, deform=deform)
     stored = {name: x.clone() for name, x in run.model_state.items()}
     other.scene = other.training.restored(gaussians, stored, other.scene)
     assert other.model_state.keys() == run.model_state.keys()
