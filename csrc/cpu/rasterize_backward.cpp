@@ -96,15 +96,15 @@ BlockPixels<S> load_pixels(const Splats<S>& s, const TileFrame<S>& frame, int bl
 template <class S>
 void add_moments(const Packet<S> (&p)[kLanes], const Batch<S>& batch, Packet<S>* out) {
   using P = Packet<S>;
-  const P zero(S(0));
-  P sum[] = {zero, zero, zero, zero, zero, zero};
+  P one(S(0)), x(S(0)), y(S(0)), xx(S(0)), xy(S(0)), yy(S(0));  // an array of them would live in memory
   for (int r = 0; r < kBlockSide; ++r) {
     const P &a = p[4 * r], &b = p[4 * r + 1], &c = p[4 * r + 2], &d = p[4 * r + 3];
     const P row = (a + b) + (c + d), row_x = b + P(S(2)) * c + P(S(3)) * d;
     const P fy(static_cast<S>(r)), fyy(static_cast<S>(r * r));
-    sum[kOne] += row, sum[kX] += row_x, sum[kXX] += b + P(S(4)) * c + P(S(9)) * d;
-    sum[kY] += fy * row, sum[kXY] += fy * row_x, sum[kYY] += fyy * row;
+    one += row, x += row_x, xx += b + P(S(4)) * c + P(S(9)) * d;
+    y += fy * row, xy += fy * row_x, yy += fyy * row;
   }
+  const P sum[] = {one, x, y, xx, xy, yy};
   moments_about(sum, batch.dx, batch.dy, out);
 }
 
