@@ -35,8 +35,8 @@ from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import PictureLoader
 from dyngs.data.prepare.triangulate import triangulated_points, views_of_a_moment
 from dyngs.data.read import read_capture
-from dyngs.deform.residual import Residuals, cameras_in_place, residuals_of, views_to_compare
 from dyngs.deform.scene import DynamicScene
+from dyngs.deform.still_error import StillErrors, cameras_in_place, still_errors, views_to_compare
 from dyngs.deform.training import DynamicTraining, TrainingViews
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians import Gaussians
@@ -282,15 +282,15 @@ def _training_views(
     divisor = picture_divisor(config.train, deform_schedule(model, rates_of(config)).fine)
     looked_at = views_to_compare(views)
 
-    def residuals(gaussians_at: Callable[[float], Gaussians]) -> Residuals:
+    def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
         shown = [pictures[i].shrunk(divisor) for i in looked_at]
         network = colours.network
         shader = (lambda time: None) if network is None else network.shader
-        return residuals_of(gaussians_at, shown, _training_options(config), background, shader)
+        return still_errors(gaussians_at, shown, _training_options(config), background, shader)
 
     cameras, extent = training_cameras(views, config.data), surroundings(capture).extent
     stay = bool(cameras_in_place(views))
-    return TrainingViews(training_times(capture), cameras, extent, residuals, cameras_stay=stay)
+    return TrainingViews(training_times(capture), cameras, extent, errors_of, cameras_stay=stay)
 
 
 def _colours(config: Config, capture: Capture, gaussians: Gaussians, generator: torch.Generator) -> ColourTraining:

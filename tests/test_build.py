@@ -35,7 +35,7 @@ from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
-from dyngs.deform.residual import residuals_of
+from dyngs.deform.still_error import still_errors
 from dyngs.deform.training import DynamicScene
 from dyngs.static.densify import DefaultDensifier
 from dyngs.static.fixed import FixedDensifier
@@ -169,9 +169,9 @@ def test_motion_is_looked_for_in_pictures_from_all_over_the_clip(capture: Path, 
     trainer = assemble(_dynamic(root, data=DataConfig(root=root, background="white")))
     assert isinstance(trainer.model, DynamicScene)
     gaussians = trainer.scene.gaussians.detach()
-    found = trainer.model.capture.residuals(lambda _: gaussians)
+    found = trainer.model.capture.still_errors(lambda _: gaussians)
     pictures = [trainer.pictures[i] for i in range(5)]
-    expected = residuals_of(lambda _: gaussians, pictures, trainer.options, torch.ones(3))
+    expected = still_errors(lambda _: gaussians, pictures, trainer.options, torch.ones(3))
     assert torch.equal(found.most, expected.most)
     assert torch.equal(found.usual, expected.usual)
     assert found.most.shape == (50,)

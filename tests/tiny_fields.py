@@ -57,7 +57,7 @@ def tiny_field(kind: str, num_moving: int = 9, *, everything: bool = True) -> De
 def stirred_field(kind: str, num_moving: int = 9, *, size: float = 0.2, everything: bool = True) -> DeformationField:
     """A field as after training: all that is learned has some noise on it, and no unit of the networks is silent.
 
-    A skeleton has its nodes among the first means of ``cloud``.
+    Control nodes lie among the first means of ``cloud``.
     """
     field = tiny_field(kind, num_moving, everything=everything)
     field.offsets(cloud(num_moving).means, 0.0)
@@ -87,8 +87,8 @@ def write_tiny_capture(root: Path) -> Path:
 def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Config:
     """A run of 24 steps in which all happens: motion begins after step 8, all times come from 14 on, splits from 15 on.
 
-    Of the 60 Gaussians some may move, and so may 12 seeds; the set changes each third step. The field learns so fast
-    that after some steps a part of what may move is seen to.
+    Of the 60 Gaussians some may move, and so may 12 random ones; the set changes each third step. The field learns so
+    fast that after some steps a part of what may move is seen to.
     """
     rates = {
         "hexplane": {"lr_planes": 1e-1, "lr_decoder": 5e-2},

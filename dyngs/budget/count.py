@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dyngs.budget.run import LimitedRun
-from dyngs.prune.selection import best
+from dyngs.prune.selection import highest
 from dyngs.prune.stage import default_scores
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import CLOSE, most_gaussians
@@ -40,7 +40,7 @@ class CountLimit:
             case StepDone():
                 count = self.run.trainer.num_gaussians
                 if count > self.most and self.run.stage:
-                    before, after = self.run.remove(best(default_scores(self.run.trainer), 1 - self.most / count))
+                    before, after = self.run.remove(highest(default_scores(self.run.trainer), 1 - self.most / count))
                     self.before, self.lost = self.before or count, self.lost + before - after
                     self.run.say(
                         f"step {event.step}: {self._name}: {count:,} -> {self.most:,} Gaussians; {after - before:+.2f} "

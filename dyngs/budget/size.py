@@ -12,10 +12,10 @@ from torch import Tensor
 from dyngs.build import restored_scene
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.errors import DyngsError
-from dyngs.prune.selection import best
+from dyngs.prune.selection import highest
 from dyngs.prune.stage import default_scores, probe_pictures, quality_of
 from dyngs.runs.checkpoint import SCENE_FILE
-from dyngs.runs.folder import SMALL_FOLDER
+from dyngs.runs.folder import EXPORT_FOLDER, FORMER_EXPORT_FOLDER
 from dyngs.scene import Scene
 from dyngs.storage.drawable import drawable
 from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
@@ -55,7 +55,7 @@ class SizeReport:
         if self.num_kept < self.num_gaussians:
             how += [f"{self.num_kept:,} of {self.num_gaussians:,} Gaussians"]
         return (
-            f"budget.max_mb: asked {self.asked:g}, got {self.megabytes:.3g} ({SMALL_FOLDER}/{SCENE_FILE}"
+            f"budget.max_mb: asked {self.asked:g}, got {self.megabytes:.3g} ({EXPORT_FOLDER}/{SCENE_FILE}"
             f"{''.join(f', {x}' for x in how)}); {self.after - self.before:+.2f} dB on training views "
             f"({self.before:.2f} -> {self.after:.2f})"
         )
@@ -72,9 +72,9 @@ class _File:
 
 
 def has_file(run_dir: Path) -> bool:
-    """Whether the file of a run was written already."""
-    folder = run_dir / SMALL_FOLDER
-    return (folder / SCENE_FILE).is_file() and (folder / RESOLVED_NAME).is_file()
+    """Return whether a run has its file of limited size, also under the folder's former name."""
+    folders = (run_dir / EXPORT_FOLDER, run_dir / FORMER_EXPORT_FOLDER)
+    return any((folder / SCENE_FILE).is_file() and (folder / RESOLVED_NAME).is_file() for folder in folders)
 
 
 @torch.no_grad()
@@ -110,15 +110,15 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
     if chosen is None or chosen.coarser > 1:
         scores, share = default_scores(trainer), KEPT
         while share * len(scene) >= 1:
-            kept = best(scores, 1 - share)
+            kept = highest(scores, 1 - share)
             found = stored(scene.select(kept), None if plan.coarseness is None else plan.coarseness[kept])
             if chosen is not None and (found is None or found.psnr <= chosen.psnr):
                 break
             chosen, share = found, share * KEPT
     if chosen is None:
         raise DyngsError(f"budget.max_mb={megabytes:g}: what is trained does not fit; the run itself is in {run_dir}")
-    write_scene(run_dir / SMALL_FOLDER / SCENE_FILE, chosen.data)
-    save_config(config, run_dir / SMALL_FOLDER / RESOLVED_NAME)
+    write_scene(run_dir / EXPORT_FOLDER / SCENE_FILE, chosen.data)
+    save_config(config, run_dir / EXPORT_FOLDER / RESOLVED_NAME)
     got = 1e-6 * len(chosen.data)
     return SizeReport(megabytes, got, before, chosen.psnr, len(scene), chosen.num_kept, chosen.coarser)
 

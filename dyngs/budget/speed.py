@@ -22,7 +22,7 @@ from dyngs.data.frame_selection import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.evaluate.temporal import Drawing
 from dyngs.metrics import flip, ssim
-from dyngs.prune.selection import best
+from dyngs.prune.selection import highest
 from dyngs.prune.stage import default_scores, training_quality
 from dyngs.scene import Scene, render_options
 from dyngs.training.events import Event, StepDone
@@ -230,7 +230,7 @@ class SpeedLimit:
             count = min(fine + max(1, int(share * (slow - fine))), slow - 1)
             if count <= fine:
                 break
-            kept = best(scores, 1 - count / len(scores))
+            kept = highest(scores, 1 - count / len(scores))
             seconds = least_seconds(trainer, trainer.scene.select(kept), goal)
             if seconds > goal:
                 slow, slow_seconds = count, seconds

@@ -9,10 +9,10 @@ from torch import Tensor
 from typing_extensions import assert_never
 
 from dyngs.config import ControlNodesField, DeformField, HexplaneField, MlpField, TrajectoryField
+from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
-from dyngs.deform.skeleton import Skeleton
 from dyngs.deform.trajectory import Trajectory
 from dyngs.state import Role, State, with_role
 from dyngs.tensor_checks import require_positive, require_tensor
@@ -26,7 +26,7 @@ def new_field(options: DeformField, setup: FieldSetup, generator: torch.Generato
         case MlpField():
             return Mlp(options, setup, generator)
         case ControlNodesField():
-            return Skeleton(options, setup, generator)
+            return ControlNodes(options, setup, generator)
         case TrajectoryField():
             return Trajectory(options, setup, generator)
         case _:

@@ -19,10 +19,10 @@ from dyngs.data.loader import Picture
 from dyngs.deform.field import FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
 from dyngs.deform.motion import bake_, measure_motion
-from dyngs.deform.residual import Residuals, two_group_threshold
+from dyngs.deform.random_gaussians import box_of, with_random_gaussians
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.seeds import box_of, seeded
-from dyngs.deform.window import TimeWindow
+from dyngs.deform.still_error import StillErrors, two_group_threshold
+from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.scene import Moment, Scene
 from dyngs.state import State
@@ -66,14 +66,14 @@ class TrainingViews:
         times: of the training views, in [0, 1], ascending; at least two differ.
         cameras: the training cameras.
         extent: of the scene, world units.
-        residuals: how far its pictures disagree with what is still, where N Gaussians are seen.
+        still_errors: how far its pictures disagree with what is still, where N Gaussians are seen.
         cameras_stay: in place, so that pictures show what is still exactly alike.
     """
 
     times: tuple[float, ...]
     cameras: Sequence[Cameras]
     extent: float
-    residuals: Callable[[Callable[[float], Gaussians]], Residuals]
+    still_errors: Callable[[Callable[[float], Gaussians]], StillErrors]
     cameras_stay: bool = False
 
 
@@ -146,14 +146,15 @@ class DynamicTraining:
         if step != self.schedule.fine:
             return None
         now = scene.gaussians
-        found = self.capture.residuals(lambda _: now)
+        found = self.capture.still_errors(lambda _: now)
         floor = self.options.motion_threshold
         if not bool((found.most > SURELY_MOVING * floor).float().mean() > MIN_MOVING_SHARE):
             return None
         threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(found.usual > threshold)[:, 0]
-        result = seeded(now.detach(), self.options.num_random_moving, self.capture.extent, self._generator)
-        added = torch.arange(len(now), len(now) + self.options.num_random_moving, device=rows.device)
+        num_added = self.options.num_random_moving
+        result = with_random_gaussians(now.detach(), num_added, self.capture.extent, self._generator)
+        added = torch.arange(len(now), len(now) + num_added, device=rows.device)
         moving = torch.cat([rows, added])
         center, half_size = box_of(now, self.capture.extent)
         setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
@@ -190,7 +191,7 @@ class DynamicTraining:
         moves = motion.pixels >= self.options.freeze_below_px
         if self.capture.cameras_stay:
             means = now.means[scene.moving]
-            seen = self.capture.residuals(lambda time: deformed(now, field.offsets(means, time), scene.moving))
+            seen = self.capture.still_errors(lambda time: deformed(now, field.offsets(means, time), scene.moving))
             moves &= seen.usual[scene.moving] > SURELY_STILL * self.options.motion_threshold
         still = torch.nonzero(~moves)[:, 0]
         bake_(scene.gaussians, scene.moving[still], motion.mean.select(still))

@@ -78,7 +78,7 @@ class EvalReport:
         reasons: metric name to why it is None.
         notes: anything else that a reader of the numbers should know.
         per_view: the single views.
-        stored_mb: size on disk of a run that ``dyngs export --format compact`` wrote; None of others.
+        stored_mb: size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others.
         psnr_person, ssim_person: means inside the box around the person, where the true picture is not transparent;
             only of a human model, and None where pictures have no alpha.
     """

@@ -28,7 +28,7 @@ class Pruning:
     loss: float
 
 
-def best(scores: Tensor, share: float) -> Tensor:
+def highest(scores: Tensor, share: float) -> Tensor:
     """(N,) bool: all but the lowest ``share`` of ``scores`` (N,), at least one; of equal ones the first."""
     count = min(max(1, math.ceil(len(scores) * (1 - share) - 1e-9)), len(scores))
     kept = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
@@ -45,14 +45,14 @@ def prune(scores: Tensor, share: float, loss_of: Callable[[Tensor], float], max_
         loss_of: dB that the pictures lose with only those kept that are marked (N,).
         max_loss: dB; where it is exceeded the share is looked for by bisection.
     """
-    kept = best(scores, share)
+    kept = highest(scores, share)
     loss = loss_of(kept)
     if loss <= max_loss:
         return Pruning(kept, share, loss)
     found, low, high = Pruning(torch.ones_like(kept), 0.0, 0.0), 0.0, share
     for _ in range(BACK_OFFS):
         middle = (low + high) / 2
-        kept = best(scores, middle)
+        kept = highest(scores, middle)
         loss = loss_of(kept)
         if loss <= max_loss:
             found, low = Pruning(kept, middle, loss), middle

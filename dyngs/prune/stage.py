@@ -129,7 +129,7 @@ def scores_of(found: Importance, options: PruneConfig) -> Tensor:
 
 @torch.no_grad()
 def default_scores(trainer: Trainer) -> Tensor:
-    """Return (N,) how much each Gaussian matters now: the first score of docs/compact.md."""
+    """Return (N,) how much each Gaussian matters now: the first score of docs/prune.md."""
     scene = trainer.scene.unmasked()
     return scores_of(importance(scoring_views(trainer, scene), slopes=True), PruneConfig())
 

@@ -149,7 +149,7 @@ def load_run(run_dir: Path) -> LoadedRun:
 
 
 def has_only_scene_file(run_dir: Path) -> bool:
-    """Whether the run is only there as the file that ``dyngs export --format compact`` writes."""
+    """Whether the run is only there as the file that ``dyngs export --format dyngs`` writes."""
     return (run_dir / SCENE_FILE).is_file() and not checkpoint_paths(run_dir)
 
 

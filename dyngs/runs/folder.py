@@ -16,8 +16,10 @@ from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths
 from dyngs.runs.lock import LOCK_NAME, writing
 from dyngs.runs.log import LOG_NAME
 
-SMALL_FOLDER = "small"
-"""In a run folder: the run as a file of at most ``budget.max_mb``."""
+EXPORT_FOLDER = "export"
+"""In a run folder: the run as one .dyngs file of at most ``budget.max_mb``."""
+FORMER_EXPORT_FOLDER = "small"
+"""Name of ``EXPORT_FOLDER`` in runs of earlier versions; nothing is written there."""
 _BEGUN = (RESOLVED_NAME, LOG_NAME, TIMING_NAME)
 """What a run that was stopped before its first checkpoint may have written."""
 _OLD_LEFTOVER = re.compile(r"\.step_\d+\.\d+\.safetensors|\.tmp[A-Za-z0-9]{6}")
@@ -161,7 +163,7 @@ def tidy(folder: Path, *, sole_writer: bool) -> None:
     ours = set(_BEGUN)
     remove_leftovers(folder, ours.__contains__ if sole_writer else None)
     checkpoints = folder / "checkpoints"
-    for inner in (checkpoints, folder / SMALL_FOLDER):
+    for inner in (checkpoints, folder / EXPORT_FOLDER, folder / FORMER_EXPORT_FOLDER):
         if not inner.is_symlink():
             remove_leftovers(inner, (lambda _: True) if sole_writer else None)
     if sole_writer and not checkpoints.is_symlink():
@@ -172,7 +174,8 @@ def tidy(folder: Path, *, sole_writer: bool) -> None:
 
 def _found(folder: Path) -> list[str]:
     """Names in ``folder`` that a run writes, whatever lies there under them; those of a begun run last."""
-    names = [SCENE_FILE, SMALL_FOLDER, *sorted(path.name for path in folder.glob("metrics*.json")), *_BEGUN]
+    metrics = sorted(path.name for path in folder.glob("metrics*.json"))
+    names = [SCENE_FILE, EXPORT_FOLDER, FORMER_EXPORT_FOLDER, *metrics, *_BEGUN]
     found = [name for name in names if (folder / name).exists() or (folder / name).is_symlink()]
     checkpoints = folder / "checkpoints"
     is_taken = not checkpoints.is_dir() and (checkpoints.exists() or checkpoints.is_symlink())

@@ -34,7 +34,7 @@ def require_possible(config: Config) -> None:
     if budget.max_minutes is not None and config.prune.is_wanted:
         raise DyngsError(
             "budget.max_minutes: how long the stage of prune.* takes cannot be foreseen; leave that out and run "
-            "`dyngs compact` afterwards"
+            "`dyngs prune` afterwards"
         )
 
 

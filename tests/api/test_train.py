@@ -248,7 +248,7 @@ def test_a_moving_run_goes_through_its_phases(whole_run: Path) -> None:
     moving = [record["num_moving"] / record["num_gaussians"] for record in log]
     assert moving[:7] == [0.0] * 7
     assert all(0 < share < 1 for share in moving[7:]), "a part of them must move, or the tests below show little"
-    assert log[7]["num_moving"] > 12, "not only the seeds"
+    assert log[7]["num_moving"] > 12, "not only the random Gaussians"
     assert log[-1]["num_moving"] != log[13]["num_moving"], "some must have been frozen since"
     assert len({record["num_gaussians"] for record in log}) > 3
     losses = torch.tensor([record["loss"] for record in log])
@@ -309,7 +309,7 @@ def test_where_nothing_moves_no_field_is_kept(tmp_path: Path, kind: str) -> None
 def test_where_a_still_model_explains_all_the_run_stays_static(
     moving_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int
 ) -> None:
-    """No seeds, no field, resumed or not, as if no error were large enough."""
+    """No random Gaussians, no field, resumed or not, as if no error were large enough."""
     changes = {"motion_threshold": 10.0, "time_window": 1.0}
     whole = train(busy_config(moving_capture, tmp_path / "whole", "control_nodes", **changes))
     assert {record["num_moving"] for record in _log(whole)} == {0}

@@ -17,7 +17,7 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.prune.stage import quality_of
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, has_only_scene_file, latest_checkpoint, load_run
-from dyngs.runs.folder import SMALL_FOLDER
+from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -57,7 +57,7 @@ def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_pat
     for share in (0.8, 0.4, 0.15):
         asked = share * usual.megabytes
         report = write_within(trainer, tmp_path / str(share), asked)
-        file = tmp_path / str(share) / SMALL_FOLDER / SCENE_FILE
+        file = tmp_path / str(share) / EXPORT_FOLDER / SCENE_FILE
         assert file.stat().st_size == round(1e6 * report.megabytes) <= 1e6 * asked
         assert report.coarser > 1 or report.num_kept < 500
         assert report.before == usual.before
@@ -74,7 +74,7 @@ def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_pat
 def test_what_cannot_fit_is_said(trainer: Trainer, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match=r"budget.max_mb=0.0001: what is trained does not fit"):
         write_within(trainer, tmp_path, 0.0001)
-    assert not (tmp_path / SMALL_FOLDER).exists()
+    assert not (tmp_path / EXPORT_FOLDER).exists()
 
 
 def test_a_run_writes_it_and_a_finished_one_makes_it_again(
@@ -82,15 +82,15 @@ def test_a_run_writes_it_and_a_finished_one_makes_it_again(
 ) -> None:
     folder = train(config_of(still, tmp_path / "run", BudgetConfig(max_mb=0.02)))
     assert "budget.max_mb: asked 0.02, got" in capsys.readouterr().out
-    file, end = folder / SMALL_FOLDER / SCENE_FILE, checkpoint_paths(folder)[-1].read_bytes()
+    file, end = folder / EXPORT_FOLDER / SCENE_FILE, checkpoint_paths(folder)[-1].read_bytes()
     wanted = file.read_bytes()
     assert len(wanted) <= 20_000
-    assert has_only_scene_file(folder / SMALL_FOLDER)
-    assert len(load_run(folder / SMALL_FOLDER).scene) == len(latest_checkpoint(folder).tensors["gaussians.means"])
-    shutil.rmtree(folder / SMALL_FOLDER)
+    assert has_only_scene_file(folder / EXPORT_FOLDER)
+    assert len(load_run(folder / EXPORT_FOLDER).scene) == len(latest_checkpoint(folder).tensors["gaussians.means"])
+    shutil.rmtree(folder / EXPORT_FOLDER)
     train(load_resolved(folder), resume_from=folder)
     assert file.read_bytes() == wanted
-    (folder / SMALL_FOLDER / "config.yaml").unlink()  # a kill right after the file was written
+    (folder / EXPORT_FOLDER / "config.yaml").unlink()  # a kill right after the file was written
     train(load_resolved(folder), resume_from=folder)
-    assert len(load_run(folder / SMALL_FOLDER).scene) > 0
+    assert len(load_run(folder / EXPORT_FOLDER).scene) > 0
     assert checkpoint_paths(folder)[-1].read_bytes() == end

@@ -6,16 +6,16 @@ import pytest
 import torch
 from tiny_fields import KINDS, TIMES, cloud, stirred_field, tiny_field, tiny_options, tiny_setup
 
+from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.fields import field_state, new_field, restored_field
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
-from dyngs.deform.skeleton import Skeleton
 from dyngs.deform.trajectory import Trajectory
 from dyngs.state import tensors_of
 
 
 def test_options_decide_the_kind() -> None:
-    kinds = {"hexplane": Hexplane, "mlp": Mlp, "control_nodes": Skeleton, "trajectory": Trajectory}
+    kinds = {"hexplane": Hexplane, "mlp": Mlp, "control_nodes": ControlNodes, "trajectory": Trajectory}
     for kind, expected in kinds.items():
         assert type(tiny_field(kind)) is expected
 

@@ -17,14 +17,14 @@ from torch import Tensor
 from dyngs.build import assemble, restored_scene
 from dyngs.camera import Cameras
 from dyngs.config import ControlNodesField, DynamicModel, HexplaneField, StaticModel, TrainConfig
+from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
 from dyngs.deform.hexplane import Hexplane, time_rows
 from dyngs.deform.motion import MAX_SAMPLES, measure_motion
+from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.seeds import box_of
-from dyngs.deform.skeleton import Skeleton
-from dyngs.deform.window import FRONTIER_VIEWS, TimeWindow
+from dyngs.deform.time_window import FRONTIER_VIEWS, TimeWindow
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.ops.planes import PlaneLevel, hexplane_features
@@ -120,7 +120,7 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     field = trainer.scene.field
     if isinstance(field, Hexplane):
         assert field.levels[0].time.shape[1] == 2
-    if isinstance(field, Skeleton):
+    if isinstance(field, ControlNodes):
         assert field.num_pieces == 1
 
 
@@ -129,9 +129,9 @@ def test_10000_training_times() -> None:
     assert time_rows(HexplaneField(), LONG) == MAX_KEY_TIMES
     assert time_rows(HexplaneField(time_resolution=LONG // 2), LONG) == LONG // 2
     setup = FieldSetup(torch.zeros(3), torch.ones(3), LONG, 3, 1.0)
-    skeleton = new_field(ControlNodesField(nodes=2), setup, torch.Generator())
-    assert isinstance(skeleton, Skeleton)
-    assert skeleton.num_pieces == MAX_KEY_TIMES
+    control_nodes = new_field(ControlNodesField(nodes=2), setup, torch.Generator())
+    assert isinstance(control_nodes, ControlNodes)
+    assert control_nodes.num_pieces == MAX_KEY_TIMES
     times = tuple(i / (LONG - 1) for i in range(LONG))
     window = TimeWindow.around_middle(times, 0.1, 1000, 1000, 8000)
     assert sum(window.holds(time, 1001) for time in times) == pytest.approx(LONG / 10, abs=2)
@@ -325,7 +325,7 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
 
 
 def test_a_picture_that_a_still_model_explains(capture: Path) -> None:
-    """No error stands out: nothing moves, no seeds, no field; the run goes on static."""
+    """No error stands out: nothing moves, no random Gaussians, no field; the run goes on static."""
     trainer = fine_trainer(capture, "control_nodes", motion_threshold=10.0)
     assert isinstance(trainer.scene, DynamicScene)
     assert trainer.scene.field is None
@@ -333,11 +333,11 @@ def test_a_picture_that_a_still_model_explains(capture: Path) -> None:
     assert trainer.step().loss > 0
 
 
-def test_no_seeds(capture: Path) -> None:
+def test_no_random_gaussians(capture: Path) -> None:
     """Just the Gaussians that were there move."""
     sizes, moving = [], []
-    for seeds in (12, 0):
-        trainer = assemble(busy_config(capture, capture, "trajectory", num_random_moving=seeds))
+    for added in (12, 0):
+        trainer = assemble(busy_config(capture, capture, "trajectory", num_random_moving=added))
         for _ in range(8):
             trainer.step()
         sizes.append(len(trainer.scene.gaussians))
@@ -358,7 +358,7 @@ def reference_set(capture: Path) -> Gaussians:
 
 @pytest.mark.parametrize("filtered", [False, True])
 def test_a_run_of_one_step(capture: Path, filtered: bool) -> None:
-    """It ends as motion begins: with a field that is the identity, for the seeds too, and filtered."""
+    """It ends as motion begins: with a field that is the identity, for the random Gaussians too, and filtered."""
     config = busy_config(capture, capture, "hexplane", filter_3d=filtered)
     config = config.model_copy(update={"train": TrainConfig(steps=1)})
     trainer = assemble(config)

@@ -18,9 +18,9 @@ from dyngs.config import DynamicModel, OptimConfig, TrajectoryField
 from dyngs.data.loader import Picture
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
-from dyngs.deform.residual import Residuals
+from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.seeds import box_of
+from dyngs.deform.still_error import StillErrors
 from dyngs.deform.training import DeformSchedule, DynamicTraining, TrainingViews
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.rendering import render
@@ -57,11 +57,11 @@ def leaves(gaussians: Gaussians) -> Gaussians:
     return Gaussians(**{name: x.clone().requires_grad_() for name, x in gaussians.tensors().items()})
 
 
-def alike(errors: Tensor) -> Residuals:
-    return Residuals(errors, errors)
+def alike(errors: Tensor) -> StillErrors:
+    return StillErrors(errors, errors)
 
 
-def unmeasured(gaussians_at: Callable[[float], Gaussians]) -> Residuals:
+def unmeasured(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
     return alike(torch.zeros(len(gaussians_at(0.0))))
 
 
@@ -104,7 +104,7 @@ class Run:
 def new_run(
     gaussians: Gaussians,
     times: tuple[float, ...] = TIMES,
-    residuals: Callable[[Callable[[float], Gaussians]], Residuals] = unmeasured,
+    still_errors: Callable[[Callable[[float], Gaussians]], StillErrors] = unmeasured,
     update: FilterUpdate | None = None,
     cameras_stay: bool = False,
     full: int = FULL,
@@ -113,7 +113,7 @@ def new_run(
     """Before the first step; the field is a straight line per Gaussian unless told otherwise."""
     line = TrajectoryField(polynomial=1, fourier=0, move_rotations=False, move_scales=False)
     defaults = {"deform": line, "num_random_moving": 0, "motion_sparsity": 0.0, "freeze_below_px": THRESHOLD}
-    capture = TrainingViews(times, [camera()], 1.0, residuals, cameras_stay)
+    capture = TrainingViews(times, [camera()], 1.0, still_errors, cameras_stay)
     schedule = DeformSchedule(FINE, FINE, full, FINE, (SPLIT,), Rates(STEPS))
     model = DynamicModel.model_validate(defaults | options)
     training = DynamicTraining(model, schedule, capture, update or FilterUpdate(), torch.Generator())
@@ -145,7 +145,7 @@ def speeds_of(run: Run) -> Tensor:
 
 def test_before_the_fine_phase_it_is_the_static_model() -> None:
     gaussians = flat_cloud()
-    run = new_run(gaussians, residuals=lambda _: alike(torch.arange(9.0)))
+    run = new_run(gaussians, still_errors=lambda _: alike(torch.arange(9.0)))
     for step in (1, FINE):
         assert run.grow(step - 1) is None
         drawn = run.moment(0.3, step)
@@ -177,13 +177,13 @@ ERRORS = (0.01, 0.3, 0.02, 0.35, 0.03, 0.0, 0.31, 0.02, 0.01)
 
 def test_what_a_still_model_cannot_explain_moves() -> None:
     """And only after the last step of the coarse phase."""
-    run = new_run(flat_cloud(), residuals=lambda _: alike(torch.tensor(ERRORS)))
+    run = new_run(flat_cloud(), still_errors=lambda _: alike(torch.tensor(ERRORS)))
     result = run.grow(FINE)
     assert run.scene.rows.tolist() == [1, 3, 6]
     assert run.scene.num_moving == 3
     assert result is not None
     assert result.edit is not None
-    assert result.edit.source.tolist() == list(range(9)), "without seeds the set stays"
+    assert result.edit.source.tolist() == list(range(9)), "without random Gaussians the set stays"
     field = run.scene.field
     for step in (1, FINE + 1, FULL, SPLIT):
         assert run.grow(step) is None
@@ -208,7 +208,7 @@ def test_small_errors_are_no_motion(errors: tuple[float, ...], motion_threshold:
     gaussians = flat_cloud()
     run = new_run(
         gaussians,
-        residuals=lambda _: alike(torch.tensor(errors)),
+        still_errors=lambda _: alike(torch.tensor(errors)),
         motion_threshold=motion_threshold,
         num_random_moving=5,
     )
@@ -222,10 +222,10 @@ def test_small_errors_are_no_motion(errors: tuple[float, ...], motion_threshold:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_seeds_move_too(kind: str) -> None:
+def test_random_gaussians_move_too(kind: str) -> None:
     gaussians = flat_cloud()
     run = new_run(
-        gaussians, residuals=lambda _: alike(torch.tensor(ERRORS)), num_random_moving=4, deform=tiny_options(kind)
+        gaussians, still_errors=lambda _: alike(torch.tensor(ERRORS)), num_random_moving=4, deform=tiny_options(kind)
     )
     result = run.grow(FINE)
     assert result is not None
@@ -242,10 +242,10 @@ def test_seeds_move_too(kind: str) -> None:
     assert torch.equal(torch.nonzero(moved)[:, 0], run.scene.rows)
 
 
-def test_the_filter_of_a_still_model_counts_the_seeds() -> None:
+def test_the_filter_of_a_still_model_counts_the_random_gaussians() -> None:
     """A checkpoint of that very step has as many values as Gaussians."""
     update, errors = FilterUpdate([camera()]), alike(torch.tensor(ERRORS))
-    run = new_run(flat_cloud(), residuals=lambda _: errors, update=update, num_random_moving=4)
+    run = new_run(flat_cloud(), still_errors=lambda _: errors, update=update, num_random_moving=4)
     run.moment(0.3, FINE)
     assert len(run.model_state["filter_std"]) == 9
     run.grow(FINE)
@@ -356,7 +356,7 @@ def test_where_cameras_stay_nothing_moves_that_pictures_show_still(in_place: boo
     still, moving = 0.2 * DynamicModel().motion_threshold, 0.3 * DynamicModel().motion_threshold
     errors = alike(torch.tensor([still, moving, moving, moving]))
     gaussians = flat_cloud(4)
-    run = begun(gaussians, residuals=lambda _: errors, cameras_stay=in_place)
+    run = begun(gaussians, still_errors=lambda _: errors, cameras_stay=in_place)
     move(run, torch.tensor([0.1, 0.0, 0.1, 0.1]))
     run.after_step(SPLIT)
     assert run.scene.rows.tolist() == kept

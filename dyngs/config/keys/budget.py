@@ -12,7 +12,7 @@ class BudgetConfig(Section):
 
     max_gaussians: int | None = Field(default=None, ge=1, description="most Gaussians at the end of the run")
     max_mb: float | None = Field(
-        default=None, gt=0, description="largest size of `small/scene.dyngs`, 1e6 bytes; the file is then written"
+        default=None, gt=0, description="largest size of `export/scene.dyngs`, 1e6 bytes; the file is then written"
     )
     max_minutes: float | None = Field(
         default=None,

@@ -10,11 +10,11 @@ from dyngs.config.keys.section import Fraction, Section
 
 
 class PruneConfig(Section):
-    """A last stage with fewer Gaussians, after ``train.steps`` (docs/compact.md). Off where nothing is asked for."""
+    """A last stage with fewer Gaussians, after ``train.steps`` (docs/prune.md). Off where nothing is asked for."""
 
     share: float = Field(default=0.0, ge=0, lt=1, description="share of the Gaussians to remove; 0: none")
     score: Literal["variation", "sensitivity", "contribution", "temporal"] = Field(
-        default="sensitivity", description="importance of a Gaussian (docs/compact.md); the lowest are removed"
+        default="sensitivity", description="importance of a Gaussian (docs/prune.md); the lowest are removed"
     )
     max_loss: float = Field(
         default=10.0,

@@ -1,4 +1,4 @@
-"""Faint Gaussians all over a scene, to catch what a still model has lost."""
+"""Faint Gaussians at random points of a scene, for moving things that a still model has lost."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from torch import Tensor
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 
 BOX_MARGIN = 1.1
-SEED_SIZE = 0.3
-"""Standard deviation of a seed, in distances between them."""
-SEED_LOGIT = -2.2
+SCALE = 0.3
+"""Standard deviation of each, in distances between them."""
+LOGIT = -2.2
 """Opacity 0.1, as all Gaussians begin."""
 SOLID = 0.05
 """Opacity from which a Gaussian counts for the box in which things move."""
 
 
-def seeded(gaussians: Gaussians, count: int, extent: float, generator: torch.Generator) -> EditResult:
-    """The edit that adds ``count`` faint grey Gaussians, spread evenly in the box of ``gaussians``."""
+def with_random_gaussians(gaussians: Gaussians, count: int, extent: float, generator: torch.Generator) -> EditResult:
+    """Return the edit that adds ``count`` faint grey Gaussians at random points of the box of ``gaussians``."""
     center, half_size = box_of(gaussians, extent)
     places = center + half_size * (2 * torch.rand((count, 3), generator=generator, device="cpu") - 1)
     spacing = float((2 * half_size).prod() / max(count, 1)) ** (1 / 3)
@@ -36,10 +36,13 @@ def seeded(gaussians: Gaussians, count: int, extent: float, generator: torch.Gen
             [gaussians.quats, torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=gaussians.means.device).expand(count, 4)]
         ),
         "log_scales": torch.cat(
-            [gaussians.log_scales, torch.full((count, 3), math.log(SEED_SIZE * spacing), device=gaussians.means.device)]
+            [
+                gaussians.log_scales,
+                torch.full((count, 3), math.log(SCALE * spacing), device=gaussians.means.device),
+            ]
         ),
         "logit_opacities": torch.cat(
-            [gaussians.logit_opacities, torch.full((count,), SEED_LOGIT, device=gaussians.means.device)]
+            [gaussians.logit_opacities, torch.full((count,), LOGIT, device=gaussians.means.device)]
         ),
         "sh": torch.cat([gaussians.sh, torch.zeros(count, *gaussians.sh.shape[1:], device=gaussians.means.device)]),
     }

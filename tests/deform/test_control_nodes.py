@@ -16,43 +16,43 @@ from tiny_fields import HEADS, cloud, stirred_field, tiny_setup
 from torch import Tensor
 
 from dyngs.config import ControlNodesField
+from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import Offsets
-from dyngs.deform.skeleton import Skeleton
 from dyngs.gaussians import TopologyEdit
 from dyngs.state import tensors_of
 
 MEANS_ONLY = dict.fromkeys(HEADS, False)
 
 
-def skeleton(nodes: int = 5, pieces: int = 4, num_times: int = 10, **options: object) -> Skeleton:
+def control_nodes(nodes: int = 5, pieces: int = 4, num_times: int = 10, **options: object) -> ControlNodes:
     """An untrained one."""
-    return Skeleton(
+    return ControlNodes(
         ControlNodesField(nodes=nodes, pieces=pieces, **options),  # type: ignore[arg-type]
         tiny_setup(num_times=num_times),
         torch.Generator(),
     )
 
 
-def placed(means: Tensor, **options: object) -> Skeleton:
+def placed(means: Tensor, **options: object) -> ControlNodes:
     """One whose nodes are placed."""
-    field = skeleton(**options)  # type: ignore[arg-type]
+    field = control_nodes(**options)  # type: ignore[arg-type]
     field.offsets(means, 0.0)
     return field
 
 
-def changed(field: Skeleton, source: Tensor, is_new: Tensor) -> Skeleton:
+def changed(field: ControlNodes, source: Tensor, is_new: Tensor) -> ControlNodes:
     """The field after an edit in training."""
     field = field.edited(TopologyEdit(source, is_new))
     field.regroup()
     return field
 
 
-def points_of(field: Skeleton) -> Tensor:
+def points_of(field: ControlNodes) -> Tensor:
     """(P,) control points of the first node's motion along x."""
     return field.parameters["means"].detach()[0, :, 0]
 
 
-def hold(field: Skeleton, name: str, values: Tensor) -> None:
+def hold(field: ControlNodes, name: str, values: Tensor) -> None:
     """Let all nodes keep ``values`` (S, size) of one head at all times: all control points are equal."""
     field.parameters[name].data[:] = values[:, None]
 
@@ -64,8 +64,8 @@ def outputs(offsets: Offsets) -> Tensor:
 
 @pytest.mark.parametrize(("num_times", "pieces"), [(2, 1), (5, 2), (10, 3), (100, 30), (10_000, 256)])
 def test_pieces_follow_the_number_of_times(num_times: int, pieces: int) -> None:
-    assert skeleton(pieces=0, num_times=num_times).num_pieces == pieces
-    assert skeleton(pieces=7, num_times=num_times).num_pieces == 7
+    assert control_nodes(pieces=0, num_times=num_times).num_pieces == pieces
+    assert control_nodes(pieces=7, num_times=num_times).num_pieces == 7
 
 
 @settings(max_examples=40, deadline=None)
@@ -177,7 +177,7 @@ def test_nodes_that_nothing_follows_are_dropped_with_their_moments() -> None:
 def test_when_nothing_is_left_there_is_nothing_to_move() -> None:
     """Also after nodes were placed."""
     nobody = torch.zeros(0, 3)
-    field = skeleton()
+    field = control_nodes()
     assert len(field.offsets(nobody, 0.5).means) == 0
     field = placed(cloud().means)
     field = changed(field, torch.zeros(0).long(), torch.zeros(0).bool())
@@ -270,7 +270,7 @@ def test_known_penalties() -> None:
 def test_no_penalties_where_none_are_wanted_or_possible() -> None:
     assert placed(cloud().means, rigidity=0.0, smoothness=0.0).penalties(0.3) == {}
     assert placed(cloud().means, nodes=1).penalties(0.3) == {}
-    assert skeleton().penalties(0.3) == {}
+    assert control_nodes().penalties(0.3) == {}
 
 
 def test_the_place_of_a_gaussian_matters() -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Picture
-from dyngs.deform.residual import MIN_SAME, cameras_in_place, residuals_of, two_group_threshold, views_to_compare
+from dyngs.deform.still_error import MIN_SAME, cameras_in_place, still_errors, two_group_threshold, views_to_compare
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, render
 
@@ -64,7 +64,7 @@ def left_half() -> Tensor:
 
 def scores_of(gaussians: Gaussians, pictures: list[Picture], background: Tensor) -> Tensor:
     """(N,) of cameras that do not stay in place."""
-    found = residuals_of(lambda _: gaussians, pictures, OPTIONS, background)
+    found = still_errors(lambda _: gaussians, pictures, OPTIONS, background)
     assert torch.equal(found.most, found.usual)
     return found.most
 
@@ -77,7 +77,7 @@ def test_colours_of_a_shader_are_expected() -> None:
         return torch.tensor([1.0, 0.0, 0.0]).expand(len(cameras), len(gaussians), 3)
 
     shown = picture(render(gaussians, camera(), OPTIONS, background=BLACK, shader=red).rgb[0])
-    assert (residuals_of(lambda _: gaussians, [shown], OPTIONS, BLACK, lambda _: red).most < 1e-6).all()
+    assert (still_errors(lambda _: gaussians, [shown], OPTIONS, BLACK, lambda _: red).most < 1e-6).all()
     assert (scores_of(gaussians, [shown], BLACK) > 0.2).all(), "half of each channel, times the mean alpha"
 
 
@@ -201,20 +201,20 @@ def in_place(*errors: float, view: int = 0) -> list[Picture]:
 def test_what_a_still_model_has_not_learned_is_no_motion() -> None:
     """Wrong by far, but in all pictures alike; with too few pictures to know, it may be motion."""
     ball = balls(sideways(0.0))
-    found = residuals_of(lambda _: ball, in_place(*[0.4] * MIN_SAME), OPTIONS, BLACK)
+    found = still_errors(lambda _: ball, in_place(*[0.4] * MIN_SAME), OPTIONS, BLACK)
     assert (float(found.most), float(found.usual)) == pytest.approx((0.0, 0.0), abs=1e-6)
-    few = residuals_of(lambda _: ball, in_place(*[0.4] * (MIN_SAME - 1)), OPTIONS, BLACK)
+    few = still_errors(lambda _: ball, in_place(*[0.4] * (MIN_SAME - 1)), OPTIONS, BLACK)
     assert float(few.most) == pytest.approx(0.4, rel=1e-3)
 
 
 def test_what_is_hidden_at_times_does_not_move() -> None:
     """Something passes in front in two of ten pictures: seen by ``most``, not by ``usual``."""
-    found = residuals_of(lambda _: balls(sideways(0.0)), in_place(*[0.0] * 8, 0.3, 0.3), OPTIONS, BLACK)
+    found = still_errors(lambda _: balls(sideways(0.0)), in_place(*[0.0] * 8, 0.3, 0.3), OPTIONS, BLACK)
     assert (float(found.most), float(found.usual)) == pytest.approx((0.3, 0.0), rel=1e-3, abs=1e-6)
 
 
 def test_what_changes_again_and_again_moves() -> None:
-    found = residuals_of(lambda _: balls(sideways(0.0)), in_place(*[0.0] * 6, 0.1, 0.2, 0.3, 0.4), OPTIONS, BLACK)
+    found = still_errors(lambda _: balls(sideways(0.0)), in_place(*[0.0] * 6, 0.1, 0.2, 0.3, 0.4), OPTIONS, BLACK)
     assert float(found.most) == pytest.approx(0.4, rel=1e-3)
     assert float(found.usual) == pytest.approx(0.1, rel=1e-3)
 
@@ -223,13 +223,13 @@ def test_pictures_in_which_a_gaussian_does_not_show_do_not_count() -> None:
     """Seen by one of two cameras, which sees it change in every second picture."""
     ball = balls(sideways(0.0))
     beside = [picture(torch.zeros(SIZE, SIZE, 3), torch.zeros(SIZE, SIZE), view=1)] * 10
-    found = residuals_of(lambda _: ball, in_place(*[0.0, 0.3] * 3) + beside, OPTIONS, BLACK)
+    found = still_errors(lambda _: ball, in_place(*[0.0, 0.3] * 3) + beside, OPTIONS, BLACK)
     assert float(found.usual) == pytest.approx(0.3, rel=1e-3)
 
 
 def test_a_camera_that_stays_is_preferred_to_one_that_does_not() -> None:
     pictures = in_place(0.0, 0.0, 0.0) + in_place(0.5, view=1)
-    found = residuals_of(lambda _: balls(sideways(0.0)), pictures, OPTIONS, BLACK)
+    found = still_errors(lambda _: balls(sideways(0.0)), pictures, OPTIONS, BLACK)
     assert float(found.most) == pytest.approx(0.0, abs=1e-6)
 
 

@@ -26,7 +26,7 @@ SHOWS = 1e-3
 
 
 @dataclass(frozen=True)
-class Residuals:
+class StillErrors:
     """How far pictures disagree with what is still.
 
     Attributes:
@@ -38,13 +38,13 @@ class Residuals:
     usual: Tensor
 
 
-def residuals_of(
+def still_errors(
     gaussians_at: Callable[[float], Gaussians],
     pictures: Sequence[Picture],
     options: RenderOptions,
     background: Tensor,
     shader_at: Callable[[float], Shader | None] = lambda _: None,
-) -> Residuals:
+) -> StillErrors:
     """How far the pictures disagree with what is still, where each Gaussian is seen.
 
     e_vi = |sum_p w_vip (expected - truth)| / sum_p w_vip with w = alpha T for each picture v, a mean over channels.
@@ -76,11 +76,11 @@ def residuals_of(
     errors, weights = torch.stack([x for x, _ in found]), torch.stack([x for _, x in found])
     if not expected:
         mean = errors.sum(0) / weights.sum(0).clamp_min(1e-6)
-        return Residuals(mean, mean)
+        return StillErrors(mean, mean)
     shows = weights > SHOWS
     ordered = torch.where(shows, errors / weights.clamp_min(SHOWS), 0.0).sort(dim=0, descending=True).values
     usual = ((1 - USUAL) * shows.sum(0)).long()
-    return Residuals(ordered[0], ordered.gather(0, usual[None])[0])
+    return StillErrors(ordered[0], ordered.gather(0, usual[None])[0])
 
 
 def _errors_in(

@@ -37,7 +37,7 @@ PIECES_PER_TIME = 0.3
 """Pieces of the splines per training time. With more, poses follow single pictures; with fewer, they lag behind."""
 
 
-class Skeleton(NetworkField):
+class ControlNodes(NetworkField):
     """Offsets of nodes, uniform cubic B-splines of time, blended into those of the Gaussians that follow them.
 
     Nodes are placed when first needed. Whenever the set of Gaussians has changed, nodes that nothing follows are
@@ -55,7 +55,7 @@ class Skeleton(NetworkField):
         } | LR
         self.parameters = Parameters(tensors, {name: rates[name] for name in sizes}, LR_DECAY)
 
-    def restored(self, tensors: Mapping[str, Tensor]) -> Skeleton:
+    def restored(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
         buffers = part_of(tensors, "buffers")
         count, moving = len(buffers["positions"]), self.setup.num_moving
         require_tensor("positions", buffers["positions"], (count, 3))
@@ -80,7 +80,7 @@ class Skeleton(NetworkField):
     def num_values(self) -> int:
         return self.parameters.num_values + sum(x.numel() for x in self.buffers.values())
 
-    def edited(self, edit: TopologyEdit) -> Skeleton:
+    def edited(self, edit: TopologyEdit) -> ControlNodes:
         field = copy.copy(self)
         field.buffers = dict(self.buffers)
         if "followed" in field.buffers:
@@ -91,7 +91,7 @@ class Skeleton(NetworkField):
         """Place nodes anew, and find out which of them Gaussians follow, when that is next needed."""
         self.buffers.pop("followed", None)
 
-    def to(self, device: torch.device | str) -> Skeleton:
+    def to(self, device: torch.device | str) -> ControlNodes:
         field = super().to(device)
         field.buffers = moved_to(self.buffers, device)
         return field

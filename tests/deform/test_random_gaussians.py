@@ -1,4 +1,4 @@
-"""Seeds: where they lie, and that nothing else changes."""
+"""Random Gaussians: where they lie, and that nothing else changes."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from hypothesis import strategies as st
 from tiny_fields import cloud
 
 from dyngs.config import OptimConfig
-from dyngs.deform.seeds import box_of, seeded
+from dyngs.deform.random_gaussians import box_of, with_random_gaussians
 from dyngs.state import tensors_of
 from dyngs.static.optimizer import GaussianOptimizer
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 30), st.integers(0, 40), st.integers(0, 3), st.integers(0, 2**32))
-def test_seeds_are_faint_and_lie_in_the_box(count: int, seeds: int, degree: int, seed: int) -> None:
+def test_they_are_faint_and_lie_in_the_box(count: int, num_added: int, degree: int, seed: int) -> None:
     """So many, after all others, which stay as they are; new rows without moments."""
     gaussians = cloud(count).replace(sh=torch.randn(count, (degree + 1) ** 2, 3))
-    result = seeded(gaussians, seeds, 2.0, torch.Generator().manual_seed(seed))
+    result = with_random_gaussians(gaussians, num_added, 2.0, torch.Generator().manual_seed(seed))
     assert result.edit is not None
-    assert torch.equal(result.edit.is_new, torch.arange(count + seeds) >= count)
+    assert torch.equal(result.edit.is_new, torch.arange(count + num_added) >= count)
     assert torch.equal(result.edit.source[:count], torch.arange(count))
     optimizer = GaussianOptimizer(gaussians, OptimConfig())
     for x in optimizer.parameters.tensors().values():
         x.grad = torch.ones_like(x)
     optimizer.step(1, 0.1, dense=True)
     before, moments = optimizer.parameters.detach(), tensors_of(optimizer.state())
-    optimizer.apply(seeded(before, seeds, 2.0, torch.Generator().manual_seed(seed)))
+    optimizer.apply(with_random_gaussians(before, num_added, 2.0, torch.Generator().manual_seed(seed)))
     after = optimizer.parameters.detach()
-    added = after.select(torch.arange(count, count + seeds))
-    assert len(after) == count + seeds
+    added = after.select(torch.arange(count, count + num_added))
+    assert len(after) == count + num_added
     for name, x in before.tensors().items():
         assert torch.equal(after.tensors()[name][:count], x), name
         for moment in ("exp_avg", "exp_avg_sq"):
@@ -44,10 +44,13 @@ def test_seeds_are_faint_and_lie_in_the_box(count: int, seeds: int, degree: int,
     assert (added.log_scales.exp() < half_size.max()).all()
 
 
-def test_seeds_fill_the_box() -> None:
+def test_they_fill_the_box() -> None:
     """Each octant has its share; another draw gives other places, the same generator the same."""
     gaussians = cloud(200)
-    draws = [seeded(gaussians, 4000, 1.0, torch.Generator().manual_seed(i)).changes["means"][200:] for i in (0, 0, 1)]
+    draws = [
+        with_random_gaussians(gaussians, 4000, 1.0, torch.Generator().manual_seed(i)).changes["means"][200:]
+        for i in (0, 0, 1)
+    ]
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
     octants = (draws[0] > box_of(gaussians, 1.0)[0]).float() @ torch.tensor([1.0, 2, 4])
