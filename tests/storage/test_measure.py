@@ -1,0 +1,62 @@
+"""How exactly a scene is stored is measured on pictures of its capture."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from moving_scene import write_moving_run
+
+from dyngs.config import SceneModel
+from dyngs.runs.checkpoint import latest_checkpoint, load_run
+from dyngs.storage.measure import COMPARED, StoragePlan, storage_plan
+from dyngs.storage.precision import assumed_precision
+
+
+def plan_of(run_dir: Path, max_change: float | None = None) -> StoragePlan:
+    run = load_run(run_dir)
+    assert isinstance(run.config.model, SceneModel)
+    return storage_plan(run.config, latest_checkpoint(run_dir), run.scene, max_change)
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_what_is_stored_changes_pictures_by_what_is_allowed(tmp_path: Path, moves: bool) -> None:
+    run_dir = write_moving_run(tmp_path, moves=moves)
+    fine, coarse = plan_of(run_dir, 0.1), plan_of(run_dir, 3.0)
+    for plan, most in ((fine, 0.1), (coarse, 3.0)):
+        assert plan.precision.allowed == pytest.approx(most)
+        assert plan.precision.change is not None
+        assert plan.precision.change <= most
+        assert plan.coarseness is not None
+        assert plan.coarseness.dtype == torch.uint8
+        assert plan.coarseness.shape == (5,)
+    steps = [(step, coarse.precision.steps[name]) for name, step in fine.precision.steps.items()]
+    assert all(a <= b for a, b in steps)
+    assert any(a < b for a, b in steps)
+
+
+def test_the_pictures_that_are_compared_are_those_of_the_run(tmp_path: Path) -> None:
+    run_dir = write_moving_run(tmp_path)
+    scene, plan = load_run(run_dir).scene, plan_of(run_dir, 0.5)
+    assert plan.pictures is not None
+    drawn = plan.pictures(scene)
+    assert len(drawn) == min(COMPARED, 5)
+    assert all(x.shape == (16, 16, 3) and not x.requires_grad for x in drawn)
+    assert all(torch.equal(a, b) for a, b in zip(drawn, plan.pictures(scene), strict=True))
+    without = plan.pictures(scene.select(torch.tensor([0, 2, 4])))
+    assert any(not torch.equal(a, b) for a, b in zip(drawn, without, strict=True))
+
+
+def test_what_is_not_said_follows_the_errors_of_the_pictures(tmp_path: Path) -> None:
+    allowed = plan_of(write_moving_run(tmp_path)).precision.allowed
+    assert allowed is not None
+    assert 0.1 < allowed < 255 * (10 ** (0.025 / 10) - 1) ** 0.5
+
+
+def test_without_a_capture_steps_are_assumed(tmp_path: Path) -> None:
+    run_dir = write_moving_run(tmp_path)
+    shutil.rmtree(tmp_path / "capture")
+    plan = plan_of(run_dir)
+    assert plan == StoragePlan(assumed_precision(load_run(run_dir).scene.gaussians))
