@@ -277,7 +277,7 @@ def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> Non
     assert network is not None
     camera = trainer.pictures[0].cameras
     gaussians, shader = trainer.scene.gaussians.detach(), network.shader(None, None)
-    drawn = scene.render(camera, options=RenderOptions()).rgb
+    drawn = scene.render(camera, options=RenderOptions(), background=torch.zeros(3)).rgb
     assert torch.equal(drawn, render(gaussians, camera, shader=shader).rgb.detach())
     assert not torch.equal(drawn, render(gaussians, camera).rgb)
     assert scene.colour is not None
