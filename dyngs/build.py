@@ -1,4 +1,4 @@
-"""From a configuration to a trainer that is ready for its first step, and from a checkpoint to a scene.
+"""Trainers from a configuration, ready for the first step, and scenes from a checkpoint.
 
 Here, and nowhere else, it is decided what each kind of model, colour and strategy is made of.
 """
@@ -87,7 +87,7 @@ FIRST_VIEWS = 50
 
 @dataclass(frozen=True)
 class Built:
-    """What a configuration trains.
+    """The trainer of a configuration.
 
     Attributes:
         trainer: for the loop.
@@ -276,7 +276,7 @@ def human_start(
 def _training_views(
     config: Config, model: DynamicModel, capture: Capture, pictures: PictureLoader, colours: ColourTraining
 ) -> TrainingViews:
-    """Return what the training of a dynamic scene needs to know of its capture."""
+    """Return the properties of the capture that training a dynamic scene needs."""
     views = capture.splits["train"]
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     divisor = picture_divisor(config.train, deform_schedule(model, rates_of(config)).fine)

@@ -38,14 +38,14 @@ class MetricValue:
 
 
 def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB over all pixels and channels, at most ``MAX_PSNR``."""
+    """Return the peak signal-to-noise ratio in dB over all pixels and channels, at most ``MAX_PSNR``."""
     squared = (_clamped(rendered).double() - _clamped(truth).double()).square().mean(dim=-1)
     mse = _weighted_mean(squared, mask)
     return math.nan if math.isnan(mse) else -10 * math.log10(max(mse, 10 ** (-MAX_PSNR / 10)))
 
 
 def ssim(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-    """Mean structural similarity in [-1, 1] with the convention of 3DGS.
+    """Return the mean structural similarity in [-1, 1] with the convention of 3DGS.
 
     Gaussian window 11x11 with sigma 1.5, zero padding, data range 1, C1 = 0.01^2, C2 = 0.03^2, mean over pixels and
     channels. With a mask, ignored pixels are replaced by the truth and the map is weighted (Wang et al. 2004).
@@ -54,7 +54,7 @@ def ssim(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
 
 
 def ssim_map(rendered: Tensor, truth: Tensor) -> Tensor:
-    """(H, W, 3) structural similarity per pixel and channel; see ``ssim``.
+    """Return (H, W, 3) structural similarity per pixel and channel; see ``ssim``.
 
     By way of the difference d and the sum s, whose variances do not cancel where the pictures agree or are white: with
     P = mean_a^2 + mean_b^2 + C1 and Q = var_a + var_b + C2 it is (1 - mean_d^2 / P) (1 - var_d / Q).
@@ -82,7 +82,7 @@ def ssim_map(rendered: Tensor, truth: Tensor) -> Tensor:
 
 
 def flip(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> MetricValue:
-    """Mean LDR-FLIP error in [0, 1], 0 = equal, at 67.02 pixels per degree (Andersson et al. 2020).
+    """Return the mean LDR-FLIP error in [0, 1], 0 = equal, at 67.02 pixels per degree (Andersson et al. 2020).
 
     Needs the package ``flip-evaluator`` (the extra ``metrics``).
     """
@@ -98,7 +98,7 @@ def flip(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> MetricV
 
 
 def masked(rendered: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
-    """(H, W, 3) the rendered picture with ignored pixels replaced by the truth."""
+    """Return (H, W, 3) the rendered picture with ignored pixels replaced by the truth."""
     return rendered if mask is None else torch.lerp(truth, rendered, mask[..., None].to(rendered.dtype))
 
 
@@ -117,7 +117,7 @@ class Lpips:
     distance: Callable[[Tensor, Tensor], Tensor] | None = None
 
     def __call__(self, rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> MetricValue:
-        """Perceptual distance, 0 = equal (Zhang et al. 2018)."""
+        """Return the perceptual distance, 0 = equal (Zhang et al. 2018)."""
         if self.distance is None:
             return MetricValue(None, self.reason)
         a, b = (_clamped(x).float().permute(2, 0, 1)[None] * 2 - 1 for x in (masked(rendered, truth, mask), truth))
@@ -129,7 +129,7 @@ class Lpips:
 
 
 def load_lpips(net: LpipsNet = "alex") -> Lpips:
-    """LPIPS from ``torchmetrics`` or ``lpips``, only if the backbone's weights already lie in torch's cache.
+    """Return LPIPS from ``torchmetrics`` or ``lpips``, only if the backbone's weights are already in torch's cache.
 
     Both packages would download missing weights, hence the check before either is constructed.
     """
@@ -146,7 +146,7 @@ def load_lpips(net: LpipsNet = "alex") -> Lpips:
 
 
 def _backbone_file(net: LpipsNet) -> Path:
-    """Where torch looks for the ImageNet weights of ``net`` before it downloads them."""
+    """Return the path where torch looks for the ImageNet weights of ``net`` before it downloads them."""
     from torchvision import models  # pyright: ignore[reportMissingImports]
 
     weights = {
@@ -168,7 +168,7 @@ def _lpips_distance(package: str, net: LpipsNet) -> Callable[[Tensor, Tensor], T
 
 
 def _weighted_mean(values: Tensor, mask: Tensor | None) -> float:
-    """Mean of ``values`` (H, W), weighted with ``mask`` (H, W), in float64; NaN where all weights are zero."""
+    """Return the mean of ``values`` (H, W) weighted with ``mask`` (H, W), in float64; NaN where all weights are 0."""
     values = values.double()
     return (values.mean() if mask is None else (values * mask).sum() / mask.double().sum()).item()
 

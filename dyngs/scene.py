@@ -1,4 +1,4 @@
-"""What can be trained and drawn: N Gaussians, how they move, and how they are coloured.
+"""Scenes that can be trained and drawn: N Gaussians with their motion and colours.
 
 There is one class per kind of model: ``static.scene.StaticScene``, ``deform.scene.DynamicScene`` and
 ``human.avatar.scene.HumanScene``. In training, loaded from a file or watched half-way it is the same class. How a kind
@@ -76,7 +76,7 @@ class Scene(ABC):
     @property
     @abstractmethod
     def is_still(self) -> bool:
-        """Whether ``at`` returns the same at every time."""
+        """Return whether ``at`` returns the same at every time."""
 
     @property
     @abstractmethod
@@ -100,12 +100,12 @@ class Scene(ABC):
 
     @property
     def num_motion_values(self) -> int:
-        """Numbers stored for motion, beside the Gaussians and their colours."""
+        """Number of values stored for motion, beside the Gaussians and their colours."""
         return 0
 
     @property
     def num_colour_values(self) -> int:
-        """Numbers stored for colours: base, network, and harmonics but for Gaussians that have none but zeros."""
+        """Number of values stored for colours: base, network, and the rest of Gaussians where it is not all zero."""
         sh = self.gaussians.sh
         with_rest = int((sh[:, 1:] != 0).flatten(1).any(1).sum())
         network = 0 if self.colour is None else self.colour.num_values
@@ -113,7 +113,7 @@ class Scene(ABC):
 
     @property
     def num_mask_bytes(self) -> int:
-        """Bytes of the masks; 0 without any."""
+        """Number of bytes of the masks; 0 without any."""
         return 0 if self.masks is None else self.masks.bits.numel()
 
     @abstractmethod
@@ -130,7 +130,7 @@ class Scene(ABC):
             return self.moment(time).gaussians
 
     def shader(self, moment: Moment) -> Shader | None:
-        """Return the colours of the Gaussians of ``moment``; None: their harmonics."""
+        """Return the shader of the Gaussians of ``moment``; None where harmonics give the colours."""
         return None if self.colour is None else self.colour.shader(moment.time, moment.frame)
 
     def render(
@@ -224,11 +224,11 @@ def render_options(model: SceneModel) -> RenderOptions:
 
 
 class SceneTraining(Protocol[S]):
-    """How a kind of scene is trained: on which pictures, what it learns beside its Gaussians, what is frozen when."""
+    """Training of a kind of scene: its pictures, what it learns beside the Gaussians, and when motion is frozen."""
 
     @property
     def moves_by(self) -> tuple[str, str]:
-        """What moves the Gaussians, in words, and the configuration section of its learning rates, for messages."""
+        """Name of what moves the Gaussians and the configuration section of its learning rates, for messages."""
         ...
 
     def trains_on(self, time: float | None, step: int) -> bool:

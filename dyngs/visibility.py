@@ -1,4 +1,4 @@
-"""Which Gaussians can be seen around a moment: bits at key times (the temporal filter of 4DGS-1K, Yuan et al. 2025).
+"""Visibility of Gaussians over time: bits at key times (the temporal filter of 4DGS-1K, Yuan et al. 2025).
 
 Local letters: K key times, A Gaussians active at a time.
 """
@@ -19,7 +19,7 @@ BITS = 8
 
 @dataclass(frozen=True)
 class VisibilityMasks:
-    """For each of N Gaussians, at which of K >= 2 key times it is seen.
+    """Visibility of N Gaussians at K >= 2 key times.
 
     Attributes:
         times: distinct, ascending, in [0, 1].
@@ -33,26 +33,26 @@ class VisibilityMasks:
 
     @staticmethod
     def pack(times: tuple[float, ...], seen: Tensor) -> VisibilityMasks:
-        """The masks of ``seen`` (K, N) bool."""
+        """Return the masks of ``seen`` (K, N) bool."""
         padded = torch.nn.functional.pad(seen, (0, -seen.shape[1] % BITS)).unflatten(1, (-1, BITS))
         return VisibilityMasks(times, (padded * _places()).sum(2).to(torch.uint8), seen.shape[1])
 
     @property
     def seen(self) -> Tensor:
-        """(K, N) bool."""
+        """Return (K, N) bool, whether each Gaussian is seen at each key time."""
         return _unpacked(self.bits, self.count)
 
     def interval(self, time: float) -> int:
-        """k such that ``time`` lies between key times k and k + 1, the nearest two where it lies outside all."""
+        """Return k with ``time`` between key times k and k + 1, the nearest two where it lies outside all."""
         return min(max(bisect_right(self.times, time) - 1, 0), len(self.times) - 2)
 
     def active(self, interval: int) -> Tensor:
-        """(A,) ascending indices of the Gaussians seen at one end of an interval at least."""
+        """Return (A,) ascending indices of the Gaussians seen at one end of an interval at least."""
         either = self.bits[interval] | self.bits[interval + 1]
         return torch.nonzero(_unpacked(either[None], self.count)[0])[:, 0]
 
     def select(self, index: Tensor) -> VisibilityMasks:
-        """The masks of the Gaussians at ``index`` (long)."""
+        """Return the masks of the Gaussians at ``index`` (long)."""
         return VisibilityMasks.pack(self.times, self.seen[:, index])
 
     def state(self) -> State:
@@ -63,7 +63,7 @@ class VisibilityMasks:
 
     @staticmethod
     def restored(state: Mapping[str, Tensor], count: int | None = None) -> VisibilityMasks | None:
-        """What ``state()`` returned as masks; None of an empty one.
+        """Return the masks of what ``state()`` returned; None of an empty state.
 
         Args:
             state: by name.
@@ -85,7 +85,7 @@ class VisibilityMasks:
 
 
 def matched(rows: Tensor, active: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Places in ``rows`` of what is in both, and their places in ``active``; both ascending indices below ``count``."""
+    """Return the positions of common indices in ``rows`` and in ``active``, both ascending indices below ``count``."""
     place = torch.full((count,), -1, device=rows.device)
     place[rows] = torch.arange(len(rows), device=rows.device)
     found = place[active]
@@ -98,6 +98,6 @@ def _places() -> Tensor:
 
 
 def _unpacked(bits: Tensor, count: int) -> Tensor:
-    """(K, N) bool of packed bits (K, ceil(N / 8))."""
+    """Return (K, N) bool of packed bits (K, ceil(N / 8))."""
     places = torch.arange(BITS, dtype=torch.uint8, device=bits.device)
     return ((bits[..., None] >> places) & 1).bool().flatten(1)[:, :count]

@@ -1,4 +1,4 @@
-"""From a trained network and a few pictures of a person to a run folder like that of a trained avatar."""
+"""Prediction of a person's run folder, like that of a trained avatar, from a trained network and a few pictures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FAINT = 0.02
 
 @dataclass(frozen=True)
 class Prediction:
-    """What ``predict_person`` made.
+    """Result of ``predict_person``.
 
     Attributes:
         run_dir: the run folder.
@@ -46,7 +46,7 @@ class Prediction:
 
 
 def predict_person(network_run: Path, capture: Path, out: Path, views: int | tuple[str, ...]) -> Prediction:
-    """The person of ``capture`` as a run folder ``out``, which all commands take; ``dyngs train --resume`` refines it.
+    """Write the person of ``capture`` as a run folder ``out`` for all commands; ``dyngs train --resume`` refines it.
 
     Args:
         network_run: run folder of ``model.kind: human_predictor``.
@@ -128,7 +128,7 @@ def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: Human
 
 
 def without_faint(avatar: PredictedAvatar) -> PredictedAvatar:
-    """Without Gaussians that are hardly there."""
+    """Return the avatar without nearly transparent Gaussians."""
     kept = avatar.gaussians.opacities >= _FAINT
     anchors = avatar.subject.anchors.select(kept)
     return PredictedAvatar(avatar.gaussians.select(kept), replace(avatar.subject, anchors=anchors))

@@ -1,4 +1,4 @@
-"""From a finished run to a smaller one, and what that costs and brings."""
+"""Pruning of a finished run into a smaller one, and a comparison of the two."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class Cost:
-    """What a run is like.
+    """Quality, size and speed of a run.
 
     Attributes:
         num_gaussians: N.
@@ -53,7 +53,7 @@ class Cost:
 
 
 def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
-    """The new run folder ``out``, which starts where the run in ``run_dir`` is and ends with fewer Gaussians.
+    """Return the new run folder ``out``, which starts where the run in ``run_dir`` is and ends with fewer Gaussians.
 
     Args:
         run_dir: a run with at least one checkpoint; an interrupted one counts as finished there.
@@ -71,7 +71,7 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
     done = [f"train.steps={step}", "budget.max_minutes=null", f"run.dir={out}"]
     config = load_resolved(run_dir, [*done, *defaults, *overrides])
     if network_of(config) is not None:
-        raise DyngsError(f"{run_dir}: a network, not a scene; compact what it predicts")
+        raise DyngsError(f"{run_dir}: a network, not a scene; prune what it predicts")
     if not config.prune.is_wanted:
         raise DyngsError("nothing to do: give a share to --prune, or key times to --masks")
     with new_folder(out) as started:
@@ -81,7 +81,7 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
 
 
 def _copy_start(run_dir: Path, checkpoint: Checkpoint, folder: Path) -> None:
-    """What a run goes on from: its last checkpoint, its time and its log."""
+    """Copy the last checkpoint, the training time and the log of a run."""
     save_checkpoint(folder, checkpoint, 0.0)
     for name in (TIMING_NAME, LOG_NAME):
         if (run_dir / name).is_file():
@@ -89,7 +89,7 @@ def _copy_start(run_dir: Path, checkpoint: Checkpoint, folder: Path) -> None:
 
 
 def compared(before: Path, after: Path, threads: int = 0) -> tuple[Cost, Cost]:
-    """What two runs on one capture are like; their pictures are drawn in turn, so that both meet the same machine."""
+    """Return the costs of two runs on one capture; pictures are drawn in turn, so that machine load affects both."""
     runs = [load_run(folder) for folder in (before, after)]
     capture = read_capture(runs[0].config.data)
     with kernel_threads(threads or num_cores()), torch.no_grad():
@@ -123,7 +123,7 @@ def _fps(runs: Sequence[LoadedRun], capture: Capture, split: str) -> tuple[float
 
 
 def _views(runs: Sequence[LoadedRun], capture: Capture, split: str) -> list[tuple[Picture, list[Drawing]]]:
-    """Some pictures of a split, each with what should draw it."""
+    """Return some pictures of a split, each with one drawing per run."""
     config = runs[0].config
     loader = PictureLoader(split_views(capture, split), config.data)
     _, colour = evaluation_background(config.data.background, capture.has_alpha)

@@ -116,7 +116,7 @@ class _Run:
 
     @property
     def config(self) -> Config:
-        """As it is saved; limits may change the number of steps."""
+        """The configuration as saved; limits may change the number of steps."""
         return self._config if self.limited is None else self.limited.config
 
     def run(self, listeners: Sequence[Listener]) -> None:

@@ -45,7 +45,7 @@ class LimitedRun:
 
     @property
     def stage(self) -> int:
-        """How many stages of removal the run has come to; the last is its end."""
+        """Return the number of removal stages that the run has reached; the last is its end."""
         return stage(self.config, self.trainer.done, self.used / self.given)
 
     def exchange(self, trainer: Trainer) -> None:

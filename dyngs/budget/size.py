@@ -33,7 +33,7 @@ _TRIALS = 40
 
 @dataclass(frozen=True)
 class SizeReport:
-    """What a file was made of.
+    """Size and quality of the file, and how it was stored.
 
     Attributes:
         asked, megabytes: 1e6 bytes.

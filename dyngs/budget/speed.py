@@ -59,7 +59,7 @@ MAYBE = 0.6
 
 @dataclass
 class Measured:
-    """What was measured and done for a speed.
+    """Measurements and removals for a speed.
 
     Attributes:
         base: seconds of a drawing with hardly any Gaussians.
@@ -256,7 +256,7 @@ def allowed(found: Measured, fps: float, count: int, config: Config) -> int:
 
 @torch.no_grad()
 def drawing_seconds(trainer: Trainer, scene: Scene, views: int = VIEWS) -> float:
-    """The median over training views of the least time in which one is drawn at its full size, deformation included.
+    """Return the median over training views of the least time to draw one at full size, deformation included.
 
     In between each picture is judged, as evaluation does: drawing is faster where caches still hold all it needs.
     """
@@ -278,7 +278,7 @@ def drawing_seconds(trainer: Trainer, scene: Scene, views: int = VIEWS) -> float
 
 
 def least_seconds(trainer: Trainer, scene: Scene, limit: float) -> float:
-    """``drawing_seconds``, or the least of several measurements if more than ``limit``."""
+    """Return ``drawing_seconds``, or the least of several measurements if more than ``limit``."""
     least = math.inf
     for _ in range(ATTEMPTS):
         least = min(least, drawing_seconds(trainer, scene))
@@ -294,6 +294,6 @@ def _few(trainer: Trainer) -> Scene:
 
 
 def _rounded_down(x: float) -> float:
-    """Two digits."""
+    """Return ``x`` rounded down to two digits."""
     unit = 10.0 ** (math.floor(math.log10(x)) - 1)
     return math.floor(x / unit) * unit

@@ -140,12 +140,12 @@ class Deadline:
 
 
 def with_steps(config: Config, steps: int) -> Config:
-    """``config`` with another ``train.steps``, which all schedules follow."""
+    """Return ``config`` with another ``train.steps``, which all schedules follow."""
     return config.model_copy(update={"train": config.train.model_copy(update={"steps": steps})})
 
 
 def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
-    """``config`` with as many steps as fit, at most its own, by the rate at which a copy of ``trainer`` does some.
+    """Return ``config`` with as many steps as fit, at most its own, by the measured rate of a copy of ``trainer``.
 
     Args:
         config: of the run.
@@ -180,7 +180,7 @@ def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
 
 
 def refitted(trainer: Trainer, config: Config) -> Trainer:
-    """A trainer that is where ``trainer`` is, but on the schedules of ``config``."""
+    """Return a trainer that is where ``trainer`` is, but on the schedules of ``config``."""
     fitted = assemble(config, restored=True)
     fitted.pictures, fitted.bad_gradients = trainer.pictures, trainer.bad_gradients
     fitted.restore(trainer.checkpoint())
@@ -190,7 +190,7 @@ def refitted(trainer: Trainer, config: Config) -> Trainer:
 
 
 def fitting_steps(config: Config, done: int, pace: float, seconds: float, most: int) -> int:
-    """How many steps, at most ``most``, take ``seconds`` more after ``done`` of them; at least ``done``.
+    """Return the largest number of steps, ``done`` to ``most``, whose rest after ``done`` fits in ``seconds``.
 
     Args:
         config: by whose schedules ``pace`` was measured, seconds per step.
@@ -203,7 +203,7 @@ def fitting_steps(config: Config, done: int, pace: float, seconds: float, most: 
 
 
 def seconds_left(config: Config, done: int, steps: int, pace: float) -> float:
-    """What a run of ``steps`` takes after ``done`` of them; ``pace`` seconds per step were measured until there."""
+    """Return the seconds that the rest of ``steps`` takes after ``done``, at ``pace`` seconds per step so far."""
     options, left = with_steps(config, steps).train, steps - done
     now = _weight(picture_divisor(config.train, max(done, 1)))
     sampled = (done + math.ceil(left * (i + 0.5) / _SAMPLES) for i in range(_SAMPLES))
@@ -217,22 +217,22 @@ def seconds_left(config: Config, done: int, steps: int, pace: float) -> float:
 
 
 def same_phase(old: Config, new: Config, done: int) -> bool:
-    """Whether what happens once in a run is neither left out nor redone, if ``new`` follows ``old`` after ``done``."""
+    """Return whether changing ``old`` to ``new`` after ``done`` neither omits nor repeats any one-time event."""
     return _happened(old, done) == _happened(new, done)
 
 
 def _happened(config: Config, done: int) -> tuple[bool, ...]:
-    """Which of the things that happen once in a run have happened after ``done`` steps."""
+    """Return, for each one-time event of a run, whether it has happened after ``done`` steps."""
     once = motion_begins_after(config, config.train.steps), harmonics_measured_after(config)
     return tuple(done >= step for step in once if step is not None)
 
 
 def _weight(divisor: int) -> float:
-    """Time of a step with pictures shrunk by ``divisor``, of one with whole ones."""
+    """Return the time of a step with pictures shrunk by ``divisor``, relative to one at full size."""
     return 1 - PIXEL_SHARE + PIXEL_SHARE / divisor**2
 
 
 def _rounded_up(x: float) -> float:
-    """Two digits."""
+    """Return ``x`` rounded up to two digits."""
     unit = 10.0 ** (math.floor(math.log10(x)) - 1)
     return math.ceil(x / unit) * unit

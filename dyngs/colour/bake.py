@@ -31,7 +31,7 @@ class Baked:
 
 @torch.no_grad()
 def with_harmonics(gaussians: Gaussians, shader: Shader, degree: int = 3) -> Baked:
-    """The Gaussians with the harmonics of ``degree`` that come nearest to the colours of ``shader``.
+    """Return the Gaussians with the harmonics of ``degree`` that come nearest to the colours of ``shader``.
 
     Least squares over directions that are evenly spread on the sphere, those included from which no picture was taken.
     """
@@ -53,7 +53,7 @@ def with_harmonics(gaussians: Gaussians, shader: Shader, degree: int = 3) -> Bak
 
 
 def sphere(count: int) -> Tensor:
-    """(count, 3) unit vectors spread evenly over all directions: a Fibonacci lattice."""
+    """Return (count, 3) unit vectors spread evenly over all directions: a Fibonacci lattice."""
     z = 1 - (2 * torch.arange(count, dtype=torch.float64, device="cpu") + 1) / count
     angle = math.pi * (3 - math.sqrt(5)) * torch.arange(count, dtype=torch.float64, device="cpu")
     radius = (1 - z * z).sqrt()
@@ -61,7 +61,7 @@ def sphere(count: int) -> Tensor:
 
 
 def _eye(center: Tensor) -> Cameras:
-    """A camera at ``center`` (3,)."""
+    """Return a camera at ``center`` (3,)."""
     pose = torch.eye(4, dtype=center.dtype, device=center.device)
     pose[:3, 3] = -center
     return Cameras(pose[None], torch.eye(3, dtype=center.dtype, device=center.device)[None], 1, 1)

@@ -25,7 +25,7 @@ from dyngs.tensor_checks import require_positive, require_tensor
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a moving body was at rest: colours of what is painted on it follow it.
+    """Rest pose of a moving body, which its colours follow.
 
     Attributes:
         places: (N, 3) centres of the drawn Gaussians at rest.
@@ -55,7 +55,7 @@ class ColourNetwork:
 
     @property
     def num_values(self) -> int:
-        """How many numbers it holds."""
+        """Number of values that the network stores."""
         return self.box.numel() + sum(layer.weight.numel() + layer.bias.numel() for layer in self.layers)
 
     def state(self) -> State:
@@ -66,7 +66,7 @@ class ColourNetwork:
         return with_role(tensors, Role.SHARED)
 
     def shader(self, time: float | None, frame: Frame | None = None) -> Shader:
-        """Colours at ``time`` (clamped to [0, 1], None is 0), for ``render``; ``frame`` for Gaussians on a body."""
+        """Return the shader at ``time`` (clamped to [0, 1], None is 0); ``frame`` for Gaussians on a body."""
 
         def colors(gaussians: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
             views = [
@@ -80,7 +80,7 @@ class ColourNetwork:
     def _seen_from(
         self, gaussians: Gaussians, center: Tensor, drawn: Tensor, time: float | None, frame: Frame | None
     ) -> Tensor:
-        """(N, 3) colours seen from ``center``; zero, and not computed, for those that are not ``drawn`` (N,)."""
+        """Return (N, 3) colours seen from ``center``; zero, and not computed, for those that are not ``drawn`` (N,)."""
         rows, dtype = torch.nonzero(drawn)[:, 0], gaussians.means.dtype
         moment = min(max(0.0 if time is None else time, 0.0), 1.0)
         sight = Sight(
@@ -100,7 +100,7 @@ class ColourNetwork:
 
 
 def box_around(means: Tensor) -> Tensor:
-    """(2, 3) centre and half sides of the box that holds ``means`` (N, 3) but their outer percent; no side is zero."""
+    """Return (2, 3) centre and half sides of the box of ``means`` (N, 3) but their outer percent; no side is zero."""
     if not len(means):
         return torch.stack([torch.zeros(3, device=means.device), torch.ones(3, device=means.device)])
     ordered = means.detach().sort(dim=0).values
@@ -111,7 +111,7 @@ def box_around(means: Tensor) -> Tensor:
 
 
 def network_of(state: Mapping[str, Tensor]) -> ColourNetwork | None:
-    """The network of a checkpoint, from the state of its colours; None where there is none.
+    """Return the network of a checkpoint, from the state of its colours; None where there is none.
 
     Raises:
         KeyError: the state lacks a tensor.

@@ -1,4 +1,4 @@
-"""How the colours of Gaussians are trained: one class per ``colour.kind``."""
+"""Training of colours: one class per ``colour.kind``."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class ColourTraining:
 
     @property
     def network(self) -> ColourNetwork | None:
-        """What colours the Gaussians; None: their harmonics."""
+        """The colour network; None where the harmonics give the colours."""
         return None
 
     def penalties(self, gaussians: Gaussians) -> dict[str, Tensor]:
@@ -83,7 +83,7 @@ class ColourTraining:
         return False
 
     def measured(self, step: int, looks: Callable[[], TrainingLooks]) -> HarmonicsDropped | None:
-        """Measure after ``step``, if it is time to, whose harmonics improve pictures, and drop the others."""
+        """Measure, if due after ``step``, whose harmonics improve pictures, and drop the others."""
         return None
 
     def frozen_rest(self) -> Tensor | None:

@@ -1,4 +1,4 @@
-"""Which Gaussians should pay for harmonics: those whose dependence on the view improves pictures not trained on.
+"""Choice of the Gaussians that keep harmonics: those whose view dependence improves pictures not trained on.
 
 Without its harmonics a Gaussian has the mean m of the colours that it shows in the training views, each weighted with
 how much of it is seen there. How much that changes its colours there, sum_v w_v |c_v - m|^2, ranks the Gaussians.
@@ -47,7 +47,7 @@ class MeasuredView:
 
 @dataclass(frozen=True)
 class Finding:
-    """Where dependence on the view pays.
+    """The Gaussians whose view dependence is worth its cost.
 
     Attributes:
         keeps: (N,) bool, Gaussians whose harmonics stay.
@@ -77,7 +77,7 @@ def find_view_dependent(
     background: Tensor,
     tolerance: float,
 ) -> Finding:
-    """Whose harmonics pay, and what the others are drawn with.
+    """Return the Gaussians whose harmonics are worth their cost, and the colours of the others.
 
     Args:
         seen: views that were trained on, one at a time; at least one.
@@ -104,7 +104,7 @@ def find_view_dependent(
 
 
 def first_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance: float) -> Tensor:
-    """(N,) bool: the smallest number of rows, by descending ``changes``, that bring all but ``tolerance`` of the gain.
+    """Return (N,) bool, the fewest rows, by descending ``changes``, that bring all but ``tolerance`` of the gain.
 
     Args:
         changes: (N,) what ranks the rows.
@@ -121,7 +121,7 @@ def first_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance:
 
 
 def _mean_and_change(seen: Iterable[MeasuredView], options: RenderOptions) -> tuple[Tensor, Tensor]:
-    """(N, 3) mean of what the harmonics add to the base colour in the views, and (N,) how much that varies."""
+    """Return (N, 3) mean of what the harmonics add to the base colour in the views, and (N,) how much that varies."""
     weight, total, squares = (
         torch.zeros(1, 1, device="cpu"),
         torch.zeros(1, 3, device="cpu"),
@@ -138,7 +138,7 @@ def _mean_and_change(seen: Iterable[MeasuredView], options: RenderOptions) -> tu
 
 
 def _added(gaussians: Gaussians, camera: Cameras, share: Tensor, options: RenderOptions) -> Tensor:
-    """(N, 3) what the harmonics beyond the constant add to the colours; 0 where nothing is seen."""
+    """Return (N, 3) what the harmonics beyond the constant add to the colours; 0 where nothing is seen."""
     lifted = gaussians.sh.clone()
     lifted[:, 0] = _LIFT / SH_C0
     degree = gaussians.sh_degree if options.sh_degree is None else min(options.sh_degree, gaussians.sh_degree)
@@ -150,7 +150,7 @@ def _added(gaussians: Gaussians, camera: Cameras, share: Tensor, options: Render
 def _squared_error(
     view: MeasuredView, means: Tensor, shares: Tensor, options: RenderOptions, background: Tensor
 ) -> Tensor:
-    """Sum over the picture, where Gaussian i has the share ``shares[i]`` of its harmonics; differentiable in these."""
+    """Return the squared error with the share ``shares[i]`` of the harmonics of Gaussian i; differentiable in these."""
     base = view.gaussians.sh[:, 0] + (1 - shares)[:, None] * means / SH_C0
     rest = shares[:, None, None] * view.gaussians.sh[:, 1:]
     mixed = view.gaussians.replace(sh=torch.cat([base[:, None], rest], dim=1))
@@ -159,5 +159,5 @@ def _squared_error(
 
 
 def _decibels(before: float, after: float) -> float:
-    """How much better a picture with the squared error ``after`` is."""
+    """Return the gain in dB of a picture with the squared error ``after``."""
     return 10 * math.log10(max(before, 1e-12) / max(after, 1e-12))

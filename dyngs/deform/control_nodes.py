@@ -88,7 +88,7 @@ class ControlNodes(NetworkField):
         return field
 
     def regroup(self) -> None:
-        """Place nodes anew, and find out which of them Gaussians follow, when that is next needed."""
+        """Place the nodes again, and assign Gaussians to them, when they are next needed."""
         self.buffers.pop("followed", None)
 
     def to(self, device: torch.device | str) -> ControlNodes:
@@ -98,7 +98,7 @@ class ControlNodes(NetworkField):
 
     @property
     def num_points(self) -> int:
-        """Control points of each spline."""
+        """Number of control points of each spline."""
         return self.num_pieces + SPAN - 1
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
@@ -111,7 +111,7 @@ class ControlNodes(NetworkField):
         return follow(nodes, means, self._at(time))
 
     def penalties(self, time: float) -> dict[str, Tensor]:
-        """Acceleration of the nodes, and how far neighbours stray from moving rigidly, in squared spacings."""
+        """Return the nodes' acceleration and their neighbours' deviation from rigid motion, in squared spacings."""
         if len(self.buffers["positions"]) < 2:
             return {}
         penalties = {}
@@ -140,7 +140,7 @@ class ControlNodes(NetworkField):
             x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
 
     def _at(self, time: float) -> Offsets:
-        """The nodes' offsets at ``time``."""
+        """Return the nodes' offsets at ``time``."""
         place = min(max(time, 0.0), 1.0) * self.num_pieces
         piece = min(int(place), self.num_pieces - 1)
         shares = cubic_shares(place - piece)[:, None]
@@ -150,7 +150,7 @@ class ControlNodes(NetworkField):
         return Offsets(**parts)
 
     def _splines(self) -> dict[str, Tensor]:
-        """Head to its (S, P, size) values."""
+        """Return the control points (S, P, size) by head."""
         return {name: self.parameters[name] for name in head_sizes(self.options)}
 
     def _nodes(self, means: Tensor) -> Nodes:
@@ -182,7 +182,7 @@ class ControlNodes(NetworkField):
         }
 
     def _motion_at(self, points: Tensor) -> dict[str, Tensor]:
-        """Head to the control points (S', P, size) that the present nodes give to ``points`` (S', 3)."""
+        """Return the control points (S', P, size), by head, that the present nodes give to ``points`` (S', 3)."""
         splines = {name: x.detach() for name, x in self._splines().items()}
         if not len(self.buffers["positions"]) or not len(points):
             return {name: x.new_zeros(len(points), *x.shape[1:]) for name, x in splines.items()}
@@ -196,7 +196,7 @@ class ControlNodes(NetworkField):
         return started
 
     def _strain(self, now: Offsets) -> Tensor:
-        """Mean of |x_j - x_i - R_i (p_j - p_i)|^2 of neighbours, over the squared spacing (Sorkine and Alexa 2007)."""
+        """Return the mean of |x_j - x_i - R_i (p_j - p_i)|^2 over the squared spacing (Sorkine and Alexa 2007)."""
         positions, neighbours = self.buffers["positions"], self.buffers["neighbours"]
         arms = positions[neighbours] - positions[:, None]
         kept = arms if now.quats is None else turned(now.quats[:, None].expand(-1, arms.shape[1], -1), arms)
@@ -205,7 +205,7 @@ class ControlNodes(NetworkField):
 
 
 def cubic_shares(place: float) -> Tensor:
-    """(4,) shares of the control points around a piece of a uniform cubic B-spline, at ``place`` in [0, 1] of it."""
+    """Return the (4,) weights of the control points of a piece of a uniform cubic B-spline, at ``place`` in [0, 1]."""
     rest = 1 - place
     middle = [(3 * x**3 - 6 * x**2 + 4) / 6 for x in (place, rest)]
     return torch.tensor([rest**3 / 6, *middle, place**3 / 6], device="cpu")

@@ -31,7 +31,7 @@ class Decoder:
         self.skip = skip
 
     def start_values(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Weights by Glorot and Bengio 2010 and zero biases; the last layer all zero."""
+        """Return weights after Glorot and Bengio 2010 and zero biases; the last layer all zero."""
         values: dict[str, Tensor] = {}
         last = len(self.widths) - 2
         for i in range(last + 1):
@@ -43,13 +43,13 @@ class Decoder:
         return values
 
     def __call__(self, features: Tensor, parameters: Parameters) -> Tensor:
-        """(M, K) outputs of ``features`` (M, num_inputs) with the weights in ``parameters``."""
+        """Return (M, K) outputs of ``features`` (M, num_inputs) with the weights in ``parameters``."""
         layers = [Layer(parameters[f"weight{i}"], parameters[f"bias{i}"]) for i in range(len(self.widths) - 1)]
         return perceptron(features, layers, skip=self.skip)
 
 
 def head_sizes(options: FieldSection) -> Mapping[str, int]:
-    """Name of every head in ``Offsets`` to its number of outputs, in order."""
+    """Return the number of outputs of each head of ``Offsets`` by name, in order."""
     wanted = {
         "means": (3, True),
         "quats": (4, options.move_rotations),
@@ -61,7 +61,7 @@ def head_sizes(options: FieldSection) -> Mapping[str, int]:
 
 
 def split_heads(outputs: Tensor, options: FieldSection) -> Offsets:
-    """The outputs (M, K) of the heads by name."""
+    """Return the outputs (M, K) of the heads by name."""
     heads = head_sizes(options)
     parts = dict(zip(heads, outputs.split(list(heads.values()), dim=1), strict=True))
     if "logit_opacities" in parts:

@@ -1,4 +1,4 @@
-"""What every deformation field offers, and how its offsets change Gaussians.
+"""The interface of deformation fields, and Gaussians with offsets applied.
 
 Local letters: M moving Gaussians, a subset of the N of a scene.
 """
@@ -28,7 +28,7 @@ MAX_KEY_TIMES = 256
 
 @dataclass(frozen=True)
 class Offsets:
-    """By how much M Gaussians differ from their canonical form at one time; zeros mean that they do not.
+    """Changes of M Gaussians from their canonical form at one time; zeros mean no change.
 
     Attributes:
         means: (M, 3) world units.
@@ -45,14 +45,14 @@ class Offsets:
     colors: Tensor | None = None
 
     def select(self, index: Tensor | slice) -> Offsets:
-        """The offsets of the Gaussians at ``index``."""
+        """Return the offsets of the Gaussians at ``index``."""
         others = (self.quats, self.log_scales, self.logit_opacities, self.colors)
         return Offsets(self.means[index], *(None if x is None else x[index] for x in others))
 
 
 @dataclass(frozen=True)
 class FieldSetup:
-    """What a field must know of its scene.
+    """Properties of the scene that a field needs.
 
     Attributes:
         center, half_size: (3,) of the box in which things move, world units; no side is zero.
@@ -68,7 +68,7 @@ class FieldSetup:
     extent: float
 
     def normalized(self, means: Tensor) -> Tensor:
-        """(M, 3) ``means`` in the box's own coordinates: [-1, 1] inside."""
+        """Return (M, 3) ``means`` in the box's own coordinates: [-1, 1] inside."""
         return (means - self.center) / self.half_size
 
 
@@ -81,7 +81,7 @@ class DeformationField(Protocol):
 
     @property
     def num_values(self) -> int:
-        """Numbers that the field holds."""
+        """Number of values that the field stores."""
         ...
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
@@ -107,7 +107,7 @@ class DeformationField(Protocol):
         ...
 
     def regroup(self) -> None:
-        """Find out anew, when next needed, what depends on which Gaussians there are."""
+        """Drop what was derived from the set of Gaussians; it is computed again when next needed."""
         ...
 
     def state(self) -> State:
@@ -129,7 +129,7 @@ class DeformationField(Protocol):
 
 
 class NetworkField:
-    """What fields whose tensors belong to no single Gaussian have in common."""
+    """Base of the fields whose tensors belong to no single Gaussian."""
 
     setup: FieldSetup
     parameters: Parameters
@@ -148,7 +148,7 @@ class NetworkField:
         return self
 
     def regroup(self) -> None:
-        """Do nothing: nothing depends on which Gaussians there are."""
+        """Do nothing: nothing is derived from the set of Gaussians."""
 
     def state(self) -> State:
         return prefixed("learned", self.parameters.state())
@@ -169,12 +169,12 @@ class NetworkField:
 
 
 def key_times(num_times: int) -> int:
-    """How finely time is divided for so many training times: half as finely, into 2 to ``MAX_KEY_TIMES``."""
+    """Return the number of key times for ``num_times`` training times: half as many, from 2 to ``MAX_KEY_TIMES``."""
     return min(max(2, (num_times + 1) // 2), MAX_KEY_TIMES)
 
 
 def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None) -> Gaussians:
-    """``gaussians`` with ``offsets`` applied to ``rows`` ((M,) long; None = all of them, in order); differentiable.
+    """Return ``gaussians`` with ``offsets`` applied to ``rows`` ((M,) long; None = all, in order); differentiable.
 
     No row may occur twice. Without gradients it is done in one pass.
     """
@@ -204,12 +204,12 @@ def _deformed_in_one_pass(gaussians: Gaussians, offsets: Offsets, rows: Tensor |
 
 
 def chosen(x: Tensor, rows: Tensor | None) -> Tensor:
-    """The ``rows`` of ``x``; None: all."""
+    """Return the ``rows`` of ``x``; all for None."""
     return x if rows is None else x.index_select(0, rows)
 
 
 def turned_quats(quats: Tensor, offsets: Tensor) -> Tensor:
-    """(M, 4) the rotations ``quats`` followed by identity + ``offsets``: a Hamilton product, not normalised."""
+    """Return (M, 4) the rotations ``quats`` followed by identity + ``offsets``: a Hamilton product, not normalised."""
     return quat_product(offsets + identity_quat(offsets), quats)
 
 

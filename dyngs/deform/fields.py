@@ -1,4 +1,4 @@
-"""From the configuration to a deformation field, new or from a checkpoint."""
+"""Deformation fields from the configuration, new or from a checkpoint."""
 
 from __future__ import annotations
 

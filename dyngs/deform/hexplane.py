@@ -73,5 +73,5 @@ class Hexplane(NetworkField):
 
 
 def time_rows(options: HexplaneField, num_times: int) -> int:
-    """Rows of the planes with time: as asked for, or as many as ``key_times`` says."""
+    """Return the number of rows of the planes with time: as configured, or by ``key_times``."""
     return options.time_resolution or key_times(num_times)

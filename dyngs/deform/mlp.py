@@ -40,7 +40,7 @@ class Mlp(NetworkField):
 
 
 def encoded(x: Tensor, num_frequencies: int) -> Tensor:
-    """(M, D * (1 + 2 L)) ``x`` (M, D) and its sines and cosines at L octaves (NeRF: Mildenhall et al. 2020)."""
+    """Return (M, D * (1 + 2 L)) ``x`` (M, D) and its sines and cosines at L octaves (NeRF: Mildenhall et al. 2020)."""
     octaves = 2.0 ** torch.arange(num_frequencies, dtype=x.dtype, device=x.device)
     angles = (x[:, None, :] * octaves[:, None]).flatten(1)
     return torch.cat([x, angles.sin(), angles.cos()], dim=1)

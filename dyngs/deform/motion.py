@@ -1,4 +1,4 @@
-"""How much each Gaussian moves, in pixels, and what stays of a motion that is too small to pay for."""
+"""Motion of each Gaussian in pixels, and baking of motion that is too small to be worth its cost."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_SAMPLES = 24
 
 @dataclass(frozen=True)
 class Motion:
-    """What M Gaussians do over time.
+    """Motion of M Gaussians over time.
 
     Attributes:
         pixels: (M,) farthest stray from the mean position, turning and growing of the outline included, in pixels.
@@ -32,7 +32,7 @@ class Motion:
 
 @torch.no_grad()
 def measure_motion(field: DeformationField, gaussians: Gaussians, times: Sequence[float], px_size: Tensor) -> Motion:
-    """Motion of M Gaussians over ``times``.
+    """Return the motion of M Gaussians over ``times``.
 
     The score is max_t |x_t - mean| + s (2 |q_t - mean| + max_axis |log s_t - mean|) over the size of a pixel, s being
     the Gaussian's longest standard deviation, plus ``PX_PER_OPACITY`` times the change of opacity and colour.
@@ -79,7 +79,7 @@ def bake_(gaussians: Gaussians, rows: Tensor, offsets: Offsets) -> None:
 
 
 def _mean(samples: Sequence[Offsets]) -> Offsets:
-    """The means of offsets that have the same heads."""
+    """Return the mean of offsets that have the same heads."""
     return Offsets(
         torch.stack([s.means for s in samples]).mean(0),
         _mean_head([s.quats for s in samples]),

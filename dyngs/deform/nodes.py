@@ -24,7 +24,7 @@ FOLLOWED = 4
 
 @dataclass(frozen=True)
 class Nodes:
-    """Control nodes, and which of them M points follow.
+    """Control nodes, and the ones that each of M points follows.
 
     Attributes:
         positions: (S, 3) canonical.
@@ -37,17 +37,17 @@ class Nodes:
     followed: Tensor
 
     def followed_by(self, rows: Tensor) -> Nodes:
-        """The nodes as only the points ``rows`` follow them."""
+        """Return the nodes with only the points ``rows`` following them."""
         return replace(self, followed=self.followed.index_select(0, rows))
 
     def weights(self, means: Tensor) -> Tensor:
-        """(M, B) shares of the followed nodes: Gaussians of the distance, normalised; constant in ``means``."""
+        """Return (M, B) shares of the followed nodes: Gaussians of the distance, normalised; constant in ``means``."""
         apart = (means.detach()[:, None] - self.positions[self.followed]).square().sum(-1)
         return torch.softmax(-0.5 * apart / self.radii[self.followed].square(), dim=1)
 
 
 def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
-    """The nodes at ``positions`` (S, 3), at least one, followed by the points ``means`` (M, 3)."""
+    """Return the nodes at ``positions`` (S, 3), at least one, followed by the points ``means`` (M, 3)."""
     tree, places, points = _tree(positions), positions.double().numpy(), means.detach().double().numpy()
     count = min(FOLLOWED, len(positions))
     gaps = torch.from_numpy(tree.query(places, k=count)[0]).reshape(len(positions), -1)
@@ -58,7 +58,7 @@ def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
 
 
 def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
-    """Indices of at most ``count`` of the ``points`` (M, 3), each the farthest from those before it and from ``taken``.
+    """Return indices of at most ``count`` ``points`` (M, 3), each the farthest from those before it and from ``taken``.
 
     None coincides with another or with one of ``taken`` (S, 3). Without those, the first is nearest to the mean.
     """
@@ -82,7 +82,7 @@ def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
 
 
 def follow(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:
-    """Offsets of the points ``means`` (M, 3) from those of the nodes.
+    """Return offsets of the points ``means`` (M, 3) from those of the nodes.
 
     A node turns what follows it about its own place: x' = sum_b w_b (R_b (x - p_b) + p_b + d_b); differentiable in x,
     the weights taken as constant. All other offsets are blended alike.
@@ -100,7 +100,7 @@ def follow(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:
 
 
 def turned(offsets: Tensor, vectors: Tensor) -> Tensor:
-    """(..., 3) ``vectors`` turned by the rotations identity + ``offsets`` (..., 4), of any length."""
+    """Return (..., 3) ``vectors`` turned by the rotations identity + ``offsets`` (..., 4), of any length."""
     return rotate(offsets + identity_quat(offsets), vectors)
 
 

@@ -50,7 +50,7 @@ def with_random_gaussians(gaussians: Gaussians, count: int, extent: float, gener
 
 
 def box_of(gaussians: Gaussians, extent: float) -> tuple[Tensor, Tensor]:
-    """Centre and half sides (3,) of the box around what is solid, a little larger; no side is zero.
+    """Return centre and half sides (3,) of the box around what is solid, a little larger; no side is zero.
 
     The outer percent of the Gaussians on either side is left out: there the field is that of the box's border.
     """

@@ -146,7 +146,7 @@ class DynamicScene(Scene):
 
 @dataclass(frozen=True)
 class _Part:
-    """What is drawn around a time.
+    """Gaussians drawn around a time.
 
     Attributes:
         gaussians: A canonical ones.

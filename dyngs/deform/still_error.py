@@ -1,4 +1,4 @@
-"""Where a still model cannot explain the pictures: the first measure of what may move."""
+"""Errors of a still model in the pictures: the first measure of what may move."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SHOWS = 1e-3
 
 @dataclass(frozen=True)
 class StillErrors:
-    """How far pictures disagree with what is still.
+    """Errors of a still scene in the pictures, per Gaussian.
 
     Attributes:
         most: (N,) large where anything moves, be it this Gaussian or what hides it at times.
@@ -45,7 +45,7 @@ def still_errors(
     background: Tensor,
     shader_at: Callable[[float], Shader | None] = lambda _: None,
 ) -> StillErrors:
-    """How far the pictures disagree with what is still, where each Gaussian is seen.
+    """Return the errors of a still scene in the pictures, where each Gaussian is seen.
 
     e_vi = |sum_p w_vip (expected - truth)| / sum_p w_vip with w = alpha T for each picture v, a mean over channels.
     Errors of one view are summed with their sign over what a Gaussian covers: detail that is not yet resolved cancels,
@@ -86,7 +86,7 @@ def still_errors(
 def _errors_in(
     gaussians: Gaussians, picture: Picture, options: RenderOptions, background: Tensor, expected: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """(N,) sums of errors and of weights over one picture."""
+    """Return (N,) sums of errors and of weights over one picture."""
     counts = torch.ones(expected.shape[:2], device=expected.device) if picture.mask is None else picture.mask
     error = (expected - picture.composite(background)) * counts[..., None]
     flat = torch.zeros(len(gaussians), 1, 3, requires_grad=True, device=gaussians.means.device)
@@ -97,12 +97,12 @@ def _errors_in(
 
 
 def cameras_in_place(views: Sequence[View]) -> list[list[int]]:
-    """Per camera that stands and took ``MIN_SAME`` views or more, the indices of these."""
+    """Return the indices of the views of each fixed camera that took ``MIN_SAME`` views or more."""
     return [seen for seen in static_cameras(views) if len(seen) >= MIN_SAME]
 
 
 def views_to_compare(views: Sequence[View], limit: int = 50) -> list[int]:
-    """Indices of at most ``limit`` views, evenly chosen; where cameras stay in place, ``MOMENTS`` of each or more."""
+    """Return indices of at most ``limit`` views, evenly chosen; of fixed cameras, ``MOMENTS`` of each or more."""
     cameras = cameras_in_place(views)
     if not cameras:
         return evenly_spaced(len(views), limit)
@@ -111,7 +111,7 @@ def views_to_compare(views: Sequence[View], limit: int = 50) -> list[int]:
 
 
 def _median_pictures(pictures: Sequence[Picture], background: Tensor) -> dict[bytes, Tensor]:
-    """Per camera with enough pictures, (H, W, 3) what most of them show."""
+    """Return the median picture (H, W, 3) of each camera with enough pictures."""
     same: dict[bytes, list[Tensor]] = {}
     for picture in pictures:
         same.setdefault(_camera_key(picture), []).append(picture.composite(background))
@@ -119,13 +119,13 @@ def _median_pictures(pictures: Sequence[Picture], background: Tensor) -> dict[by
 
 
 def _camera_key(picture: Picture) -> bytes:
-    """Equal for pictures from the same place in the same direction, but for rounding."""
+    """Return a key that is equal for pictures from the same camera pose, but for rounding."""
     cameras = picture.cameras
     return b"".join(x.round(decimals=6).numpy().tobytes() for x in (cameras.cam_from_world, cameras.intrinsics))
 
 
 def two_group_threshold(scores: Tensor) -> float:
-    """The score that parts ``scores`` (N,) best into two groups (Otsu 1979); infinite where all are equal."""
+    """Return the threshold between two groups of ``scores`` (N,) (Otsu 1979); infinite where all are equal."""
     from skimage.filters import threshold_otsu
 
     if not len(scores) or float(scores.min()) == float(scores.max()):

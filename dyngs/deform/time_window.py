@@ -18,7 +18,7 @@ FRONTIER_VIEWS = 6
 
 @dataclass(frozen=True)
 class TimeWindow:
-    """Which times are trained on at a step.
+    """The times that are trained on at each step.
 
     Attributes:
         strays: |time - 0.5| of all training views, ascending.
@@ -35,27 +35,27 @@ class TimeWindow:
 
     @staticmethod
     def around_middle(times: Sequence[float], first: float, begins: int, opens: int, full: int) -> TimeWindow:
-        """The window over the times of all training views."""
+        """Return the window over the times of all training views."""
         return TimeWindow(tuple(sorted(abs(time - MIDDLE) for time in times)), first, begins, opens, full)
 
     def num_views(self, step: int) -> int:
-        """How many views the window holds at ``step``."""
+        """Return the number of views in the window at ``step``."""
         start = min(len(self.strays), max(MIN_VIEWS, math.ceil(self.first * len(self.strays))))
         progress = (step - self.opens) / max(self.full - self.opens, 1)
         return start + int(min(max(progress, 0.0), 1.0) * (len(self.strays) - start))
 
     def reach(self, step: int) -> float:
-        """Largest |time - 0.5| in the window at ``step``; 0.5 once it is full."""
+        """Return the largest |time - 0.5| in the window at ``step``; 0.5 once it is full."""
         count = self.num_views(step)
         return MIDDLE if count == len(self.strays) else self.strays[count - 1]
 
     def bounds(self, step: int) -> tuple[float, float]:
-        """First and last time in the window at ``step``; [0, 1] once it is full."""
+        """Return the first and last time in the window at ``step``; [0, 1] once it is full."""
         reach = self.reach(step)
         return MIDDLE - reach, MIDDLE + reach
 
     def holds(self, time: float, step: int) -> bool:
-        """Whether ``time`` is trained on at ``step``; while the window grows, in every other step only if it is new."""
+        """Return whether ``time`` is trained on at ``step``; while it grows, every other step takes only new times."""
         # Not by ``bounds``: their rounding may shut out the very times that the window ends with.
         if step <= self.begins:
             return True
@@ -64,5 +64,5 @@ class TimeWindow:
         return oldest <= stray <= self.reach(step)
 
     def tracks(self, step: int) -> bool:
-        """Whether ``step`` is for the newest views only: every other one while the window grows."""
+        """Return whether ``step`` is for the newest views only: every other one while the window grows."""
         return self.opens < step < self.full and step % 2 == 0 and self.num_views(step) < len(self.strays)

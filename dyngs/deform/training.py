@@ -1,4 +1,4 @@
-"""How a dynamic scene is trained.
+"""Training of a dynamic scene.
 
 Training goes through three phases: coarse (nothing moves), fine (the field moves all Gaussians), and from the first
 split on the field moves only those whose motion can be seen; the others are frozen and cost nothing more.
@@ -40,7 +40,7 @@ MIN_MOVING_SHARE = 0.02
 
 @dataclass(frozen=True)
 class DeformSchedule:
-    """When the phases begin, in steps of this run.
+    """The steps at which the phases of training begin.
 
     Attributes:
         fine: last step without motion.
@@ -60,7 +60,7 @@ class DeformSchedule:
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """What the training of a dynamic scene needs to know of its capture.
+    """Properties of the capture that training a dynamic scene needs.
 
     Attributes:
         times: of the training views, in [0, 1], ascending; at least two differ.

@@ -49,7 +49,7 @@ class Trajectory(NetworkField):
 
 
 def basis(time: float, polynomial: int, fourier: int) -> Tensor:
-    """(polynomial + 2 fourier,) values at ``time`` in [0, 1], float64.
+    """Return (polynomial + 2 fourier,) values at ``time`` in [0, 1], float64.
 
     Legendre polynomials of degree 1 and up on the whole clip, then sines and cosines of whole periods, less their mean
     over the clip (zero); amplitudes fall with frequency so that one learning rate suits all of them.

@@ -55,7 +55,7 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class EvalReport:
-    """What ``dyngs eval`` prints and writes; the fields are the keys of the file (docs/formats.md).
+    """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file (docs/formats.md).
 
     Attributes:
         split: which views.
@@ -114,12 +114,12 @@ class EvalReport:
     stored_mb: float | None = None
 
     def to_json(self) -> str:
-        """The report as strict JSON (no NaN or Infinity), ending in a newline."""
+        """Return the report as strict JSON (no NaN or Infinity), ending in a newline."""
         return json.dumps(asdict(self), indent=2, allow_nan=False) + "\n"
 
 
 def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "alex", threads: int = 0) -> EvalReport:
-    """Report of a run on one split, also written into its folder: ``metrics.json``, ``metrics_SPLIT.json`` if not test.
+    """Return the report of a run on one split and write it into its folder: ``metrics.json``, ``metrics_SPLIT.json``.
 
     Args:
         run_dir: folder of a run with at least one checkpoint.
@@ -181,14 +181,14 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
 
 
 def report_path(run_dir: Path, split: str) -> Path:
-    """Where the report of ``split`` lies in a run folder."""
+    """Return the path of the report of ``split`` in a run folder."""
     return run_dir / ("metrics.json" if split == "test" else f"metrics_{split}.json")
 
 
 def score_views(
     scene: Scene, pictures: Iterable[Picture], options: RenderOptions, background: Tensor, lpips: Lpips
 ) -> tuple[list[ViewScore], dict[str, str]]:
-    """Scores of the Gaussians against pictures, and the reasons for metrics that are None.
+    """Return scores of the Gaussians against pictures, and the reasons for metrics that are None.
 
     Args:
         scene: what to draw, at the time of each picture.
@@ -234,7 +234,7 @@ def score_views(
 
 
 def person_box(picture: Picture) -> tuple[slice, slice] | None:
-    """Rows and columns of the smallest box around what is not transparent; None without alpha or where nothing is."""
+    """Return rows and columns of the smallest box around opaque pixels; None without alpha or where there are none."""
     if picture.alpha is None or not bool((picture.alpha > 0).any()):
         return None
     shown = picture.alpha > 0
@@ -243,7 +243,7 @@ def person_box(picture: Picture) -> tuple[slice, slice] | None:
 
 
 def split_views(capture: Capture, split: str) -> Sequence[View]:
-    """Views of a split, at least one. Raises DyngsError that lists the splits which there are."""
+    """Return the views of a split, at least one. Raises DyngsError that lists the splits there are."""
     views = {name: views for name, views in capture.splits.items() if views}
     for name, found in views.items():
         if name == split:
@@ -253,7 +253,7 @@ def split_views(capture: Capture, split: str) -> Sequence[View]:
 
 
 def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
-    """The scene of a run as the views of ``split`` show it: a person plays the clip of that split.
+    """Return the scene of a run as the views of ``split`` show it: a person plays the clip of that split.
 
     Frames that were trained on keep their refined poses; others have those of their files.
     """
@@ -268,7 +268,7 @@ def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
 
 
 def parameter_megabytes(scene: Scene) -> float:
-    """Size in MB (1e6 bytes) as float32: 236 bytes per Gaussian at SH degree 3, the field, and masks bit by bit.
+    """Return the size in 1e6 bytes as float32: 236 bytes per Gaussian at SH degree 3, the field, and masks as bits.
 
     Harmonics of a Gaussian that are all zero beyond the base colour do not count.
     """
@@ -279,7 +279,7 @@ def parameter_megabytes(scene: Scene) -> float:
 def _timed_render(
     scene: Scene, picture: Picture, options: RenderOptions, background: Tensor
 ) -> tuple[Tensor, float, float]:
-    """(H, W, 3) rendered picture, the seconds that it took, and those of them that the deformation took."""
+    """Return the (H, W, 3) rendered picture, the seconds it took, and the seconds of these for deformation."""
     with torch.no_grad():
         start = time.perf_counter()
         moment = scene.moment(picture.time)
@@ -290,7 +290,7 @@ def _timed_render(
 
 
 def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
-    """What a reader of the numbers should know."""
+    """Return notes on how to read the numbers."""
     notes = []
     if run.config.data.background == "random":
         notes.append("trained on random backgrounds, evaluated on black")

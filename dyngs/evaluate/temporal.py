@@ -1,4 +1,4 @@
-"""What a model does over time: its quality at each moment, and how much its pictures flicker before a fixed camera.
+"""Quality of a model over time: at each moment, and the flicker of its pictures before a fixed camera.
 
 Both measures of flicker are in grey levels of 255 and mean absolute values over pixels, channels and moments, of
 pictures clamped to [0, 1]. Local letters: R a rendered picture, G the true one, t its time, k moments in order.
@@ -57,13 +57,13 @@ class Drawing:
 
     @torch.no_grad()
     def picture(self, cameras: Cameras, time: float | None) -> Tensor:
-        """(H, W, 3) what the one camera sees at ``time``, clamped to [0, 1]."""
+        """Return the picture (H, W, 3) of the one camera at ``time``, clamped to [0, 1]."""
         drawn = self.scene.render(cameras, time, options=self.options, background=self.background)
         return drawn.rgb[0].clamp(0, 1)
 
 
 def clamped_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """``times`` within [0, 1], and a line of warning where one was not.
+    """Return ``times`` within [0, 1], and a line of warning where one was not.
 
     Raises:
         DyngsError: a time that is not finite.
@@ -78,7 +78,7 @@ def clamped_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str,
 
 
 def psnr_per_time(scores: Iterable[tuple[float | None, float]]) -> tuple[TimeScore, ...]:
-    """PSNR at each distinct time, ascending, from (time, psnr) of the views; those without a time are left out."""
+    """Return the PSNR at each distinct time, ascending, from (time, psnr) of the views that have a time."""
     found: defaultdict[float, list[float]] = defaultdict(list)
     for time, value in scores:
         if time is not None:
@@ -87,7 +87,7 @@ def psnr_per_time(scores: Iterable[tuple[float | None, float]]) -> tuple[TimeSco
 
 
 def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> MetricValue:
-    """Mean of |R_{k+1} - 2 R_k + R_{k-1}| x 255: the second difference in time, before one camera, without any truth.
+    """Return the mean of |R_{k+1} - 2 R_k + R_{k-1}| x 255: the second difference in time at one camera, without truth.
 
     Smooth motion has little of it, flickering much. Where moments are not evenly spaced, R_k is compared with the
     straight line between its neighbours: 2 |w R_{k-1} + (1 - w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} -
@@ -114,7 +114,7 @@ def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> Metri
 
 
 def flicker_error(drawing: Drawing, loader: PictureLoader, views: Sequence[View]) -> MetricValue:
-    """Mean of |(R_{k+1} - R_k) - (G_{k+1} - G_k)| x 255: how wrongly pictures change, before the cameras that stand.
+    """Return the mean of |(R_{k+1} - R_k) - (G_{k+1} - G_k)| x 255: the error of changes in time, at fixed cameras.
 
     Over all neighbours in time of each pose that has several times; a mask leaves out what does not count in one of
     the two. Something that should move but does not has it, as has everything that flickers.
@@ -141,21 +141,21 @@ def flicker_error(drawing: Drawing, loader: PictureLoader, views: Sequence[View]
 
 
 def flicker_of_split(drawing: Drawing, loader: PictureLoader, views: Sequence[View]) -> MetricValue:
-    """``flicker`` before the first camera of the split, at the training times."""
+    """Return ``flicker`` before the first camera of the split, at the training times."""
     if all(view.time is None for view in views):
         return MetricValue(None, _NO_TIMES)
     return flicker(drawing, loader[0].cameras, drawing.scene.times)
 
 
 def _middles(num_times: int) -> list[int]:
-    """Which moments are compared with their neighbours."""
+    """Return the indices of the moments that are compared with their neighbours."""
     if num_times <= MAX_MOMENTS:
         return list(range(1, num_times - 1))
     return np.linspace(1, num_times - 2, _SAMPLED_TRIPLES).round().astype(int).tolist()
 
 
 def _signed_error(drawing: Drawing, picture: Picture) -> tuple[Tensor, Tensor]:
-    """(H, W, 3) render minus truth, and (H, W) what counts: R' - R - (G' - G) is the difference of two of them."""
+    """Return (H, W, 3) render minus truth and its mask (H, W): R' - R - (G' - G) is the difference of two of them."""
     truth = picture.composite(drawing.background).clamp(0, 1)
     counts = torch.ones(truth.shape[:2], device=truth.device) if picture.mask is None else picture.mask
     return drawing.picture(picture.cameras, picture.time) - truth, counts

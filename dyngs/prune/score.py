@@ -1,4 +1,4 @@
-"""How important each Gaussian is: its share of pictures over views and times, weighed in one of several ways.
+"""Importance of each Gaussian: its share of pictures over views and times, weighted in one of several ways.
 
 Local letters: K moments, C (K, N) sums over pixels and views of what a Gaussian contributes at each moment.
 """
@@ -108,6 +108,6 @@ def importance(views: ScoringViews, *, slopes: bool) -> Importance:
 
 
 def _smoothed(x: Tensor) -> Tensor:
-    """(K, N) by [1 2 1] / 4 over K, ends repeated."""
+    """Return (K, N) by [1 2 1] / 4 over K, ends repeated."""
     padded = torch.cat([x[:1], x, x[-1:]])
     return (padded[:-2] + 2 * x + padded[2:]) / 4

@@ -1,4 +1,4 @@
-"""Which Gaussians stay: the best by rank, and more of them where the pictures would suffer too much."""
+"""Choice of the Gaussians that stay: the highest scores, and more of them where pictures would lose too much."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BACK_OFFS = 5
 
 @dataclass(frozen=True)
 class Pruning:
-    """What is removed.
+    """Result of pruning: the Gaussians that stay, and its cost.
 
     Attributes:
         kept: (N,) bool.
@@ -29,7 +29,7 @@ class Pruning:
 
 
 def highest(scores: Tensor, share: float) -> Tensor:
-    """(N,) bool: all but the lowest ``share`` of ``scores`` (N,), at least one; of equal ones the first."""
+    """Return (N,) bool: all but the lowest ``share`` of ``scores`` (N,), at least one; of equal ones the first."""
     count = min(max(1, math.ceil(len(scores) * (1 - share) - 1e-9)), len(scores))
     kept = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
     kept[torch.sort(scores, descending=True, stable=True).indices[:count]] = True
@@ -37,7 +37,7 @@ def highest(scores: Tensor, share: float) -> Tensor:
 
 
 def prune(scores: Tensor, share: float, loss_of: Callable[[Tensor], float], max_loss: float) -> Pruning:
-    """The lowest ``share`` of ``scores`` removed, or as much of it as costs no more than ``max_loss``.
+    """Remove the lowest ``share`` of ``scores``, or as much of it as costs no more than ``max_loss``.
 
     Args:
         scores: (N,) what each Gaussian is worth.

@@ -39,7 +39,7 @@ PROBED_VIEWS = 16
 
 @dataclass(frozen=True)
 class Pruned:
-    """What the stage did to a run.
+    """Result of the pruning stage of a run.
 
     Attributes:
         before, after: numbers of Gaussians.
@@ -135,7 +135,7 @@ def default_scores(trainer: Trainer) -> Tensor:
 
 
 def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
-    """At most ``count`` of the ``cameras`` that differ, evenly chosen: of a rig that stands, each once."""
+    """Return at most ``count`` distinct ``cameras``, evenly chosen: each camera of a fixed rig once."""
     found: dict[bytes, Cameras] = {}
     for camera in cameras:
         numbers = torch.cat([camera.cam_from_world[0, :3], camera.intrinsics[0]], dim=1)

@@ -56,7 +56,7 @@ class LoadedRun:
 
 
 def checkpoint_paths(run_dir: Path) -> list[Path]:
-    """The run's checkpoints, oldest first."""
+    """Return the run's checkpoints, oldest first."""
     found = (run_dir / "checkpoints").glob("step_*.safetensors")
     return sorted((f for f in found if re.fullmatch(r"step_[0-9]+", f.stem)), key=step_of)
 
@@ -68,12 +68,12 @@ def remove_old_checkpoints(run_dir: Path) -> None:
 
 
 def step_of(path: Path) -> int:
-    """Steps done, by the name of a checkpoint."""
+    """Return the number of steps done, from the name of a checkpoint."""
     return int(path.stem.removeprefix("step_"))
 
 
 def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float) -> Path:
-    """The new checkpoint's path; written atomically, the oldest but ``KEEP_CHECKPOINTS`` are then removed.
+    """Write a checkpoint atomically, remove all but the newest ``KEEP_CHECKPOINTS``, and return its path.
 
     Raises:
         DyngsError: a model with values that are not finite (earlier checkpoints stay), a full disk, and the like.
@@ -92,7 +92,7 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """The checkpoint in ``path``.
+    """Return the checkpoint in ``path``.
 
     Raises:
         DyngsError: a file that is missing, truncated, altered, or of another version; names an older one if there is.
@@ -103,7 +103,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 
 def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
-    """What the header of a file says.
+    """Return the metadata in the header of a file.
 
     Raises:
         KeyError: something lacks.
@@ -121,7 +121,7 @@ def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
 
 
 def latest_checkpoint(run_dir: Path) -> Checkpoint:
-    """The newest checkpoint of a run, which may be training. Raises DyngsError if there is none or it is damaged."""
+    """Return the newest checkpoint of a run, also while it trains. Raises DyngsError for none or a damaged one."""
     while True:
         paths = checkpoint_paths(run_dir)
         if not paths:
@@ -134,7 +134,7 @@ def latest_checkpoint(run_dir: Path) -> Checkpoint:
 
 
 def load_run(run_dir: Path) -> LoadedRun:
-    """The model of a run folder at its newest checkpoint, or of its compact file where it has no checkpoints.
+    """Return the model of a run folder at its newest checkpoint, or of its .dyngs file where it has no checkpoints.
 
     Raises:
         DyngsError: no run folder, no checkpoint, or a damaged one.
@@ -149,12 +149,12 @@ def load_run(run_dir: Path) -> LoadedRun:
 
 
 def has_only_scene_file(run_dir: Path) -> bool:
-    """Whether the run is only there as the file that ``dyngs export --format dyngs`` writes."""
+    """Return whether the run is only there as the file that ``dyngs export --format dyngs`` writes."""
     return (run_dir / SCENE_FILE).is_file() and not checkpoint_paths(run_dir)
 
 
 def _scene_checkpoint(run_dir: Path) -> Checkpoint:
-    """What drawing needs; it cannot be trained on."""
+    """Return a checkpoint for drawing only, from a .dyngs file."""
     path = run_dir / SCENE_FILE
     stored = read_scene(path)
     with reading(path):
@@ -162,13 +162,13 @@ def _scene_checkpoint(run_dir: Path) -> Checkpoint:
 
 
 def last_good(run_dir: Path) -> str:
-    """A sentence that names the newest checkpoint, or says that there is none."""
+    """Return a sentence that names the newest checkpoint, or says that there is none."""
     paths = checkpoint_paths(run_dir)
     return f"The last good checkpoint is {paths[-1]}" if paths else "There is no checkpoint yet"
 
 
 def seconds_at(run_dir: Path, step: int) -> float:
-    """Training time up to the checkpoint of ``step``, over all resumes; 0 where it is not known."""
+    """Return the training time up to the checkpoint of ``step``, over all resumes; 0 where it is not known."""
     return _read_seconds(run_dir).get(str(step), 0.0)
 
 
@@ -189,7 +189,7 @@ def _write_seconds(run_dir: Path, step: int, seconds: float) -> None:
 
 
 def _instead_of(path: Path) -> str:
-    """What to do about a damaged checkpoint."""
+    """Return the end of a message on what to do about a damaged checkpoint."""
     older = [p for p in checkpoint_paths(path.parent.parent) if step_of(p) < step_of(path)]
     if older:
         return f"; delete it to go on from the previous one, {older[-1].name}"

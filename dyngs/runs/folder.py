@@ -1,4 +1,4 @@
-"""What a run folder holds, whether a new run may begin there, and what a killed process left in it."""
+"""Contents of a run folder: checks before a new run begins, and removal of unfinished files of killed processes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _OLD_LEFTOVER = re.compile(r"\.step_\d+\.\d+\.safetensors|\.tmp[A-Za-z0-9]{6}")
 
 
 def default_folder(name: str) -> Path:
-    """The run folder of a run that has only a name.
+    """Return the run folder of a run that has only a name.
 
     Raises:
         DyngsError: the name leads out of ``runs``, or is none.
@@ -39,7 +39,7 @@ def default_folder(name: str) -> Path:
 
 
 def require_no_run(folder: Path) -> None:
-    """Nothing, if a new run can be written to ``folder`` without replacing anything.
+    """Raise unless a new run can be written to ``folder`` without replacing anything.
 
     Raises:
         DyngsError: says what is there.
@@ -58,7 +58,7 @@ def require_no_run(folder: Path) -> None:
 
 
 def require_empty(folder: Path) -> None:
-    """Nothing, if ``folder`` does not exist or is empty; a lock file whose owner was killed is removed.
+    """Raise unless ``folder`` does not exist or is empty; a lock file whose owner was killed is removed.
 
     Raises:
         DyngsError: something is there, or a process writes there.
@@ -74,7 +74,7 @@ def require_empty(folder: Path) -> None:
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """A hidden folder beside ``out`` that gets its name when the block ends well, and vanishes otherwise.
+    """Yield a hidden folder beside ``out`` that gets its name when the block ends well, and is removed otherwise.
 
     Raises:
         DyngsError: ``out`` is not empty, when the block begins or when it ends.
@@ -96,7 +96,7 @@ def new_folder(out: Path) -> Iterator[Path]:
 
 @contextmanager
 def folder_of_export(out: Path, run_dir: Path, config: Config) -> Iterator[Path]:
-    """The folder to write the stored scene of a run to, and its configuration: ``out``, or one that becomes it.
+    """Yield the folder to write the stored scene and configuration of a run to: ``out``, or one that becomes it.
 
     Raises:
         DyngsError: ``out`` holds another run, or a process writes there.
@@ -112,7 +112,7 @@ def folder_of_export(out: Path, run_dir: Path, config: Config) -> Iterator[Path]
 
 
 def _require_export_of(config: Config, folder: Path) -> None:
-    """Nothing, if a run can be exported to ``folder``: no run is there, or a former export of the same one."""
+    """Raise unless a run can be exported to ``folder``: no run is there, or a former export of the same one."""
     found = _found(folder)
     if not found and not checkpoint_paths(folder):
         return
@@ -125,7 +125,7 @@ def _require_export_of(config: Config, folder: Path) -> None:
 
 
 def require_startable(folder: Path, config: Config) -> None:
-    """Nothing, if the run of ``config`` can begin in ``folder``: nothing is there that it would replace, or only what
+    """Raise unless the run of ``config`` can begin in ``folder``: it would replace nothing there, or only what
     the very same run left that was stopped before its first checkpoint.
 
     Raises:
@@ -142,7 +142,7 @@ def require_startable(folder: Path, config: Config) -> None:
 
 
 def was_only_begun(folder: Path) -> bool:
-    """Whether a run began in ``folder`` and was stopped before its first checkpoint."""
+    """Return whether a run began in ``folder`` and was stopped before its first checkpoint."""
     return _config_of_begun(folder) is not None
 
 
@@ -173,7 +173,7 @@ def tidy(folder: Path, *, sole_writer: bool) -> None:
 
 
 def _found(folder: Path) -> list[str]:
-    """Names in ``folder`` that a run writes, whatever lies there under them; those of a begun run last."""
+    """Return the names in ``folder`` that a run writes, whatever lies there under them; those of a begun run last."""
     metrics = sorted(path.name for path in folder.glob("metrics*.json"))
     names = [SCENE_FILE, EXPORT_FOLDER, FORMER_EXPORT_FOLDER, *metrics, *_BEGUN]
     found = [name for name in names if (folder / name).exists() or (folder / name).is_symlink()]
@@ -183,7 +183,7 @@ def _found(folder: Path) -> list[str]:
 
 
 def _config_of_begun(folder: Path) -> Config | None:
-    """The configuration of a run that was stopped before its first checkpoint; None where there is no such run."""
+    """Return the configuration of a run stopped before its first checkpoint; None where there is no such run."""
     found = _found(folder)
     if RESOLVED_NAME not in found or checkpoint_paths(folder) or any(name not in _BEGUN for name in found):
         return None
@@ -194,6 +194,6 @@ def _config_of_begun(folder: Path) -> Config | None:
 
 
 def _is_same_run(one: Config, other: Config) -> bool:
-    """Whether two runs have the same bytes, whatever they are called, wherever they are, by how many threads."""
+    """Return whether two runs have the same bytes, whatever they are called, wherever they are, by how many threads."""
     first, second = (c.model_copy(update={"run": RunConfig(seed=c.run.seed)}) for c in (one, other))
     return first == second

@@ -1,4 +1,4 @@
-"""One writer at a time in a run folder: a lock that the system frees when its process ends, however it ends."""
+"""A lock for one writer at a time in a run folder, released by the system when its process ends, however it ends."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class InUseError(DyngsError):
 
 @contextmanager
 def writing(folder: Path) -> Iterator[bool]:
-    """Whether it is certain that no other process writes into ``folder`` while the block lasts: false without locks.
+    """Yield whether it is certain that no other process writes into ``folder`` in the block: false without locks.
 
     The folder is made where it is missing, and removed where nothing came of it. The lock holds for as long as the
     process lives; the file ``run.lock`` says who it is. A file system that has no locks (some network file systems) is
@@ -59,7 +59,7 @@ def writing(folder: Path) -> Iterator[bool]:
 
 
 def _made(folder: Path) -> list[Path]:
-    """The folders that had to be made, innermost first."""
+    """Return the folders that had to be made, innermost first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -71,7 +71,7 @@ def _made(folder: Path) -> list[Path]:
 
 
 def _locked(folder: Path) -> tuple[int, bool]:
-    """The open lock file of a folder, and whether it is locked.
+    """Return the open lock file of a folder, and whether it is locked.
 
     Raises:
         DyngsError: another process has it.
@@ -150,7 +150,7 @@ def _sign(file: int) -> None:
 
 
 def _owner(path: Path) -> str:
-    """Who writes there, as far as the lock file says."""
+    """Return the process that writes there, as far as the lock file says."""
     try:
         with path.open("rb") as file:
             known = json.loads(file.read(4096))

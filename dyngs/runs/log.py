@@ -110,7 +110,7 @@ def record_of(event: StepDone) -> LogRecord:
 
 
 def _lines_up_to(path: Path, step: int) -> list[str]:
-    """Whole lines of an earlier log that belong to steps up to ``step``."""
+    """Return the complete lines of an earlier log for steps up to ``step``."""
     if step == 0 or not path.is_file():
         return []
     kept = []

@@ -39,7 +39,7 @@ class Progress:
         self._task: Any = None
 
     def __call__(self, event: Event) -> None:
-        """Show what ``event`` tells."""
+        """Show ``event``."""
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
                 self.update(record_of(event))
@@ -66,13 +66,13 @@ class Progress:
             self._next_line = record.step + max(1, self._total // PLAIN_LINES)
 
     def expect(self, total: int) -> None:
-        """From now on ``total`` steps are to be done."""
+        """Set the total number of steps to ``total``."""
         self._total = total
         if self._bar is not None:
             self._bar.update(self._task, total=total)
 
     def say(self, line: str) -> None:
-        """Show ``line`` above what changes."""
+        """Show ``line`` above the progress bar."""
         if self._bar is not None:
             self._bar.console.print(line, markup=False, highlight=False)
         else:
@@ -97,7 +97,7 @@ class Progress:
 
 
 def _rich_bar(total: int, done: int, stream: IO[str]) -> tuple[Any, Any]:
-    """A rich progress bar, not yet shown, and its task."""
+    """Return a rich progress bar, not yet shown, and its task."""
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as RichProgress

@@ -1,4 +1,4 @@
-"""Where Gaussians are added and removed: clone, split and prune by the gradient of the 2D means (3DGS, AbsGS).
+"""Adding and removing Gaussians: clone, split and prune by the gradient of the 2D means (3DGS, AbsGS).
 
 ``Densifier`` is what the trainer asks of any strategy; the other one is in ``mcmc.py``.
 """
@@ -29,7 +29,7 @@ MAX_LOG_VARIANCE = 60.0
 
 @dataclass(frozen=True)
 class DensifySchedule:
-    """When the set of Gaussians changes, in steps of this run (already scaled with its length).
+    """The steps at which the set of Gaussians changes, in steps of this run (already scaled with its length).
 
     Attributes:
         start, stop: changes happen strictly between the two.
@@ -55,7 +55,7 @@ class Densifier(Protocol):
     """Every Gaussian receives a gradient in every step, seen or not."""
 
     def wants_signal(self, step: int) -> bool:
-        """Whether ``after_backward`` needs the gradient of the 2D means at ``step``."""
+        """Return whether ``after_backward`` needs the gradient of the 2D means at ``step``."""
         ...
 
     def after_backward(self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]) -> None:
@@ -63,11 +63,11 @@ class Densifier(Protocol):
         ...
 
     def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
-        """What changes after ``step``; None if nothing does."""
+        """Return the edit after ``step``; None if nothing changes."""
         ...
 
     def regularizers(self, parameters: Gaussians) -> dict[str, Tensor]:
-        """Differentiable scalars, already weighted, that are added to the loss, by name."""
+        """Return differentiable scalars, already weighted, that are added to the loss, by name."""
         ...
 
     def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
@@ -75,11 +75,11 @@ class Densifier(Protocol):
         ...
 
     def limit(self, max_gaussians: int) -> None:
-        """Add none beyond so many from now on; those that there are stay. Not part of the state."""
+        """Limit the number of Gaussians from now on; none are removed. Not part of the state."""
         ...
 
     def state(self) -> dict[str, Tensor]:
-        """What a checkpoint must hold."""
+        """Return the tensors that a checkpoint must hold, by name."""
         ...
 
     def load_state(self, state: dict[str, Tensor]) -> None:
@@ -164,7 +164,7 @@ class DefaultDensifier:
 
 @dataclass(frozen=True)
 class EditPlan:
-    """Which of the N old Gaussians stay as they are, are copied, are split in two: (N,) bool each.
+    """Masks (N,) bool of the old Gaussians that stay as they are, are copied, and are split in two.
 
     A copied Gaussian is also kept, a split one is not; those in none of the three are removed.
     """
@@ -177,7 +177,7 @@ class EditPlan:
 def plan_edit(
     parameters: Gaussians, score: Tensor, options: DefaultStrategy, extent: float, max_scale: float
 ) -> EditPlan:
-    """The plan of one densification.
+    """Return the plan of one densification.
 
     Args:
         score: (N,) mean gradient norm of the 2D means in NDC units.
@@ -203,7 +203,7 @@ def plan_edit(
 
 
 def _best_within(candidates: Tensor, score: Tensor, cost: Tensor, room: int) -> Tensor:
-    """(N,) bool: the candidates of highest score whose costs add up to at most ``room``; ties by index."""
+    """Return (N,) bool: the candidates of highest score whose costs add up to at most ``room``; ties by index."""
     indices = torch.nonzero(candidates)[:, 0]
     if int(cost[indices].sum()) <= room:
         return candidates
@@ -214,7 +214,7 @@ def _best_within(candidates: Tensor, score: Tensor, cost: Tensor, room: int) -> 
 
 
 def _with_lowered_opacities(result: EditResult, logit_opacities: Tensor) -> EditResult:
-    """``result`` followed by an opacity reset: at most 0.01 everywhere, its moments at zero."""
+    """Return ``result`` followed by an opacity reset: at most 0.01 everywhere, its moments at zero."""
     moved = logit_opacities if result.edit is None else result.edit.apply(logit_opacities)
     lowered = moved.clamp_max(math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
     changes = {**result.changes, "logit_opacities": lowered}

@@ -19,7 +19,7 @@ MARGIN = 0.15
 
 
 def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
-    """(N,) standard deviation of the 3D filter in world units: sqrt(0.2) * nearest depth / largest focal length.
+    """Return (N,) standard deviation of the 3D filter in world units: sqrt(0.2) * nearest depth / largest focal length.
 
     The nearest depth is over the cameras that see a Gaussian at depth > 0.2; a Gaussian that none sees gets the largest
     nearest depth of the others (1 where there are no others). Constant with respect to gradients.
@@ -41,7 +41,7 @@ def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
 
 
 def _visible_depth(means: Tensor, pose: Tensor, intrinsics: Tensor, width: int, height: int) -> Tensor:
-    """(N,) depth in one camera, infinite where it does not see the point."""
+    """Return (N,) depth in one camera, infinite where it does not see the point."""
     # Not a matrix product, whose sums may depend on the number of threads.
     rotation, translation = pose[:3, :3], pose[:3, 3]
     x, y, z = ((means * row).sum(1) + shift for row, shift in zip(rotation, translation, strict=True))
@@ -54,7 +54,7 @@ def _visible_depth(means: Tensor, pose: Tensor, intrinsics: Tensor, width: int, 
 
 
 def fuse_filter(gaussians: Gaussians, std: Tensor) -> Gaussians:
-    """Gaussians convolved with the filter: s' = sqrt(s^2 + f^2), o' = o * prod_k s_k / s'_k; differentiable.
+    """Return Gaussians convolved with the filter: s' = sqrt(s^2 + f^2), o' = o * prod_k s_k / s'_k; differentiable.
 
     All in logarithms, one axis at a time, because products of scales underflow: log o' / (1 - o') is taken from
     log o' and 1 - o' = (1 - o) + o (1 - prod), both sums of positive terms.

@@ -24,7 +24,7 @@ CUBE_PER_EXTENT = 3.0
 
 @dataclass(frozen=True)
 class StartValues:
-    """What the strategy asks of the first Gaussians.
+    """Scales and opacities of the first Gaussians, by strategy.
 
     Attributes:
         opacity: in (0, 1).
@@ -38,7 +38,7 @@ class StartValues:
 
     @staticmethod
     def for_strategy(strategy: Strategy) -> StartValues:
-        """The published start of ``strategy`` (3DGS-MCMC: more opaque and smaller)."""
+        """Return the published start of ``strategy`` (3DGS-MCMC: more opaque and smaller)."""
         match strategy:
             case McmcStrategy():
                 return StartValues(MCMC_OPACITY, MCMC_SCALE, strategy.max_gaussians)
@@ -50,7 +50,7 @@ class StartValues:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is known of a scene before training, in world units.
+    """Cameras and extent of a scene before training, in world units.
 
     Attributes:
         camera_centers: (V, 3) of the training cameras.
@@ -82,7 +82,7 @@ def initial_gaussians(
     sh_degree: int,
     generator: torch.Generator,
 ) -> Gaussians:
-    """The first Gaussians of a run: isotropic, as large as the distance to the three nearest neighbours.
+    """Return the first Gaussians of a run: isotropic, as large as the distance to the three nearest neighbours.
 
     ``RandomInit`` draws a cube around the origin. ``PointsInit`` takes the finite ones of the scene's points; where
     there are none it draws a cube, around the origin or else around the cameras' mean and as large as their extent.
@@ -132,7 +132,7 @@ def _isotropic(xyz: Tensor, base: Tensor, start: StartValues, sh_degree: int) ->
 
 
 def mean_squared_neighbour_distance(xyz: Tensor) -> Tensor:
-    """(N,) mean squared distance to the three nearest other points, at least 1e-7; ``xyz`` is (N, 3).
+    """Return (N,) mean squared distance to the three nearest other points, at least 1e-7; ``xyz`` is (N, 3).
 
     With fewer than four points the mean is over those there are; a single point gets 1e-2.
     """

@@ -28,7 +28,7 @@ class McmcDensifier:
     touches_all = True
 
     def __init__(self, options: McmcStrategy, schedule: DensifySchedule, growth: float) -> None:
-        """``growth`` is the fraction of Gaussians added per change, adapted to the run's length."""
+        """Take the options; ``growth`` is the fraction of Gaussians added per change at the run's length."""
         self.options, self.schedule, self.growth = options, schedule, growth
         self.max_gaussians = options.max_gaussians
 
@@ -77,7 +77,7 @@ class McmcDensifier:
         }
 
     def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
-        """means += noise * lr * sigmoid(100 (0.005 - o)) * Sigma eta, with eta standard normal."""
+        """Add noise * lr * sigmoid(100 (0.005 - o)) * Sigma eta to the means, with eta standard normal."""
         if self.options.noise == 0:
             return
         drawn = parameters.logit_opacities.detach() < math.log(NOISE_MAX_OPACITY / (1 - NOISE_MAX_OPACITY))
@@ -103,7 +103,7 @@ class McmcDensifier:
         return None
 
     def _share(self, opacities: Tensor, log_scales: Tensor, picks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Opacities, log scales and a mask of changed rows, after each row shares itself with its ``picks``."""
+        """Return opacities, log scales and a mask of changed rows after each picked row has become several copies."""
         copies = torch.bincount(picks, minlength=len(opacities)) + 1
         shared = copies > 1
         opacities, log_scales = opacities.clone(), log_scales.clone()
@@ -114,7 +114,7 @@ class McmcDensifier:
 
 
 def relocated(opacities: Tensor, copies: Tensor, min_opacity: float = 0.005) -> tuple[Tensor, Tensor]:
-    """Opacity and scale factor of N coincident copies that composite to one Gaussian of opacity o.
+    """Return the opacities and scale factors of N coincident copies that composite to one Gaussian of opacity o.
 
     o' = 1 - (1 - o)^(1/N); the scale factor keeps the integral of the composited 1-D profile:
     o / sum_{j=1..N} C(N, j) (-1)^(j-1) o'^j / sqrt(j), which is the published double sum with its inner binomials added
@@ -140,6 +140,6 @@ def relocated(opacities: Tensor, copies: Tensor, min_opacity: float = 0.005) -> 
 
 
 def _binomials() -> Tensor:
-    """(51, 51) table of C(N, j), float64."""
+    """Return (51, 51) table of C(N, j), float64."""
     rows = [[float(math.comb(n, j)) for j in range(MAX_COPIES + 1)] for n in range(MAX_COPIES + 1)]
     return torch.tensor(rows, dtype=torch.float64, device="cpu")

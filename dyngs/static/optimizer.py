@@ -104,7 +104,7 @@ class GaussianOptimizer:
         return optimizer
 
     def _harmonics_rates(self) -> Tensor:
-        """(K * 3,) one rate per coefficient."""
+        """Return (K * 3,) one rate per coefficient."""
         rates = torch.full(
             (self.parameters.sh.shape[1], 3), self.options.lr_sh_rest, device=self.parameters.means.device
         )
@@ -112,7 +112,7 @@ class GaussianOptimizer:
         return rates.reshape(-1)
 
     def _rows_with_gradient(self) -> Tensor:
-        """(N,) bool; opacity or position: a Gaussian at full opacity gets no gradient on its opacity alone."""
+        """Return (N,) bool; opacity or position: a Gaussian at full opacity gets no gradient on its opacity alone."""
         opacity_grad, means_grad = self.parameters.logit_opacities.grad, self.parameters.means.grad
         if opacity_grad is None or means_grad is None:
             return torch.ones(len(self.parameters), dtype=torch.bool, device=self.parameters.means.device)

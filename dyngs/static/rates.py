@@ -1,4 +1,4 @@
-"""How far learning rates have fallen at a step of a run."""
+"""Progress of falling learning rates over a run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Rates:
     rewind: float = 1.0
 
     def progress(self, step: int, since: int = 0) -> float:
-        """0 up to step ``since`` and 1 at the end, of rates that fall from ``since`` on."""
+        """Return 0 up to step ``since``, rising to 1 at the end: the progress of rates that fall from ``since`` on."""
         at = float(step)
         if step > self.steps:
             tuned = min((step - self.steps) / max(self.tuning, 1), 1.0)

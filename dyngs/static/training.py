@@ -1,4 +1,4 @@
-"""How a static scene is trained: on every picture, with its 3D filter kept up to date."""
+"""Training of a static scene: on every picture, with its 3D filter kept up to date."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dyngs.static.scene import StaticScene
 
 
 class FilterUpdate:
-    """When Mip-Splatting's 3D filter is computed again.
+    """Recomputation of Mip-Splatting's 3D filter at given steps.
 
     Args:
         cameras: the training cameras; none: there is no filter.

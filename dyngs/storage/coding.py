@@ -24,7 +24,7 @@ _SMALLEST_DICTIONARY, _LARGEST_DICTIONARY = 2**12, 2**24
 
 @dataclass(frozen=True)
 class Packing:
-    """How an array of whole numbers became bytes.
+    """The way an array of integers was packed into bytes.
 
     Attributes:
         axis: differences along it are stored, -1: the numbers themselves.
@@ -44,7 +44,7 @@ class Packing:
 
 
 def packed(whole: np.ndarray) -> tuple[Packing, bytes]:
-    """The smallest of some ways to store ``whole`` (int64, any shape) as bytes."""
+    """Return the smallest of some ways to store ``whole`` (int64, any shape) as bytes."""
     if whole.size < _FEW:
         packing, plain = _laid_out(whole, -1, by_rows=True)
         return packing, compressed(plain)
@@ -57,7 +57,7 @@ def packed(whole: np.ndarray) -> tuple[Packing, bytes]:
 
 
 def unpacked(packing: Packing, data: bytes, shape: tuple[int, ...]) -> np.ndarray:
-    """int64 numbers of ``shape``. Raises DyngsError if the bytes are not those of so many numbers."""
+    """Return int64 numbers of ``shape``. Raises DyngsError if the bytes do not hold that many numbers."""
     count = math.prod(shape)
     plain = np.frombuffer(decompressed(data, packing.planes * count), dtype=np.uint8).reshape(packing.planes, count)
     stored = np.zeros(count, dtype=np.uint64)
@@ -73,7 +73,7 @@ def unpacked(packing: Packing, data: bytes, shape: tuple[int, ...]) -> np.ndarra
 
 
 def compressed(plain: bytes, *, room: int | None = None, quick: bool = False) -> bytes:
-    """``plain`` as LZMA2 without headers.
+    """Return ``plain`` as LZMA2 without headers.
 
     Args:
         room: the size that it will be read with, where that is not its own.
@@ -83,7 +83,7 @@ def compressed(plain: bytes, *, room: int | None = None, quick: bool = False) ->
 
 
 def decompressed(data: bytes, size: int, *, exact: bool = True) -> bytes:
-    """The ``size`` bytes that ``data`` holds (at most so many, if not ``exact``); never takes memory for more.
+    """Return the ``size`` bytes that ``data`` holds (at most so many, if not ``exact``); never takes memory for more.
 
     Raises:
         DyngsError: there are not so many, or something else follows them.
@@ -99,7 +99,7 @@ def decompressed(data: bytes, size: int, *, exact: bool = True) -> bytes:
 
 
 def _laid_out(whole: np.ndarray, axis: int, by_rows: bool) -> tuple[Packing, bytes]:
-    """The numbers as bytes, before compression."""
+    """Return the numbers as bytes, before compression."""
     if axis >= 0:
         whole = np.diff(whole, axis=axis, prepend=np.int64(0))
     signed = bool((whole < 0).any())
@@ -111,6 +111,6 @@ def _laid_out(whole: np.ndarray, axis: int, by_rows: bool) -> tuple[Packing, byt
 
 
 def _filters(preset: int, size: int) -> list[dict[str, int]]:
-    """LZMA2 with a dictionary for ``size`` bytes: a larger one costs time and memory for nothing."""
+    """Return LZMA2 filters with a dictionary for ``size`` bytes: a larger one only costs time and memory."""
     dictionary = min(max(1 << max(size - 1, 1).bit_length(), _SMALLEST_DICTIONARY), _LARGEST_DICTIONARY)
     return [{"id": lzma.FILTER_LZMA2, "preset": preset, "dict_size": dictionary, "lc": 4, "lp": 0, "pb": 0}]

@@ -1,4 +1,4 @@
-"""What of a scene is stored in a file, and how it becomes the tensors of a checkpoint again.
+"""The tensors of a scene that a .dyngs file stores, and their conversion back to those of a checkpoint.
 
 Tensors have the names of checkpoints (``gaussians.means``, ``model.rows``), but for the harmonics, which are stored as
 ``gaussians.sh_base`` (N, 3) and ``gaussians.sh_rest`` (N, K - 1, 3).

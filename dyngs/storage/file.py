@@ -61,7 +61,7 @@ class _Part(BaseModel):
 
 
 class SceneInfo(_Part):
-    """What a checkpoint says of itself; see ``dyngs.training.state.CheckpointInfo``."""
+    """Metadata of a checkpoint; see ``dyngs.training.state.CheckpointInfo``."""
 
     step: int
     extent: float
@@ -88,7 +88,7 @@ class _Entry(_Part):
 
     @property
     def stored_shape(self) -> tuple[int, ...]:
-        """Of the whole numbers: rotations are stored as three."""
+        """Shape of the stored integers: rotations are stored as three."""
         return (*self.shape[:-1], 3) if self.kind is Kind.ROTATION else self.shape
 
 
@@ -99,7 +99,7 @@ class _Header(_Part):
 
 @dataclass(frozen=True)
 class StoredScene:
-    """What a file holds.
+    """Contents of a .dyngs file.
 
     Attributes:
         info: about the run.
@@ -123,7 +123,7 @@ def write_scene(path: Path, data: bytes) -> None:
 
 
 def read_scene(path: Path) -> StoredScene:
-    """The scene in a file.
+    """Return the scene in a file.
 
     Raises:
         DyngsError: a file that is missing, truncated, altered, or of another version; one line that names it.
@@ -171,7 +171,7 @@ def encoded(info: SceneInfo, scene: Scene, steps: Mapping[str, float], coarsenes
 
 
 def decoded(data: bytes) -> StoredScene:
-    """The scene in the bytes of a file.
+    """Return the scene in the bytes of a file.
 
     Raises:
         DyngsError: anything but what ``encoded`` makes.
@@ -208,7 +208,7 @@ def decoded(data: bytes) -> StoredScene:
 
 
 def _steps(header: _Header, tensors: Mapping[str, Tensor]) -> dict[str, float]:
-    """Those with which the tensors would be stored again as they are; 0 for what is exact though it need not be."""
+    """Return the steps that would store the tensors again unchanged; 0 for tensors stored exactly without need."""
     steps: dict[str, float] = {}
     for entry in header.tensors:
         x = tensors[entry.name]
@@ -219,7 +219,7 @@ def _steps(header: _Header, tensors: Mapping[str, Tensor]) -> dict[str, float]:
 
 
 def _stored(name: str, x: Tensor, coding: Coding, coarseness: np.ndarray | None) -> tuple[_Entry, bytes]:
-    """What the header says of a tensor, and its data."""
+    """Return the header entry of a tensor, and its data."""
     whole = to_whole(x, coding, coarseness)
     packing, block = packed(whole.numbers)
     entry = _Entry(

@@ -1,4 +1,4 @@
-"""How exactly a trained scene must be stored: measured on pictures of its capture."""
+"""Storage precision of a trained scene, measured on pictures of its capture."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ Pictures = Callable[[Scene], list[Tensor]]
 
 @dataclass(frozen=True)
 class StoragePlan:
-    """How a scene is stored.
+    """Precision and coarseness with which a scene is stored.
 
     Attributes:
         precision: steps, and how much the pictures change.
@@ -62,7 +62,7 @@ class StoragePlan:
 
 @dataclass(frozen=True)
 class _Shot:
-    """What one training picture shows: a camera and a time."""
+    """Camera and time of one training picture."""
 
     cameras: Cameras
     time: float | None
@@ -106,7 +106,7 @@ def storage_plan(config: Config, checkpoint: Checkpoint, scene: Scene, max_chang
 
 
 def _shots(config: Config, capture: Capture, scene: Scene, count: int) -> list[_Shot]:
-    """At most ``count`` training views, evenly chosen; where they have no times, those of the scene."""
+    """Return at most ``count`` training views, evenly chosen; where they have no times, those of the scene."""
     chosen = _chosen(capture, count)
     times: Sequence[float | None] = [view.time for view in chosen]
     if scene.times and None in times:
@@ -116,7 +116,7 @@ def _shots(config: Config, capture: Capture, scene: Scene, count: int) -> list[_
 
 
 def _chosen(capture: Capture, count: int) -> list[View]:
-    """At most ``count`` training views, evenly chosen."""
+    """Return at most ``count`` training views, evenly chosen."""
     views = capture.splits["train"]
     count = min(count, len(views))
     return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]

@@ -11,7 +11,7 @@ INNER, OUTLYING = 0.01, 64.0
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
-    """(N,) indices of ``points`` (N, 3) along a Z-shaped curve through their box (Morton 1966); ties by index."""
+    """Return (N,) indices of ``points`` (N, 3) along a Z-order curve through their box (Morton 1966); ties by index."""
     if not len(points):
         return np.zeros(0, dtype=np.int64)
     places = points.astype(np.float64)
@@ -30,7 +30,7 @@ def morton_order(points: np.ndarray) -> np.ndarray:
 
 
 def storage_order(means: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(N,) indices of ``means`` (N, 3): those that move (``rows``, (M,)), then the others, both in Morton order."""
+    """Return (N,) indices of ``means`` (N, 3): moving ones (``rows``, (M,)), then the others, both in Morton order."""
     still = np.ones(len(means), dtype=bool)
     still[rows] = False
     rest = np.flatnonzero(still)

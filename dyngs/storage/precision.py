@@ -1,4 +1,4 @@
-"""How exactly each attribute must be stored so that the pictures change by no more than is allowed.
+"""Precision of each attribute at which the pictures change by no more than is allowed.
 
 Rounding with step s adds an error of about c s^2 to the pictures and costs -log2 s bits per value. The sum of errors is
 given, the sum of bits is to be least: then every group of tensors may add errors in proportion to its number of values
@@ -39,7 +39,7 @@ Draw = Callable[[Mapping[str, Tensor]], Sequence[Tensor]]
 
 @dataclass(frozen=True)
 class Precision:
-    """Steps, and what they do.
+    """Quantisation steps and the change of pictures that they cause.
 
     Attributes:
         steps: of each group of tensors; 0: it is stored as it is.
@@ -53,7 +53,7 @@ class Precision:
 
 
 def coarseness_of(visibility: Tensor) -> Tensor:
-    """(N,) uint8, by how many octaves each Gaussian may be stored more coarsely than those that show most.
+    """Return (N,) uint8 octaves by which each Gaussian may be stored more coarsely than the most visible ones.
 
     An error of a Gaussian counts with the square of its weight in the pictures: half an octave per octave.
 
@@ -93,7 +93,7 @@ def measured_precision(
     coarseness = checked_coarseness(exact[COARSENESS], len(exact["gaussians.means"])) if COARSENESS in exact else None
 
     def change(steps: Mapping[str, float], names: Iterable[str] = exact) -> float:
-        """Mean square over all values, with the tensors of these names quantised."""
+        """Return the mean square over all values, with the tensors of these names quantised."""
         rounded = dict(exact)
         for name in names:
             coding = coding_of(name, exact[name], steps, by_coarseness=coarseness is not None)
@@ -120,7 +120,7 @@ def measured_precision(
 
 
 def mean_square_change(before: Sequence[Tensor], after: Sequence[Tensor]) -> float:
-    """Over all values of pictures in [0, 1], after clamping; NaN where one of them is."""
+    """Return the mean square over all values of pictures in [0, 1], after clamping; NaN where one of them is."""
     total = sum(
         float((x.clamp(0, 1) - y.clamp(0, 1)).double().square().sum()) for x, y in zip(before, after, strict=True)
     )
@@ -130,7 +130,7 @@ def mean_square_change(before: Sequence[Tensor], after: Sequence[Tensor]) -> flo
 def _scaled(
     steps: dict[str, float], change: Callable[[Mapping[str, float]], float], allowed: float
 ) -> tuple[dict[str, float], float]:
-    """All steps by one factor, so that together they change the pictures by what is allowed, or a little less.
+    """Return all steps times one factor, so that together they change the pictures by what is allowed or less.
 
     And the mean square change that they make, which is larger only where no factor that was tried is small enough.
     """
@@ -150,7 +150,7 @@ def _scaled(
 
 
 def _largest_step(change: Callable[[float], float], group: Sequence[Tensor], allowed: float) -> tuple[float, bool]:
-    """The largest step tried that changes the pictures by at most ``allowed``, else the finest; and whether it does.
+    """Return the largest step tried that changes pictures by at most ``allowed``, else the finest; and whether it does.
 
     The first one tried where these pictures do not depend on the group at all: others may.
     """
@@ -176,7 +176,7 @@ def _largest_step(change: Callable[[float], float], group: Sequence[Tensor], all
 
 
 def _usual_size(values: Tensor) -> tuple[float, float]:
-    """The largest of the values but outliers, and the mean of their squares."""
+    """Return the largest of the values without outliers, and the mean of their squares."""
     sizes = values.abs().double()
     nonzero = sizes[sizes > 0]
     if not len(nonzero):
@@ -187,7 +187,7 @@ def _usual_size(values: Tensor) -> tuple[float, float]:
 
 
 def _groups(tensors: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
-    """Name of a group to its tensors by name."""
+    """Return the tensors by name of each group."""
     groups: dict[str, dict[str, Tensor]] = {}
     for name, x in tensors.items():
         group = group_of(name, x)

@@ -1,4 +1,4 @@
-"""Numbers to whole numbers and back, with a stated step.
+"""Quantisation of numbers to integers and back, with a given step.
 
 Steps are 4, 5, 6 or 7 times a power of two and whole numbers stay below ``LIMIT``, so that the products are exact in
 float32: what was decoded is encoded to the same integers again, on any machine.
@@ -27,13 +27,13 @@ OPACITY_STEPS = 2.0**-12, 1 / 8
 
 
 def step_below(step: float) -> float:
-    """The largest allowed step that does not exceed ``step``, or the smallest one."""
+    """Return the largest allowed step that does not exceed ``step``, or the smallest one."""
     fraction, exponent = math.frexp(min(max(step, SMALLEST_STEP), LARGEST_STEP))
     return math.ldexp(math.floor(8 * fraction) / 8, exponent)
 
 
 def is_step(step: float) -> bool:
-    """Whether ``step`` is one of those allowed."""
+    """Return whether ``step`` is one of those allowed."""
     return SMALLEST_STEP <= step <= LARGEST_STEP and step_below(step) == step
 
 
@@ -42,7 +42,7 @@ Steps = float | np.ndarray
 
 
 def to_grid(values: np.ndarray, step: Steps, rounding: float = NEAREST) -> tuple[np.ndarray, np.ndarray]:
-    """int32 multiples of ``step`` nearest to ``values``, and where they are out of reach (there they are 0).
+    """Return int32 multiples of ``step`` nearest to ``values``, and where they are out of reach (there they are 0).
 
     Args:
         values: finite, any shape.
@@ -56,24 +56,24 @@ def to_grid(values: np.ndarray, step: Steps, rounding: float = NEAREST) -> tuple
 
 
 def from_grid(whole: np.ndarray, step: Steps) -> np.ndarray:
-    """float64 values, exact in float32."""
+    """Return float64 values, exact in float32."""
     return whole.astype(np.float64) * step
 
 
 def opacities_to_grid(logits: np.ndarray, step: float) -> np.ndarray:
-    """int32 multiples of ``step`` nearest to the opacities of ``logits``."""
+    """Return int32 multiples of ``step`` nearest to the opacities of ``logits``."""
     opacities = 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -700, 700)))
     return np.floor(opacities / step + 0.5).astype(np.int32)
 
 
 def opacities_from_grid(whole: np.ndarray, step: float) -> np.ndarray:
-    """float64 logits; finite, as 0 becomes an eighth of a step (not drawn) and 1 a little less than 1."""
+    """Return float64 logits; finite, as 0 becomes an eighth of a step (not drawn) and 1 a little less than 1."""
     opacities = np.clip(from_grid(whole, step), step / 8, 1 - step / 64)
     return np.log(opacities) - np.log1p(-opacities)
 
 
 def rotations_to_grid(quats: np.ndarray, step: float) -> np.ndarray:
-    """(N, 3) int32 multiples of ``step``: the vector part of unit quaternions whose scalar part is about the largest.
+    """Return (N, 3) int32 multiples of ``step``: vector parts of unit quaternions with an about largest scalar part.
 
     Half turns about its own axes do not change a Gaussian: of the four quaternions that they make, one with a large
     scalar part is taken. A zero quaternion is the identity. Coded again, the result stays the same.
@@ -93,14 +93,14 @@ def rotations_to_grid(quats: np.ndarray, step: float) -> np.ndarray:
 
 
 def rotations_from_grid(whole: np.ndarray, step: float) -> np.ndarray:
-    """(N, 4) unit quaternions wxyz, float64."""
+    """Return (N, 4) unit quaternions wxyz, float64."""
     vector = from_grid(whole, step)
     scalar = np.sqrt(np.clip(1 - np.square(vector).sum(1), 0, None))
     return np.concatenate([scalar[:, None], vector], axis=1)
 
 
 def sorted_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same N Gaussians with their shortest axis first and their longest last.
+    """Return the same N Gaussians with their shortest axis first and their longest last.
 
     Args:
         quats: (N, 4) wxyz; zero is the identity.
@@ -126,7 +126,7 @@ _AXIS_TURNS = {
 
 
 def _scalar_largest(quats: np.ndarray, margin: float) -> np.ndarray:
-    """(N, 4) unit quaternions of the same axes, the scalar part positive and at most ``margin`` below the largest."""
+    """Return (N, 4) unit quaternions of the same axes, scalar part positive, at most ``margin`` below the largest."""
     unit = _unit(quats)
     size = np.abs(unit)
     size[:, 0] += margin
@@ -136,7 +136,7 @@ def _scalar_largest(quats: np.ndarray, margin: float) -> np.ndarray:
 
 
 def _unit(quats: np.ndarray) -> np.ndarray:
-    """(N, 4) float64 of unit length; zero becomes the identity."""
+    """Return (N, 4) float64 of unit length; zero becomes the identity."""
     wide = quats.astype(np.float64)
     length = np.sqrt(np.square(wide).sum(1, keepdims=True))
     return np.where(length > 0, wide / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""Tensors as whole numbers and back: which kind of number each is, and how exactly it is kept."""
+"""Conversion of tensors to integers and back: the kind and precision of each."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from dyngs.storage.quantize import (
 
 
 class Kind(str, Enum):
-    """How values become whole numbers."""
+    """Ways to convert values to integers."""
 
     EXACT = "exact"
     HALF = "half"
@@ -71,7 +71,7 @@ FIXED_STEPS = {
 
 @dataclass(frozen=True)
 class Coding:
-    """How one tensor is stored.
+    """Kind and precision with which one tensor is stored.
 
     Attributes:
         kind: of its numbers.
@@ -91,7 +91,7 @@ class Coding:
             raise ValueError(f"no such coding: {self}")
 
     def steps(self, coarseness: np.ndarray | None, num_axes: int) -> Steps:
-        """The step, or those of all rows of an array with so many axes."""
+        """Return the step, or those of all rows of an array with so many axes."""
         if not self.by_coarseness:
             return self.step
         if coarseness is None:
@@ -101,7 +101,7 @@ class Coding:
 
 @dataclass(frozen=True)
 class Whole:
-    """A tensor as whole numbers.
+    """A tensor as integers.
 
     Attributes:
         numbers: int64, the shape of the tensor; (N, 3) for rotations.
@@ -113,7 +113,7 @@ class Whole:
 
 
 def group_of(name: str, x: Tensor) -> str | None:
-    """Name of the tensors that share a step with this one: less the number at its end; None where it has no step."""
+    """Return the name of the group that shares a step, without the number at its end; None where there is no step."""
     if x.dtype != torch.float32 or name == RELATIVE or name in FIXED_STEPS:
         return None
     if x.numel() <= FEW and not name.startswith("gaussians."):
@@ -122,7 +122,7 @@ def group_of(name: str, x: Tensor) -> str | None:
 
 
 def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness: bool = False) -> Coding:
-    """How a tensor is stored.
+    """Return the coding of a tensor.
 
     Args:
         name: as in ``dyngs.storage.drawable``.
@@ -149,7 +149,7 @@ def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness
 
 
 def to_whole(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> Whole:
-    """The whole numbers of ``x``; ``coarseness`` (N,) of its rows, where they have any."""
+    """Return ``x`` as integers; ``coarseness`` (N,) of its rows, where they have any."""
     values, far = x.detach().contiguous().numpy(), np.zeros((0, 2), dtype=np.int64)
     if coding.kind is Kind.ROTATION:
         numbers = rotations_to_grid(values, coding.step)
@@ -167,7 +167,7 @@ def to_whole(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) ->
 
 
 def from_whole(whole: Whole, coding: Coding, dtype: torch.dtype, coarseness: np.ndarray | None = None) -> Tensor:
-    """The tensor again.
+    """Return the tensor that ``to_whole`` turned into integers.
 
     Raises:
         ValueError, OverflowError: numbers that ``to_whole`` does not make.
@@ -189,12 +189,12 @@ def from_whole(whole: Whole, coding: Coding, dtype: torch.dtype, coarseness: np.
 
 
 def restored(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> Tensor:
-    """``x`` as it will be read again."""
+    """Return ``x`` as it is read back."""
     return from_whole(to_whole(x, coding, coarseness), coding, x.dtype, coarseness)
 
 
 def checked_coarseness(values: Tensor, count: int) -> np.ndarray:
-    """(N,) whole numbers from 0 to ``MAX_COARSENESS``. Raises ValueError for anything else."""
+    """Return (N,) integers from 0 to ``MAX_COARSENESS``. Raises ValueError for anything else."""
     whole = values.to(torch.int64).numpy()
     if whole.shape != (count,) or (count and not 0 <= whole.min() <= whole.max() <= MAX_COARSENESS):
         raise ValueError("its coarseness is not one small number per Gaussian")
@@ -202,7 +202,7 @@ def checked_coarseness(values: Tensor, count: int) -> np.ndarray:
 
 
 def _bits(values: np.ndarray) -> np.ndarray:
-    """int64 of the same shape: whole numbers as they are, the bits of others."""
+    """Return int64 of the same shape: integers as they are, the bits of others."""
     if values.dtype.kind != "f":
         return values.astype(np.int64)
     return values.view(f"i{values.itemsize}").astype(np.int64)

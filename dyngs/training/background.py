@@ -1,4 +1,4 @@
-"""Which colour lies behind the pictures."""
+"""The background colour of training and evaluation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _BACKGROUNDS = {"white": 1.0, "black": 0.0}
 
 
 def evaluation_background(choice: str, has_alpha: bool) -> tuple[str, Tensor]:
-    """Name and (3,) colour of the background to evaluate on: that of training, black where that was random.
+    """Return the name and (3,) colour of the background to evaluate on: that of training, black where that was random.
 
     Args:
         choice: ``data.background`` of the config.
@@ -20,7 +20,7 @@ def evaluation_background(choice: str, has_alpha: bool) -> tuple[str, Tensor]:
 
 
 def background_colour(name: str, generator: torch.Generator | None = None) -> Tensor:
-    """(3,) of a run's "white", "black" or "random" background; random ones need a generator, else they are black."""
+    """Return the (3,) colour of a "white", "black" or "random" background; a random one without generator is black."""
     if name == "random" and generator is not None:
         return torch.rand(3, generator=generator, device="cpu")
     return torch.full((3,), _BACKGROUNDS["black" if name == "random" else name], device="cpu")

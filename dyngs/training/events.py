@@ -1,4 +1,4 @@
-"""What training tells while it goes: typed events, and those who listen.
+"""Typed events of training and their listeners.
 
 A progress bar, a log, limits on the result and a viewer are all listeners; training knows none of them.
 """
@@ -41,7 +41,7 @@ class StepReport:
 
     @cached_property
     def psnr(self) -> float:
-        """Of the picture, dB, at most 100; NaN where its mask leaves nothing, or it is not finite."""
+        """PSNR of the picture, dB, at most 100; NaN where its mask leaves nothing, or it is not finite."""
         return psnr(self.rendered, self.truth, self.picture.mask)
 
 
@@ -88,12 +88,12 @@ class StepDone:
 
     @property
     def bad_gradients(self) -> int:
-        """How often so far a Gaussian was left out of a step because its gradient was not finite."""
+        """Number of rows left out of steps so far because their gradient was not finite."""
         return self.loop.trainer.bad_gradients
 
     @property
     def seconds(self) -> float:
-        """Of training so far, over all resumes."""
+        """Seconds of training so far, over all resumes."""
         return self.loop.watch.seconds
 
 

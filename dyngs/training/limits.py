@@ -39,7 +39,7 @@ def require_possible(config: Config) -> None:
 
 
 def within_cap(config: Config, num_times: int) -> Config:
-    """``config`` with what decides the number of Gaussians lowered to its limits; the same object where it has none.
+    """Return ``config`` with all numbers of Gaussians lowered to its limits; the same object where it has none.
 
     Args:
         config: of a run.
@@ -60,7 +60,7 @@ def within_cap(config: Config, num_times: int) -> Config:
 
 
 def most_gaussians(config: Config, num_times: int) -> int | None:
-    """How many Gaussians a run may end with by its limits; None: as many as it wants.
+    """Return the largest number of Gaussians at the end by the limits of the run; None without one.
 
     Args:
         config: of a run.
@@ -76,7 +76,7 @@ def most_gaussians(config: Config, num_times: int) -> int | None:
 
 
 def room(config: Config, num_times: int, megabytes: float) -> int:
-    """How many Gaussians a file of so many 1e6 bytes holds, stored as exactly as is usual.
+    """Return the number of Gaussians that fit in a file of so many 1e6 bytes at the usual precision.
 
     Raises:
         DyngsError: fewer than ``FEWEST``; says which size has room for them.
@@ -97,6 +97,6 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
 
 
 def _field_values(options: DeformField, num_times: int, num_moving: int) -> int:
-    """Numbers that a field learns."""
+    """Return the number of values that a field learns."""
     setup = FieldSetup(torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0)
     return new_field(options, setup, torch.Generator()).parameters.num_values

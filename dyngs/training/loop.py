@@ -12,7 +12,7 @@ from dyngs.training.state import Checkpoint
 
 
 class Trainable(Protocol):
-    """What the loop trains: a scene, or a network that predicts scenes."""
+    """Interface of the trainers that the loop runs: of a scene, or of a network that predicts scenes."""
 
     done: int
     """Steps done."""

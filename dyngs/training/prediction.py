@@ -52,13 +52,13 @@ class Filmed:
     _maps: dict[int, TexelMaps] = field(default_factory=dict)
 
     def maps(self, choice: int) -> TexelMaps:
-        """What the pictures of that choice show; kept."""
+        """Return the maps of the pictures of a choice; kept."""
         if choice not in self._maps:
             self._maps[choice] = self.look(self.choices[choice])
         return self._maps[choice]
 
     def look(self, views: list[int]) -> TexelMaps:
-        """What these pictures show."""
+        """Return the maps of these pictures."""
         return observe_texels(
             self.sitter, ((self.pictures[i], self.sitter.pose_in(self.sitter.views[i])) for i in views)
         )
@@ -131,7 +131,7 @@ class NetworkTrainer:
         return StepReport(step, float(total.detach()), picture, rendering.rgb[0].detach(), truth)
 
     def checkpoint(self) -> Checkpoint:
-        """Everything that ``restore`` needs."""
+        """Return everything that ``restore`` needs."""
         tensors = {f"model.network.{name}": x for name, x in self.network.state_dict().items()}
         tensors |= {"model.mean": self.mean, "rng": self.generator.get_state()}
         tensors |= {f"sampler.{name}": x for name, x in self.sampler.state().items()}
@@ -160,7 +160,7 @@ class NetworkTrainer:
         self.done = checkpoint.info.step
 
     def _targets(self, person: Filmed, inputs: list[int]) -> list[Picture]:
-        """Pictures of one moment that were not predicted from, where there are any."""
+        """Return pictures of one moment that were not predicted from, where there are any."""
         views = person.sitter.views
         others = [i for i in range(len(views)) if i not in inputs] or inputs
         frame = views[others[self._draw(len(others))]].frame
@@ -184,7 +184,7 @@ class NetworkTrainer:
 
 
 def assemble_network(config: Config, model: HumanPredictorModel) -> NetworkTrainer:
-    """The trainer of ``model.kind: human_predictor``: captures read, nothing trained.
+    """Return the trainer of ``model.kind: human_predictor``: captures read, nothing trained.
 
     Raises:
         DyngsError: ``data.root`` has no captures of people, or settings that do not go together.
@@ -209,7 +209,7 @@ def assemble_network(config: Config, model: HumanPredictorModel) -> NetworkTrain
 
 
 def new_network(model: HumanPredictorModel, generator: torch.Generator) -> AtlasNetwork:
-    """The untrained network of ``model``.
+    """Return the untrained network of ``model``.
 
     Raises:
         DyngsError: widths or a resolution that do not suit it.
@@ -224,7 +224,7 @@ def new_network(model: HumanPredictorModel, generator: torch.Generator) -> Atlas
 
 
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
-    """The mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the ``resolution``.
+    """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the ``resolution``.
 
     Raises:
         DyngsError: the checkpoint is of something else, or of another network.
@@ -241,7 +241,7 @@ def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int)
 
 
 def human_options(model: HumanPredictorModel) -> HumanModel:
-    """The section of one person with the same template, texels and scaffolds; nothing of it is learned."""
+    """Return the section of one person with the same template, texels and scaffolds; nothing of it is learned."""
     shared = ("body", "uv", "resolution", "scaffold_heights", "min_silhouette_share")
     drawn = ("near", "eps2d", "rasterize_mode", "alpha_min", "transmittance_min")
     none = {"refine": False, "offset_weight": 0, "scale_weight": 0, "rigidity": 0, "smoothness": 0}
@@ -249,7 +249,7 @@ def human_options(model: HumanPredictorModel) -> HumanModel:
 
 
 def captures_in(data: DataConfig) -> list[DataConfig]:
-    """Where the captures in the folders of ``data.root`` are, by name.
+    """Return the paths of the captures in the folders of ``data.root``, by name.
 
     Raises:
         DyngsError: there is no folder in it.
@@ -262,7 +262,7 @@ def captures_in(data: DataConfig) -> list[DataConfig]:
 
 
 def filmed(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> Filmed:
-    """The person of one capture, without choices of pictures.
+    """Return the person of one capture, without choices of pictures.
 
     Raises:
         DyngsError: no capture there, or not one of a person.
@@ -274,7 +274,7 @@ def filmed(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> 
 
 
 def mean_colours(people: list[Filmed], resolution: int) -> Tensor:
-    """(3, S, S) mean over people of the colours that their pictures show of the lowest scaffold.
+    """Return (3, S, S) mean over people of the colours that their pictures show of the lowest scaffold.
 
     Where nobody is seen: the mean of all that is.
     """
@@ -293,14 +293,14 @@ def mean_colours(people: list[Filmed], resolution: int) -> Tensor:
 
 
 def rate_at(model: HumanPredictorModel, step: int, steps: int) -> float:
-    """Of AdamW: up along a line, then down along one (one cycle; Smith and Topin 2017)."""
+    """Return the learning rate of AdamW: a linear rise, then a linear fall (one cycle; Smith and Topin 2017)."""
     top = max(1, round(WARM_UP * steps))
     share = step / top if step <= top else (steps - step) / max(steps - top, 1)
     return model.lr * max(share, _LOWEST)
 
 
 def _choices(sitter: CapturedPerson, model: HumanPredictorModel, generator: torch.Generator) -> list[list[int]]:
-    """Views to predict from: of a random moment each, one of them random, the others such that much is seen."""
+    """Return views to predict from, of a random moment each: one at random, the others chosen to see much."""
     firsts = torch.randint(len(sitter.views), (model.source_sets,), generator=generator, device="cpu").tolist()
     return [spread_views(sitter, model.source_views, first) for first in firsts]
 

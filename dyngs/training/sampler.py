@@ -19,7 +19,7 @@ class ViewSampler:
         self._position = 0
 
     def next(self, generator: torch.Generator, wanted: Callable[[int], bool]) -> int:
-        """Index of the next view that is ``wanted``, of which there must be one; others are passed over.
+        """Return the index of the next view that is ``wanted``, of which there must be one; others are passed over.
 
         ``generator`` is drawn from once per epoch.
         """

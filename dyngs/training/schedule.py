@@ -38,12 +38,12 @@ SPLITS = (0.1, 0.3, 0.5)
 
 
 def scaled(step: int, steps: int) -> int:
-    """``step`` of a 30,000-step run in a run of ``steps``; at least 1."""
+    """Return ``step`` of a 30,000-step run in a run of ``steps``; at least 1."""
     return max(1, round(step * steps / PUBLISHED_STEPS))
 
 
 def picture_divisor(options: TrainConfig, step: int) -> int:
-    """Divisor of the pictures' sides at ``step``: ``initial_downscale``, halved at even distances until it is 1."""
+    """Return the divisor of the pictures' sides at ``step``: ``initial_downscale``, halved evenly until it is 1."""
     halvings = options.initial_downscale.bit_length() - 1
     first, last = options.resolution_grows_from, max(options.resolution_grows_from, options.resolution_full_at)
     shares = [first + (last - first) * i / max(halvings - 1, 1) for i in range(halvings)]
@@ -51,23 +51,23 @@ def picture_divisor(options: TrainConfig, step: int) -> int:
 
 
 def rates_of(config: Config) -> Rates:
-    """When the learning rates of a run fall."""
+    """Return the course of the learning rates of a run."""
     stage = config.prune
     return Rates(config.train.steps, stage.steps, stage.rewind) if stage.is_wanted else Rates(config.train.steps)
 
 
 def means_rate(options: OptimConfig, progress: float, extent: float) -> float:
-    """Learning rate of the means, world units: log-linear in ``progress`` from 0 to 1, times the scene's extent."""
+    """Return the learning rate of the means, world units: log-linear in ``progress`` in [0, 1], times the extent."""
     return extent * math.exp((1 - progress) * math.log(options.lr_means) + progress * math.log(options.lr_means_final))
 
 
 def active_sh_degree(options: TrainConfig, step: int, max_degree: int) -> int:
-    """SH degree drawn at ``step``: one more each ``sh_every`` (scaled) steps."""
+    """Return the SH degree drawn at ``step``: one more each ``sh_every`` (scaled) steps."""
     return min(max_degree, step // scaled(options.sh_every, options.steps))
 
 
 def densify_schedule(strategy: DefaultStrategy | McmcStrategy, steps: int, white_background: bool) -> DensifySchedule:
-    """When ``strategy`` changes the set of Gaussians in a run of ``steps``.
+    """Return the steps at which ``strategy`` changes the set of Gaussians in a run of ``steps``.
 
     Opacities need as many steps to recover from a reset in a short run as in a long one. So resets are a fifth of the
     run apart, within [``MIN_RESET_GAP``, the published 3000], and the last is one period before densification stops (at
@@ -94,7 +94,7 @@ def densify_schedule(strategy: DefaultStrategy | McmcStrategy, steps: int, white
 
 
 def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:
-    """Gradient from which Gaussians are cloned or split in a run of ``steps``.
+    """Return the gradient norm from which Gaussians are cloned or split in a run of ``steps``.
 
     Changes come every ``every`` steps whatever the run's length, so that a short run has fewer of them; a lower
     threshold makes up for it. The fourth root was measured on lego: +0.5 dB at 2,000 steps, +0.3 dB at 7,000.
@@ -103,7 +103,7 @@ def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:
 
 
 def growth_per_change(strategy: McmcStrategy, steps: int) -> float:
-    """Fraction of Gaussians that MCMC adds per change.
+    """Return the fraction of Gaussians that MCMC adds per change.
 
     Changes come every ``every`` steps whatever the run's length, so that a short run has fewer of them; each then adds
     more, up to a quarter, and the count follows the same curve over the run.
@@ -113,13 +113,13 @@ def growth_per_change(strategy: McmcStrategy, steps: int) -> float:
 
 
 def filter_steps(strategy: Strategy, steps: int) -> range:
-    """Steps after which Mip-Splatting's 3D filter is recomputed: each 100 from the end of densification on."""
+    """Return the steps after which Mip-Splatting's 3D filter is recomputed: each 100 after densification ends."""
     first = -(-scaled(strategy.stop, steps) // FILTER_EVERY) * FILTER_EVERY
     return range(first, steps - FILTER_EVERY + 1, FILTER_EVERY)
 
 
 def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
-    """The phases of a dynamic model in a run with ``rates``; where ``freeze_below_px`` is 0 nothing is ever frozen.
+    """Return the phases of a dynamic model in a run with ``rates``; ``freeze_below_px`` 0 freezes nothing.
 
     While new times come in, the field learns at its first rate: what has slowed down follows nothing.
     """

@@ -1,4 +1,4 @@
-"""What a training must keep to go on later."""
+"""The state of a training run that a checkpoint stores."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OTHER_CONFIG = "was its config changed? Otherwise train anew"
 
 @dataclass(frozen=True)
 class CheckpointInfo:
-    """What a checkpoint says of itself.
+    """Metadata of a checkpoint.
 
     Attributes:
         step: steps done.

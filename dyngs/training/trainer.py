@@ -239,7 +239,7 @@ def _finite_sum(terms: dict[str, Tensor], step: int, picture: Picture) -> float:
 
 
 def _require_finite(gaussians: Gaussians, step: int, picture: Picture, moves_by: tuple[str, str]) -> None:
-    """A field may explode unseen, because Gaussians that are not finite are not drawn."""
+    """Raise if a Gaussian is not finite: it would not be drawn, so that a diverging field could go unseen."""
     broken = [name for name, x in gaussians.tensors().items() if not bool(x.detach().isfinite().all())]
     if broken:
         what, section = moves_by

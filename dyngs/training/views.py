@@ -1,4 +1,4 @@
-"""What training needs to know of a capture: cameras, times, surroundings, background."""
+"""Cameras, times, surroundings and background of a capture, as training needs them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ AROUND_ORIGIN = ("blender", "body_json")
 
 
 def surroundings(capture: Capture) -> Surroundings:
-    """What initialisation needs to know of a capture."""
+    """Return the properties of a capture that initialisation needs."""
     poses = np.stack([view.cam_from_world for view in capture.splits["train"]])
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
     points = capture.points
@@ -32,14 +32,14 @@ def surroundings(capture: Capture) -> Surroundings:
 
 
 def resolved_background(config: Config, capture: Capture) -> str:
-    """White, black or random; "auto" is white where pictures have alpha, as 3DGS has it, and black otherwise."""
+    """Return "white", "black" or "random"; "auto" is white where pictures have alpha, as in 3DGS, else black."""
     if config.data.background == "auto":
         return "white" if capture.has_alpha else "black"
     return config.data.background
 
 
 def training_cameras(views: Sequence[View], options: DataConfig) -> list[Cameras]:
-    """The cameras of ``views`` as pictures of their training size, one each; no picture is read."""
+    """Return the cameras of ``views`` as pictures of their training size, one each; no picture is read."""
     cameras = []
     for view in views:
         width, height = target_size(view.width, view.height, options.downscale, options.longest_side)
@@ -50,5 +50,5 @@ def training_cameras(views: Sequence[View], options: DataConfig) -> list[Cameras
 
 
 def training_times(capture: Capture) -> tuple[float, ...]:
-    """Times of the training views in [0, 1], ascending; empty without times."""
+    """Return the times of the training views in [0, 1], ascending; empty without times."""
     return tuple(sorted(view.time for view in capture.splits["train"] if view.time is not None))
