@@ -278,6 +278,19 @@ def test_keys_in_sentences_are_keys_of_the_configuration(page: Path) -> None:
             require_overrides(whole)
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_and_places_that_a_page_names_are_there(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:dyngs|tests|csrc|benchmarks|examples)/[\w/.]+)`", text):
+        assert (ROOT / name).exists(), f"{page.name}: there is no {name}"
+    for file, place in re.findall(r"\]\((?!http)([^)#]*)#?([^)]*)\)", text):
+        target = page.parent / file if file else page
+        assert target.exists(), f"{page.name}: there is no {file}"
+        titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE) if place else []
+        places = {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+        assert not place or place in places, f"{page.name}: {file} has no section {place}"
+
+
 # ------------------------------------------------------------------------------------------------------- really run
 
 
