@@ -82,7 +82,7 @@ from dyngs.training.views import (
 )
 
 FIRST_VIEWS = 50
-"""Pictures that say what a person looks like before training."""
+"""Number of pictures from which a person's first colours are taken."""
 
 
 @dataclass(frozen=True)

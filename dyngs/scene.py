@@ -183,7 +183,7 @@ class Scene(ABC):
         return replace(self, gaussians=gaussians)
 
     def changed(self) -> None:
-        """Forget what was derived from tensors that have been changed in place since."""
+        """Drop caches derived from tensors that have been changed in place."""
         self._derived.clear()
 
     def state(self) -> State:
@@ -202,7 +202,7 @@ class Scene(ABC):
 
     @abstractmethod
     def _model_state(self) -> State:
-        """Return what the kind of scene stores beside its Gaussians and colours."""
+        """Return the state of this kind of scene beside its Gaussians and colours."""
 
 
 def clamped_time(time: float | None) -> float:
@@ -236,7 +236,7 @@ class SceneTraining(Protocol[S]):
         ...
 
     def moment(self, scene: S, picture: Picture, step: int) -> Moment:
-        """Return what is drawn for ``picture`` in ``step``, and the penalties."""
+        """Return the moment drawn for ``picture`` in ``step``, with the penalties."""
         ...
 
     def optimize(self, scene: S, step: int) -> int:
@@ -292,5 +292,5 @@ class SceneTraining(Protocol[S]):
         ...
 
     def state(self) -> State:
-        """Return what a checkpoint must hold beside the scene."""
+        """Return the tensors that a checkpoint must hold beside the scene."""
         ...

@@ -63,7 +63,7 @@ class VisibilityMasks:
 
     @staticmethod
     def restored(state: Mapping[str, Tensor], count: int | None = None) -> VisibilityMasks | None:
-        """Return the masks of what ``state()`` returned; None of an empty state.
+        """Return the masks of a state that ``state()`` returned; None of an empty one.
 
         Args:
             state: by name.

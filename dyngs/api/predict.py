@@ -92,7 +92,7 @@ def network_config(run_dir: Path) -> tuple[Config, HumanPredictorModel]:
 
 
 def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: HumanPredictorModel, seconds: float) -> None:
-    """Write ``avatar`` as a run of the preset for one person after no step; ``seconds`` is what it took so far."""
+    """Write ``avatar`` as a run of the preset for one person after no step; ``seconds`` is the time taken so far."""
     preset = load_config(packaged_preset("human"), ["data.root=."])
     person = person_of(preset)
     if person is None:

@@ -30,7 +30,7 @@ from dyngs.runs.log import LOG_NAME
 from dyngs.training.background import evaluation_background
 
 COMPARED_VIEWS = 20
-"""Of each split; a before and an after need not be benchmarks."""
+"""Number of views compared per split; enough for before and after, not for a benchmark."""
 ROUNDS = 3
 
 

@@ -42,7 +42,7 @@ from dyngs.training.limits import require_possible
 from dyngs.training.loop import Loop, Stopwatch
 
 _COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"
-"""Parts of a checkpoint: what was done for limits."""
+"""Names of the limits' states in a checkpoint."""
 
 
 class Limit(Protocol):
@@ -142,7 +142,7 @@ class _Run:
             print(line, flush=True)
 
     def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None) -> None:
-        """Prepare what keeps the limits of the configuration; measure before training what must be known then."""
+        """Set up the limits of the configuration, with the measurements that they need before training."""
         budget, speed = run.config.budget, None
         if budget.min_fps is not None:
             speed = SpeedLimit(run, budget.min_fps)

@@ -48,7 +48,7 @@ class CountLimit:
                     )
 
     def state(self) -> dict[str, Tensor]:
-        """Return what a checkpoint must hold: nothing where nothing was removed."""
+        """Return the state for a checkpoint; empty where nothing was removed."""
         if not self.before:
             return {}
         return {
@@ -57,7 +57,7 @@ class CountLimit:
         }
 
     def restore(self, stored: Mapping[str, Tensor]) -> None:
-        """Take over what ``state`` returned."""
+        """Restore the state that ``state`` returned."""
         if stored:
             self.before, self.lost = int(stored["before"]), float(stored["lost"])
 
@@ -78,7 +78,7 @@ class CountLimit:
 
 
 def count_limit(run: LimitedRun) -> CountLimit | None:
-    """Return the limit of a run; None: there is none."""
+    """Return the limit of a run, None without one."""
     times = {view.time for view in run.trainer.pictures.views if view.time is not None}
     most = most_gaussians(run.trainer.config, len(times))
     return None if most is None else CountLimit(run, most)

@@ -1,4 +1,4 @@
-"""A run whose result is limited: what the limits look at and change."""
+"""Interface of a run to its limits: what they read and change."""
 
 from __future__ import annotations
 

@@ -25,9 +25,9 @@ from dyngs.training.state import Checkpoint
 from dyngs.training.trainer import Trainer
 
 KEPT = 0.7
-"""Share of the Gaussians that each further trial keeps of those of the one before."""
+"""Share of the Gaussians that each trial keeps of those of the trial before."""
 FINEST_CHANGE, LARGEST_CHANGE, COARSEST = 2**0.25, 2.0, 64.0
-"""By what steps are multiplied at once, and altogether."""
+"""Smallest and largest factor on the steps per trial, and the largest in all."""
 _TRIALS = 40
 
 
@@ -79,7 +79,7 @@ def has_file(run_dir: Path) -> bool:
 
 @torch.no_grad()
 def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeReport:
-    """Write ``scene.dyngs``, at most ``megabytes`` large, into a folder of ``run_dir``, and return what became of it.
+    """Write ``scene.dyngs``, at most ``megabytes`` large, into a folder of ``run_dir``, and return a report.
 
     Stored as exactly as is usual if that fits. Otherwise more coarsely, and with fewer Gaussians, as long as the latter
     makes training pictures better than the former alone.

@@ -32,29 +32,29 @@ from dyngs.training.trainer import Trainer
 from dyngs.training.views import training_cameras
 
 FEW = 300
-"""Gaussians that say how long drawing takes with hardly any."""
+"""Number of Gaussians with which the fixed cost of drawing is measured."""
 POSSIBLE = 0.8
-"""Of the time that a drawing may take; where hardly any Gaussians take more, the run is refused."""
+"""Share of the allowed drawing time; a run whose fixed cost is higher is refused."""
 GOAL, ACCEPTED = 0.9, 0.95
-"""Shares of that time: what removing aims at, and from which on it is needed. What is measured varies."""
+"""Shares of the allowed time: the aim of a removal, and the least that needs one. Measurements vary."""
 CHECKS = 10
-"""Of growth, over a run."""
+"""Number of measurements during growth, over a run."""
 VIEWS, GROWTH_VIEWS, ROUNDS = 10, 5, 3
 """Views that are drawn for a measurement, fewer while Gaussians are added, and how often each."""
 ATTEMPTS = 2
 """Measurements of which one must be fast enough: other programs disturb."""
 TRIALS = 5
-"""Numbers of Gaussians that are tried in one removal."""
+"""Number of trials in one removal."""
 CLOSE_ENOUGH = 0.9
-"""Of the time aimed at; more Gaussians than that are not looked for."""
+"""Share of the time aimed at from which the search ends."""
 JUDGED = 100
-"""Sides of the part of a picture that is judged, px: larger ones only take longer."""
+"""Side of the part of a picture that is compared, px; larger parts only take longer."""
 SCORING_DRAWINGS = 1000
-"""That take about as long as finding out which Gaussians matter."""
+"""Number of drawings that take about as long as scoring the Gaussians."""
 SAFETY = 1.3
 """Factor on the time that is kept free for that: the load of the machine changes."""
 MAYBE = 0.6
-"""Of the time that a drawing may take: less will not be too slow in the end."""
+"""Share of the allowed time; a faster scene will not be too slow at the end."""
 
 
 @dataclass
@@ -117,14 +117,14 @@ class SpeedLimit:
         self.hold()
 
     def state(self) -> dict[str, Tensor]:
-        """Return what a checkpoint must hold."""
+        """Return the state for a checkpoint."""
         return {
             name: torch.tensor(x, dtype=torch.float64 if isinstance(x, float) else None, device="cpu")
             for name, x in asdict(self.found).items()
         }
 
     def restore(self, stored: Mapping[str, Tensor]) -> None:
-        """Take over what ``state`` returned."""
+        """Restore the state that ``state`` returned."""
         for name in self.state().keys() & stored.keys():
             setattr(self.found, name, stored[name].item())
 

@@ -24,15 +24,15 @@ from dyngs.training.schedule import motion_begins_after, picture_divisor, scaled
 from dyngs.training.trainer import Trainer
 
 FEWEST_STEPS = 200
-"""Where not even so many fit, the run is refused."""
+"""Fewest steps that must fit; otherwise the run is refused."""
 AIM = 0.97
-"""Share of the time that a fit fills."""
+"""Share of the time that a run is planned to use."""
 PILOT_STEPS, PILOT_WARM_UP, PILOT_SHARE = 20, 2, 0.02
 """Steps that are measured before training, fewer where they would take a larger share of the time."""
 FITS = 20
-"""Over a run."""
+"""Number of times over a run that the number of steps is adapted."""
 SMALLEST_CHANGE = 0.04
-"""Of the number of steps; less is not worth preparing the run anew."""
+"""Smallest relative change of the number of steps for which the run is prepared again."""
 PIXEL_SHARE = 0.7
 GROWTH, MOTION = 1.25, 2.0
 _SAMPLES = 64

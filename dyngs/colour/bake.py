@@ -15,10 +15,10 @@ from dyngs.ops.reference import harmonics_basis
 from dyngs.rendering import Shader
 
 DIRECTIONS = 96
-"""Directions that colours are looked at from; degree 3 has 16 terms."""
+"""Number of directions from which colours are sampled; degree 3 has 16 terms."""
 
 _FAR = 1e4
-"""How far away the eye is, in the largest distance of a Gaussian from the origin."""
+"""Distance of the camera, in largest distances of a Gaussian from the origin."""
 
 
 @dataclass(frozen=True)

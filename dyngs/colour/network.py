@@ -59,7 +59,7 @@ class ColourNetwork:
         return self.box.numel() + sum(layer.weight.numel() + layer.bias.numel() for layer in self.layers)
 
     def state(self) -> State:
-        """Return weights, and what their inputs are; ``network_of`` reads it."""
+        """Return the weights and the description of their inputs, for ``network_of``."""
         tensors = {"box": self.box, "sees": torch.tensor([self.sees_time, self.sees_normals], device="cpu")}
         for i, layer in enumerate(self.layers):
             tensors |= {f"weight{i}": layer.weight.detach(), f"bias{i}": layer.bias.detach()}

@@ -26,7 +26,7 @@ _MILESTONES = (1 / 6, 1 / 2, 5 / 6)
 """Shares of a run after which the network's rate is divided by 3 (MEGA: 5k, 15k and 25k of 30k steps)."""
 HELD_OUT_EVERY = 8
 _HELD_OUT = 5
-"""Which of each eight views is held out."""
+"""Index, in each eight views, of the one that is held out."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class ColourTraining:
         return 0
 
     def state(self) -> State:
-        """Return what a checkpoint must hold beside the scene's colours."""
+        """Return the tensors that a checkpoint must hold beside the scene's colours."""
         return {}
 
     def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
@@ -148,7 +148,7 @@ class NetworkTraining(ColourTraining):
 
 
 class AutoTraining(ColourTraining):
-    """Harmonics for all Gaussians until it is measured which ones they pay for, then only for those.
+    """Harmonics for all Gaussians at first, later only for those where they are measured to improve pictures.
 
     Args:
         options: when, and what may be given away.

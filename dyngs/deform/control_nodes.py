@@ -30,9 +30,9 @@ NOTHING = torch.zeros(0, 3, device="cpu")
 SPAN = 4
 """Control points that a pose depends on: the splines are cubic."""
 LR = {"quats": 6e-3, "log_scales": 1e-3, "logit_opacities": 1e-2, "colors": 2e-3}
-"""Learning rates of the nodes' changes but those of places."""
+"""Learning rates of the nodes' attributes other than positions."""
 LR_DECAY = 0.2
-"""Last over first learning rate."""
+"""Ratio of the last to the first learning rate."""
 PIECES_PER_TIME = 0.3
 """Pieces of the splines per training time. With more, poses follow single pictures; with fewer, they lag behind."""
 

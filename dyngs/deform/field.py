@@ -23,7 +23,7 @@ from dyngs.state import State, moved_to, part_of, prefixed
 F = TypeVar("F", bound="NetworkField")
 
 MAX_KEY_TIMES = 256
-"""Longer clips want a choice of their own: memory grows with it."""
+"""Limit on the default number of key times; longer clips may set more, which takes memory."""
 
 
 @dataclass(frozen=True)
@@ -111,11 +111,11 @@ class DeformationField(Protocol):
         ...
 
     def state(self) -> State:
-        """Return what ``restored`` needs, but for the setup."""
+        """Return the state that ``restored`` needs, without the setup."""
         ...
 
     def restored(self, tensors: Mapping[str, Tensor]) -> DeformationField:
-        """Return the field of what ``state`` returned, with the options and the setup of this one.
+        """Return the field of a state that ``state`` returned, with the options and the setup of this one.
 
         Raises:
             KeyError: a tensor is missing.

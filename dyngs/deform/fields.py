@@ -34,7 +34,7 @@ def new_field(options: DeformField, setup: FieldSetup, generator: torch.Generato
 
 
 def field_state(field: DeformationField) -> State:
-    """Return what ``restored_field`` needs, by name."""
+    """Return the state that ``restored_field`` needs, by name."""
     box = torch.stack([field.setup.center, field.setup.half_size])
     numbers = torch.tensor([field.setup.num_times, field.setup.extent], dtype=torch.float64, device="cpu")
     return field.state() | with_role({"box": box, "numbers": numbers}, Role.SHARED)

@@ -14,7 +14,7 @@ from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.parameters import Parameters
 
 LR_DECAY = 0.01
-"""Last over first learning rate."""
+"""Ratio of the last to the first learning rate."""
 SPACE_RANGE = (0.1, 0.5)
 """Planes over space start uniformly in it, those with time at 1 (Wu et al.): the product does not depend on time."""
 

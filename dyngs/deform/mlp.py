@@ -11,7 +11,7 @@ from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen
 from dyngs.parameters import Parameters
 
 LR_DECAY = 0.002
-"""Last over first learning rate."""
+"""Ratio of the last to the first learning rate."""
 SKIP_LAYER = 5
 """The input is fed once more into this layer (counted from 0), where there are that many hidden ones."""
 

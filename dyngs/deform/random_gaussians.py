@@ -11,11 +11,11 @@ from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 
 BOX_MARGIN = 1.1
 SCALE = 0.3
-"""Standard deviation of each, in distances between them."""
+"""Standard deviation of each, as a share of the distance between them."""
 LOGIT = -2.2
 """Opacity 0.1, as all Gaussians begin."""
 SOLID = 0.05
-"""Opacity from which a Gaussian counts for the box in which things move."""
+"""Opacity from which a Gaussian counts for the bounding box."""
 
 
 def with_random_gaussians(gaussians: Gaussians, count: int, extent: float, generator: torch.Generator) -> EditResult:
@@ -50,7 +50,7 @@ def with_random_gaussians(gaussians: Gaussians, count: int, extent: float, gener
 
 
 def box_of(gaussians: Gaussians, extent: float) -> tuple[Tensor, Tensor]:
-    """Return centre and half sides (3,) of the box around what is solid, a little larger; no side is zero.
+    """Return centre and half sides (3,) of a box a little larger than all opaque Gaussians; no side is zero.
 
     The outer percent of the Gaussians on either side is left out: there the field is that of the box's border.
     """

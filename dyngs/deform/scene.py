@@ -39,7 +39,7 @@ class DynamicScene(Scene):
 
     @staticmethod
     def restored(options: DynamicModel, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
-        """Return the scene of what ``state`` returned.
+        """Return the scene of a state that ``state`` returned.
 
         Raises:
             KeyError: a tensor is missing.
@@ -124,7 +124,7 @@ class DynamicScene(Scene):
         return state if self.masks is None else state | prefixed("masks", self.masks.state())
 
     def _drawn_around(self, time: float, *, detach: bool) -> _Part:
-        """Return what is drawn around ``time``; without gradients, that of the last interval of the masks is kept."""
+        """Return the Gaussians drawn around ``time``; without gradients, those of the last mask interval are kept."""
         interval = 0 if self.masks is None else self.masks.interval(time)
         if torch.is_grad_enabled():
             return self._selected(self.gaussians.detach() if detach else self.gaussians, interval)

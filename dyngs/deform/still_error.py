@@ -16,13 +16,13 @@ from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, Shader, render
 
 MIN_SAME = 3
-"""Pictures of one camera, from which what they have in common is known."""
+"""Fewest pictures of one camera whose median shows what is still."""
 USUAL = 0.7
 """What moves differs from the median in three of ten pictures or more; what is hidden at times, in fewer."""
 MOMENTS = 8
-"""Pictures of one camera that are looked at."""
+"""Pictures of one camera that are compared."""
 SHOWS = 1e-3
-"""Sum of weights, in pixels, from which a Gaussian shows in a picture."""
+"""Sum of weights, in pixels, from which a Gaussian counts as visible in a picture."""
 
 
 @dataclass(frozen=True)

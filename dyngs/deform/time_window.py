@@ -13,7 +13,7 @@ from dataclasses import dataclass
 MIN_VIEWS = 6
 MIDDLE = 0.5
 FRONTIER_VIEWS = 6
-"""While the window grows, every other step trains on one of so many views at its ends, which are the newest."""
+"""Number of newest views, at the window's ends, that every other step trains on while the window grows."""
 
 
 @dataclass(frozen=True)

@@ -31,11 +31,11 @@ from dyngs.static.rates import Rates
 from dyngs.static.training import FilterUpdate
 
 SURELY_MOVING = 1.5
-"""Errors so many times ``motion_threshold`` are never taken for those of still things."""
+"""Multiple of ``motion_threshold`` above which an error always counts as motion."""
 SURELY_STILL = 0.25
-"""Where cameras stay in place, errors of so many times ``motion_threshold`` are those of still things."""
+"""Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in place."""
 MIN_MOVING_SHARE = 0.02
-"""If no larger share of the Gaussians surely moves, nothing does."""
+"""Share of surely moving Gaussians up to which the scene counts as still."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class DynamicTraining:
             scene.field.extend(seen, self._window.bounds(step))
 
     def moment(self, scene: DynamicScene, picture: Picture, step: int) -> Moment:
-        """Return what is drawn for ``picture`` at its time, and the regularizers of motion."""
+        """Return the moment drawn for ``picture`` at its time, and the regularizers of motion."""
         if scene.field is None:
             return scene.moment(picture.time)
         time = self._jittered(picture.time or 0.0, step)

@@ -18,9 +18,9 @@ from dyngs.parameters import Parameters
 from dyngs.state import Role
 
 LR_OTHERS = 1e-3
-"""Learning rate of all coefficients but those of positions."""
+"""Learning rate of all coefficients except those of positions."""
 LR_DECAY = 0.01
-"""Last over first learning rate."""
+"""Ratio of the last to the first learning rate."""
 
 
 class Trajectory(NetworkField):

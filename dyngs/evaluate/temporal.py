@@ -26,7 +26,7 @@ from dyngs.rendering import RenderOptions
 from dyngs.scene import Scene
 
 MAX_MOMENTS = 60
-"""Up to so many training times, flicker is measured at all of them."""
+"""Number of training times up to which flicker is measured at all of them."""
 
 _SAMPLED_TRIPLES = MAX_MOMENTS // 3
 _NO_TIMES = "the pictures have no times"

@@ -1,1 +1,1 @@
-"""Fewer Gaussians for nearly the same pictures: what each is worth, and which may go."""
+"""Fewer Gaussians for nearly the same pictures: importance scores, selection and fine-tuning."""

@@ -16,7 +16,7 @@ from dyngs.rendering import RenderOptions, contributions, sensitivities
 from dyngs.scene import Scene
 
 STEEPNESS = 4.0
-"""Of the hyperbolic tangent: second differences of a profile are small numbers."""
+"""Slope of the hyperbolic tangent: second differences of a profile are small numbers."""
 VOLUME_POWER = 0.1
 
 
@@ -90,7 +90,7 @@ class Importance:
 
 @torch.no_grad()
 def importance(views: ScoringViews, *, slopes: bool) -> Importance:
-    """Return what every Gaussian contributes to the pictures of ``views``; ``slopes`` are the dearer half."""
+    """Return the contribution of each Gaussian to the pictures of ``views``; ``slopes`` cost the larger half."""
     scene, options, behind = views.scene, views.options, views.background
     shares, opacities, volumes, squares = [], [], [], torch.zeros((), device=behind.device)
     for time in views.times:

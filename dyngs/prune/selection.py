@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 BACK_OFFS = 5
-"""Halvings of the interval in which the share is looked for."""
+"""Number of bisection steps in the search for the share."""
 
 
 @dataclass(frozen=True)

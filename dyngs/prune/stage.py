@@ -31,10 +31,10 @@ from dyngs.training.views import training_cameras
 from dyngs.visibility import VisibilityMasks
 
 MOVING_VIEWS, MOVING_TIMES = 8, 24
-"""Training cameras and times of which all pairs are looked at where things move."""
+"""Numbers of training cameras and times whose pairs are scored in dynamic scenes."""
 STILL_VIEWS = 100
 PROBED_VIEWS = 16
-"""Training pictures by which the loss is measured."""
+"""Number of training pictures on which the loss is measured."""
 
 
 @dataclass(frozen=True)

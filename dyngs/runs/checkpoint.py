@@ -31,7 +31,7 @@ from dyngs.training.state import Checkpoint, CheckpointInfo
 KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"
 SCENE_FILE = "scene.dyngs"
-"""Of the file that holds a run that is done in little space, see ``dyngs.storage``."""
+"""Name of the .dyngs file that holds a finished run, see ``dyngs.storage``."""
 _KIND = FileKind("dyngs", "a checkpoint", 1)
 MAX_STEP = 2**53
 BACKGROUNDS = ("white", "black", "random")

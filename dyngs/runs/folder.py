@@ -21,9 +21,9 @@ EXPORT_FOLDER = "export"
 FORMER_EXPORT_FOLDER = "small"
 """Name of ``EXPORT_FOLDER`` in runs of earlier versions; nothing is written there."""
 _BEGUN = (RESOLVED_NAME, LOG_NAME, TIMING_NAME)
-"""What a run that was stopped before its first checkpoint may have written."""
+"""Files that a run stopped before its first checkpoint may have written."""
 _OLD_LEFTOVER = re.compile(r"\.step_\d+\.\d+\.safetensors|\.tmp[A-Za-z0-9]{6}")
-"""Earlier versions, and the library that they let write there, called a checkpoint so while they wrote it."""
+"""Names of half-written checkpoints of earlier versions and of the library that wrote them."""
 
 
 def default_folder(name: str) -> Path:

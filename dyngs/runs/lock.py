@@ -21,12 +21,12 @@ else:
     import fcntl
 
 LOCK_NAME = "run.lock"
-"""There while a process writes into the folder, and after one was killed, which does no harm."""
+"""File that exists while a process writes into the folder; one left by a killed process has no effect."""
 
 _HELD = (errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK)
 _WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
 _FAR = 2**30
-"""Windows keeps others from reading the byte that is locked, so it is one that the file does not have."""
+"""Offset of the locked byte on Windows, past the end of the file: a locked byte cannot be read by others."""
 
 
 class InUseError(DyngsError):

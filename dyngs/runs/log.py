@@ -59,7 +59,7 @@ class RunLog:
         self._file: IO[str] = self.path.open("a", encoding="utf-8")
 
     def __call__(self, event: Event) -> None:
-        """Write what ``event`` tells, if it belongs into the log."""
+        """Write ``event`` to the log, if it belongs there."""
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
                 self.write(record_of(event))

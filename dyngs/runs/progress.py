@@ -12,7 +12,7 @@ from dyngs.runs.log import LogRecord, record_of
 from dyngs.training.events import Evaluated, Event, Message, StepDone, TotalChanged
 
 PLAIN_LINES = 10
-"""Lines that a run prints where there is no terminal."""
+"""Number of lines that a run prints without a terminal."""
 
 
 class Progress:

@@ -83,7 +83,7 @@ class Densifier(Protocol):
         ...
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Take over what ``state()`` returned."""
+        """Restore the state that ``state()`` returned."""
         ...
 
 

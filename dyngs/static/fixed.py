@@ -9,7 +9,7 @@ from dyngs.gaussians import EditResult, Gaussians
 
 
 class FixedDensifier:
-    """A ``Densifier`` that leaves everything as it is."""
+    """A ``Densifier`` that changes nothing."""
 
     touches_all = False
 

@@ -29,7 +29,7 @@ class StaticScene(Scene):
 
     @staticmethod
     def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
-        """Return the scene of what ``state`` returned.
+        """Return the scene of a state that ``state`` returned.
 
         Raises:
             ValueError: a tensor does not fit the Gaussians.

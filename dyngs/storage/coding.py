@@ -15,9 +15,9 @@ import numpy as np
 from dyngs.errors import DyngsError
 
 _SAMPLE = 2**15
-"""Values that decide how an array is laid out."""
+"""Number of values by which the layout of an array is chosen."""
 _FEW = 512
-"""Fewer values are stored as they come."""
+"""Number of values below which the layout is not changed."""
 _MAX_PLANES = 8
 _SMALLEST_DICTIONARY, _LARGEST_DICTIONARY = 2**12, 2**24
 

@@ -21,12 +21,12 @@ from dyngs.storage.order import storage_order
 from dyngs.storage.quantize import sorted_axes
 
 FIELD = "model.field.learned."
-"""Names of the tensors that a deformation field has learned begin so."""
+"""Prefix of the learned tensors of a deformation field."""
 GAUSSIANS = tuple(field.name for field in fields(Gaussians))
 
 
 def drawable(scene: Scene) -> dict[str, Tensor]:
-    """Return what drawing needs, in an equivalent form that is cheaper to store: axes are sorted by length.
+    """Return the tensors for drawing in an equivalent form that is cheaper to store: axes sorted by length.
 
     Not those of Gaussians whose axes a field changes one by one.
 

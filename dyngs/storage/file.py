@@ -45,10 +45,10 @@ from dyngs.storage.tensors import (
 MAGIC = b"dyngs\x00\x01\n"
 MAX_HEADER = 2**20
 FREE_VALUES, VALUES_PER_BYTE = 2**22, 64
-"""A file holds at most so many values, and so many more per byte."""
+"""Largest number of values in any file, and of further values per byte of it."""
 _CHECKSUM = 32
 _FAR_BYTES = 16
-"""Of an index and a value."""
+"""Bytes of an index and a value."""
 _DTYPES = {
     str(dtype).removeprefix("torch."): dtype
     for dtype in (torch.float16, torch.float32, torch.float64, torch.int32, torch.int64, torch.uint8, torch.bool)
@@ -117,7 +117,7 @@ class StoredScene:
 
 
 def write_scene(path: Path, data: bytes) -> None:
-    """Write what ``encoded`` made, atomically. Raises DyngsError for a full disk and the like."""
+    """Write the bytes of ``encoded`` atomically. Raises DyngsError for a full disk and the like."""
     with atomic_file(path, durable=True) as temporary:
         temporary.write_bytes(data)
 

@@ -33,13 +33,13 @@ from dyngs.training.state import Checkpoint
 from dyngs.training.views import training_cameras
 
 LOSS_DB = 0.025
-"""By how much the PSNR of training pictures may fall. That of others falls by up to twice as much."""
+"""Allowed loss of PSNR on training pictures, dB. On others it is up to twice as much."""
 COMPARED = 6
-"""Training views in which the change is measured."""
+"""Number of training views in which the change is measured."""
 SMALLEST_CHANGE = 0.01
-"""Grey levels of 255; less is of no use."""
+"""Smallest change to allow, in grey levels of 255."""
 LOOKED_AT = 50
-"""Training views in which it is measured how much each Gaussian shows."""
+"""Number of training views in which the visibility of each Gaussian is measured."""
 
 Pictures = Callable[[Scene], list[Tensor]]
 """Draws a scene, always from the same cameras at the same times: (H, W, 3) each."""

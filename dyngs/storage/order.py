@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 MORTON_BITS = 20
-"""Of each coordinate; 60 bits in all."""
+"""Bits per coordinate; 60 in all."""
 INNER, OUTLYING = 0.01, 64.0
-"""Places farther out than so many sides of the box around all but these shares of the coordinates count as its edge."""
+"""Quantile and multiple of the box: points farther out than so many of its sides count as its edge."""
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:

@@ -21,16 +21,16 @@ from dyngs.storage.tensors import COARSENESS, MAX_COARSENESS, checked_coarseness
 
 GREY_LEVELS = 255.0
 TRIALS = 4
-"""Steps that are tried for a group."""
+"""Number of steps tried per group."""
 CLOSE = 0.8
-"""An error of so large a share of what is allowed is not brought closer to it."""
+"""Share of the allowed error from which the search ends."""
 FIRST_STEP = 2.0**-6
-"""Of the mean size of the values."""
+"""First step as a share of the mean magnitude of the values."""
 WIDEST_JUMP = 32.0
 OUTLYING, USUAL_SHARE = 64.0, 0.95
 """Values so many times as large as this share of those that are not 0 are outliers: steps are chosen without them."""
 MOST_VISIBLE = 0.9
-"""Share of the Gaussians that show less than those that are stored most finely."""
+"""Quantile of visibility above which Gaussians are stored most finely."""
 ASSUMED_STEPS = {"quats": 2**-8, "log_scales": 2**-6, "logit_opacities": 2**-10, "sh_base": 2**-7, "sh_rest": 2**-7}
 
 Draw = Callable[[Mapping[str, Tensor]], Sequence[Tensor]]

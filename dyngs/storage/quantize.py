@@ -14,16 +14,16 @@ import torch
 from dyngs.ops.quaternions import quat_product
 
 LIMIT = 2**20
-"""Whole numbers are smaller in size; larger values are stored as they are."""
+"""Bound on the magnitude of the integers; larger values are stored as they are."""
 SMALLEST_STEP, LARGEST_STEP = 2.0**-100, 2.0**60
 NEAREST, SPARSE = 0.5, 0.35
-"""What is added before rounding down: to the nearest whole number, or rather to zero, which costs least."""
+"""Added before rounding down: to the nearest integer, or biased to zero, which costs least to store."""
 ROTATION_STEP = 1 / 32
-"""The coarsest for rotations: the component that is left out stays the largest."""
+"""Coarsest step for rotations, at which the component left out stays the largest."""
 FINEST_ROTATION = 2.0**-19
-"""With finer steps the components of a unit quaternion would be out of reach of the whole numbers."""
+"""Finest step for rotations, at which the components of a unit quaternion are within ``LIMIT``."""
 OPACITY_STEPS = 2.0**-12, 1 / 8
-"""The finest and the coarsest for opacities."""
+"""Finest and coarsest step for opacities."""
 
 
 def step_below(step: float) -> float:

@@ -43,7 +43,7 @@ class Kind(str, Enum):
 
 
 MAX_COARSENESS = 6
-"""Octaves by which the colour steps of a Gaussian that hardly shows exceed those of the others."""
+"""Most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others."""
 COARSENESS = "gaussians.coarseness"
 _BY_COARSENESS = ("gaussians.sh_base", "gaussians.sh_rest")
 _KINDS = {
@@ -53,10 +53,10 @@ _KINDS = {
 }
 _LIMITS = {Kind.ROTATION: (SMALLEST_STEP, ROTATION_STEP), Kind.OPACITY: OPACITY_STEPS}
 FEW = 64
-"""Tensors with no more values are stored as they are."""
+"""Number of values up to which tensors are stored as they are."""
 LARGEST_HALF = 65504.0
 MOST_FAR = 1 / 8
-"""Where a larger share of the values is out of reach of the whole numbers, all are stored as they are."""
+"""Largest share of values out of the integer range; with more, all are stored as they are."""
 RELATIVE = "model.filter_std"
 """Stored in half precision: it spans orders of magnitude."""
 FIXED_STEPS = {
@@ -66,7 +66,7 @@ FIXED_STEPS = {
     "model.anchors.uv": 2.0**-9,
     "model.anchors.barycentric": 2.0**-6,
 }
-"""Of what ties a person's Gaussians to the template, m or shares: pictures hardly depend on it, or not at all."""
+"""Steps of a person's anchors on the template, m or shares: pictures hardly depend on them."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Coding:
             raise ValueError(f"no such coding: {self}")
 
     def steps(self, coarseness: np.ndarray | None, num_axes: int) -> Steps:
-        """Return the step, or those of all rows of an array with so many axes."""
+        """Return the step, or one per row, broadcast to ``num_axes`` axes."""
         if not self.by_coarseness:
             return self.step
         if coarseness is None:

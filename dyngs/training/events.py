@@ -55,7 +55,7 @@ class Started:
 
 @dataclass(frozen=True)
 class StepDone:
-    """A step is done. What is not in the report is as it is when it is asked for: an earlier listener may change it.
+    """A step is done. Values outside the report are current when read: an earlier listener may have changed them.
 
     Attributes:
         report: of the step.

@@ -15,14 +15,14 @@ from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.errors import DyngsError
 
-SEED_SHARE = 0.1
-"""Of the limit that is kept free for the Gaussians with which motion begins."""
+RANDOM_SHARE = 0.1
+"""Share of the limit that is kept free for the random Gaussians with which motion begins."""
 SHAPE_BYTES, HARMONIC_BYTES, FIELD_BYTES = 16.0, 0.35, 1.0
-"""Per Gaussian, per value of its harmonics, per number of a field: a little more than docs/storage.md measured."""
+"""Bytes per Gaussian, per value of its harmonics, per value of a field: a little more than in docs/storage.md."""
 CLOSE = 0.8
-"""Share of the limit from which on it is taken to have held growth back."""
+"""Share of the limit from which the limit counts as having held growth back."""
 FEWEST = 500
-"""Gaussians; a limit on the size that has no room for them is refused."""
+"""Fewest Gaussians that a limit on the size must have room for."""
 
 
 def require_possible(config: Config) -> None:
@@ -53,7 +53,7 @@ def within_cap(config: Config, num_times: int) -> Config:
         return config
     added = added_for_motion(config)
     if added:
-        added = min(added, int(SEED_SHARE * cap))
+        added = min(added, int(RANDOM_SHARE * cap))
         changes["model"] = config.model.model_copy(update={"num_random_moving": added})
     cap -= added
     return config.model_copy(update=changes | {"strategy": config.strategy.limited(cap)})

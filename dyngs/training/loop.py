@@ -87,7 +87,7 @@ class Loop:
         self._listeners: list[Listener] = []
 
     def subscribe(self, *listeners: Listener) -> None:
-        """Tell these, too, after those that there are."""
+        """Add listeners, after the present ones."""
         self._listeners += listeners
 
     def tell(self, event: Event) -> None:

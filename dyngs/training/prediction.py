@@ -32,14 +32,14 @@ from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
 WARM_UP = 0.05
 """Share of the run in which the highest learning rate is reached."""
 WEIGHT_DECAY = 1e-5
-"""Of AdamW."""
+"""Weight decay of AdamW."""
 MAX_GRADIENT = 1.0
-"""Longer gradients are shortened to it."""
+"""Norm to which gradients are clipped."""
 MEAN_VIEWS = 8
 """Pictures of each person that the mean colours are taken from."""
 
 _LOWEST = 1e-3
-"""Last rate over the highest."""
+"""Ratio of the last to the highest learning rate."""
 
 
 @dataclass

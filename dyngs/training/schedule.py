@@ -28,13 +28,13 @@ MIN_START = 100
 MIN_RESET_GAP = 400
 """Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)."""
 RESET_SHARE = 0.2
-"""Of a short run, between resets."""
+"""Share of a short run between opacity resets."""
 MAX_GROWTH = 0.25
 FILTER_EVERY = 100
 MIN_COARSE_STEPS = 1000
 """Steps that a still model needs to show where it fails; short runs spend at most a third on it."""
 SPLITS = (0.1, 0.3, 0.5)
-"""When a dynamic model freezes what does not move: shares of the part of the run that sees all times."""
+"""Steps at which still Gaussians are frozen, as shares of the part of the run that sees all times."""
 
 
 def scaled(step: int, steps: int) -> int:

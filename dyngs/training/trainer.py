@@ -1,4 +1,4 @@
-"""Training of a scene, step by step. It knows Gaussians and pictures, not what kind of scene lies between them."""
+"""Training of a scene, step by step. It does not depend on the kind of scene."""
 
 from __future__ import annotations
 
