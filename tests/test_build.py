@@ -35,12 +35,14 @@ from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
+from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import still_errors
-from dyngs.deform.training import DynamicScene
+from dyngs.deform.training import DynamicTraining
+from dyngs.state import tensors_of
 from dyngs.static.densify import DefaultDensifier
 from dyngs.static.fixed import FixedDensifier
 from dyngs.static.mcmc import McmcDensifier
-from dyngs.static.training import StaticScene
+from dyngs.static.scene import StaticScene
 
 
 @pytest.fixture(scope="module")
@@ -136,11 +138,12 @@ def _dynamic(capture: Path, **changes: object) -> Config:
 def test_times_make_a_dynamic_model(capture: Path, tmp_path: Path) -> None:
     root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
     assert training_times(read_capture(DataConfig(root=root))) == (0.0, 0.25, 0.5, 0.5, 1.0)
-    model = assemble(_dynamic(root)).model
-    assert isinstance(model, DynamicScene)
-    assert model.times == (0.0, 0.25, 0.5, 1.0)
-    assert model.schedule.rates.steps == 12
-    assert isinstance(assemble(_dynamic(root, model=StaticModel())).model, StaticScene)
+    trainer = assemble(_dynamic(root))
+    assert isinstance(trainer.scene, DynamicScene)
+    assert isinstance(trainer.training, DynamicTraining)
+    assert trainer.scene.times == (0.0, 0.25, 0.5, 1.0)
+    assert trainer.training.schedule.rates.steps == 12
+    assert isinstance(assemble(_dynamic(root, model=StaticModel())).scene, StaticScene)
 
 
 @pytest.mark.parametrize("times", [None, [0.5] * 5], ids=["no times", "one time"])
@@ -153,7 +156,7 @@ def test_without_times_a_dynamic_config_is_a_static_one(
     results = []
     for model in (DynamicModel(sh_degree=1, filter_3d=filter_3d), StaticModel(sh_degree=1, filter_3d=filter_3d)):
         trainer = assemble(_dynamic(root, model=model))
-        assert isinstance(trainer.model, StaticScene)
+        assert isinstance(trainer.scene, StaticScene)
         for _ in range(8):
             trainer.step()
         results.append(trainer.checkpoint())
@@ -167,9 +170,9 @@ def test_motion_is_looked_for_in_pictures_from_all_over_the_clip(capture: Path, 
     """Drawn as in training, on the background of the evaluation."""
     root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
     trainer = assemble(_dynamic(root, data=DataConfig(root=root, background="white")))
-    assert isinstance(trainer.model, DynamicScene)
+    assert isinstance(trainer.training, DynamicTraining)
     gaussians = trainer.scene.gaussians.detach()
-    found = trainer.model.capture.still_errors(lambda _: gaussians)
+    found = trainer.training.capture.still_errors(lambda _: gaussians)
     pictures = [trainer.pictures[i] for i in range(5)]
     expected = still_errors(lambda _: gaussians, pictures, trainer.options, torch.ones(3))
     assert torch.equal(found.most, expected.most)
@@ -185,9 +188,9 @@ def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: P
     config = _dynamic(root, init=PointsInit(num_random=7))
     found = with_points(read_capture(config.data), config).points
     assert found is not None
-    assert len(assemble(config).optimizer.parameters) == len(found.xyz) > 7
+    assert len(assemble(config).scene) == len(found.xyz) > 7
     without = config.model_copy(update={"init": PointsInit(num_random=7, triangulate=0)})
-    assert len(assemble(without).optimizer.parameters) == 7
+    assert len(assemble(without).scene) == 7
 
 
 def test_no_points_are_triangulated_for_what_is_restored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -219,5 +222,5 @@ def test_the_coarse_phase_is_static_training(capture: Path, tmp_path: Path) -> N
     static, dynamic = (assemble(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(motion_from=1.0)))
     for _ in range(8):
         assert static.step().loss == dynamic.step().loss
-    mine, others = static.optimizer.state(), dynamic.optimizer.state()
+    mine, others = (tensors_of(trainer.optimizer.state()) for trainer in (static, dynamic))
     assert all(torch.equal(x, others[name]) for name, x in mine.items())

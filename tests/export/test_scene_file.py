@@ -13,6 +13,7 @@ from moving_scene import write_moving_run
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
 from dyngs.runs.checkpoint import latest_checkpoint, load_run, save_checkpoint
+from dyngs.state import prefixed, tensors_of
 from dyngs.storage.precision import Precision
 from dyngs.visibility import VisibilityMasks
 
@@ -38,7 +39,7 @@ def test_a_run_with_masks_is_stored_with_them(tmp_path: Path) -> None:
     seen = torch.ones(3, 5, dtype=torch.bool)
     seen[1:, 0] = False
     checkpoint = latest_checkpoint(run_dir)
-    masks = {f"model.masks.{name}": x for name, x in VisibilityMasks.pack((0.0, 0.5, 1.0), seen).state().items()}
+    masks = tensors_of(prefixed("model.masks", VisibilityMasks.pack((0.0, 0.5, 1.0), seen).state()))
     save_checkpoint(run_dir, replace(checkpoint, tensors=checkpoint.tensors | masks), 1.0)
     write_scene_file(run_dir, tmp_path / "small", 0.5)
     stored = load_run(tmp_path / "small").scene
@@ -73,7 +74,7 @@ def test_a_file_that_changes_pictures_more_than_allowed_is_not_written(
     run_dir = write_moving_run(tmp_path)
     before = sorted(run_dir.rglob("*"))
     coarse = {f"gaussians.{name}": 0.5 for name in ("means", "log_scales", "sh_base")}
-    monkeypatch.setattr("dyngs.export.scene_file.measured_precision", lambda *_: Precision(coarse, 0.1, 0.5))
+    monkeypatch.setattr("dyngs.storage.measure.measured_precision", lambda *_: Precision(coarse, 0.1, 0.5))
     with pytest.raises(DyngsError, match=r"more than the 0.5 allowed; nothing was written. Give a larger --max-change"):
         write_scene_file(run_dir, run_dir if into_run else tmp_path / "small", 0.5)
     assert sorted(run_dir.rglob("*")) == before

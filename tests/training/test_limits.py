@@ -138,7 +138,7 @@ def test_what_contradicts_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match=r"budget.max_mb: a network"):
         require_possible(limited(NOTHING.model_copy(update={"model": HumanPredictorModel()}), max_mb=5.0))
     both = NOTHING.model_copy(update={"prune": PruneConfig(share=0.5), "run": RunConfig(dir=tmp_path / "run")})
-    with pytest.raises(DyngsError, match=r"budget.max_minutes: .*dyngs compact"):
+    with pytest.raises(DyngsError, match=r"budget.max_minutes: .*dyngs prune"):
         train(limited(both, max_minutes=5.0))
     assert not (tmp_path / "run").exists()
 
