@@ -72,7 +72,7 @@ def require_regular(path: str | os.PathLike[str]) -> None:
 
 
 def reason(error: BaseException) -> str:
-    """What ``error`` says, on one short line of printable characters; its type where it does not say much."""
+    """Return the text of ``error`` on one short line of printable characters; its type where it does not say much."""
     if isinstance(error, OSError) and error.strerror:
         where = f": {error.filename}" if error.filename is not None else ""
         text = f"{error.strerror}{where}"

@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 class Role(Enum):
-    """What the rows of a tensor belong to, and who needs it."""
+    """Role of a tensor: the meaning of its rows, and whether only training needs it."""
 
     PER_GAUSSIAN = "per Gaussian"
     PER_MOVING = "per moving Gaussian"

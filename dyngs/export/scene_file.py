@@ -27,7 +27,7 @@ MISSED = 1.05
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What was written.
+    """A stored run.
 
     Attributes:
         path: of the file.

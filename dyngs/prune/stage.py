@@ -1,6 +1,6 @@
 """The last stage of a run: few of its Gaussians are kept, masks say when they are seen, and training goes on with them.
 
-It begins where training ends, from that checkpoint, and lasts ``prune.steps``: a finished run that is compacted ends
+It begins where training ends, from that checkpoint, and lasts ``prune.steps``: a finished run that is pruned ends
 with the same bytes as one that had the stage in its configuration.
 """
 

@@ -39,7 +39,7 @@ SOURCE_NAME = "source.json"
 
 @dataclass(frozen=True)
 class Plan:
-    """What to measure.
+    """The measurements to take.
 
     Attributes:
         variations: settings and their values.

@@ -31,7 +31,7 @@ _LOWEST_OPACITY, _UPPER_OPACITY = 0.9, 0.1
 
 @dataclass(frozen=True)
 class Anchors:
-    """What ties each of N Gaussians to the template; constant.
+    """Constant attributes that tie N Gaussians to the template, row by row.
 
     Attributes:
         points: (N, 3) at rest on the scaffold, m.

@@ -124,7 +124,7 @@ class HumanScene(Scene):
 
     @property
     def fit(self) -> SharedCorrection:
-        """What was learned about all poses."""
+        """The correction of all poses."""
         return SharedCorrection(self.learned["turns"].detach(), float(self.learned["log_scale"].detach()))
 
     @property
@@ -211,7 +211,7 @@ class HumanScene(Scene):
 
 
 def avatar_of(scene: Scene) -> HumanScene | None:
-    """Return ``scene`` if it is a person, who can be pose_gaussians; None for any other scene."""
+    """Return ``scene`` if it is a person, who can be posed; None for any other scene."""
     return scene if isinstance(scene, HumanScene) else None
 
 

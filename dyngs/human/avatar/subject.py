@@ -19,7 +19,7 @@ from dyngs.human.template.atlas import Texels
 
 @dataclass(frozen=True)
 class Subject:
-    """Who is filmed: the template's skeleton, what ties the first N Gaussians to it, and the poses of the pictures.
+    """A person in a capture: the template's skeleton, the anchors of the first N Gaussians, the poses of the pictures.
 
     ``shapes`` are the template's pose blend shapes, None where it has none.
     """
@@ -33,7 +33,7 @@ class Subject:
 def first_look(
     gaussians: Gaussians, texels: Texels, subject: Subject, pictures: Iterable[Picture], carve: float
 ) -> tuple[Gaussians, Subject]:
-    """Those of the first Gaussians that pictures can hold, in the colours that they show.
+    """Return the first Gaussians that lie inside the silhouettes, in the colours of the pictures.
 
     Gaussians above the lowest scaffold are kept if they lie inside the silhouette of a share ``carve`` of the pictures.
 
