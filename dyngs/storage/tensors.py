@@ -59,6 +59,8 @@ MOST_FAR = 1 / 8
 """Largest share of values out of the integer range; with more, all are stored as they are."""
 RELATIVE = "model.filter_std"
 """Stored in half precision: it spans orders of magnitude."""
+POSITIVE = "model.field.buffers.radii"
+"""Stored as they are: a radius of influence that is rounded to 0 has no meaning, and there are few."""
 FIXED_STEPS = {
     "model.anchors.points": 2.0**-9,
     "model.anchors.size": 2.0**-13,
@@ -114,7 +116,7 @@ class Whole:
 
 def group_of(name: str, x: Tensor) -> str | None:
     """Return the name of the group that shares a step, without the number at its end; None where there is no step."""
-    if x.dtype != torch.float32 or name == RELATIVE or name in FIXED_STEPS:
+    if x.dtype != torch.float32 or name in (RELATIVE, POSITIVE) or name in FIXED_STEPS:
         return None
     if x.numel() <= FEW and not name.startswith("gaussians."):
         return None
@@ -131,7 +133,7 @@ def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness
             is stored in half precision.
         by_coarseness: Gaussians have a coarseness each.
     """
-    if steps.get(group_of(name, x) or name) == 0:
+    if name == POSITIVE or steps.get(group_of(name, x) or name) == 0:
         return Coding(Kind.EXACT)
     if name in FIXED_STEPS:
         return Coding(Kind.GRID, FIXED_STEPS[name])

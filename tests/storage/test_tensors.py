@@ -187,3 +187,12 @@ def _axes(quats: torch.Tensor) -> torch.Tensor:
     rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
     turns = torch.stack(rows, dim=1).unflatten(1, (3, 3))
     return torch.einsum("nik,njk->nkij", turns, turns).flatten(1)
+
+
+@given(st.integers(65, 300), st.floats(1e-12, 1e-3))
+def test_radii_are_never_rounded_to_nothing(count: int, smallest: float) -> None:
+    """Also where steps are coarse and one is tiny beside the others."""
+    radii = torch.linspace(smallest, 1.0, count)
+    name = "model.field.buffers.radii"
+    assert group_of(name, radii) is None
+    assert torch.equal(restored(radii, coding_of(name, radii, {name: 0.5})), radii)
