@@ -71,8 +71,20 @@ def moved_to(value: T, device: torch.device | str) -> T:
     return value
 
 
-def fields_moved_to(value: T, device: torch.device | str) -> T:
-    """Return a copy of the dataclass ``value`` with its fields on ``device``, as ``moved_to`` has them."""
+def fields_moved_to(value: T, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> T:
+    """Return a copy of the dataclass ``value`` with its fields on ``device``, as ``moved_to`` has them.
+
+    Args:
+        value: tensors, and parts with tensors.
+        device: None leaves everything where it is.
+        dtype: of the floating-point tensors among the fields; None leaves them as they are.
+    """
+
+    def moved(x: Any) -> Any:
+        if isinstance(x, Tensor):
+            return x.to(device, dtype if x.is_floating_point() else None)
+        return x if device is None else moved_to(x, device)
+
     own: Any = value
-    moved = {f.name: moved_to(getattr(value, f.name), device) for f in dataclasses.fields(own) if f.init}
-    return cast(T, dataclasses.replace(own, **moved))
+    fields = {f.name: moved(getattr(value, f.name)) for f in dataclasses.fields(own) if f.init}
+    return cast(T, dataclasses.replace(own, **fields))

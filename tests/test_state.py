@@ -79,3 +79,20 @@ def test_fields_are_moved_one_by_one() -> None:
     """For a ``to`` that is made of it."""
     x = torch.arange(3.0)
     assert devices(vars(fields_moved_to(Own(x, x), "meta")).values()) == ["meta", "meta"]
+
+
+@dataclass(frozen=True)
+class Mixed:
+    real: Tensor
+    whole: Tensor
+    none: Tensor | None
+    name: str
+
+
+def test_all_tensors_are_moved_and_only_real_ones_converted() -> None:
+    given = Mixed(torch.zeros(2), torch.zeros(2).long(), None, "x")
+    moved = fields_moved_to(given, "meta")
+    assert (moved.real.device.type, moved.whole.device.type) == ("meta", "meta")
+    assert (moved.none, moved.name) == (None, "x")
+    exact = fields_moved_to(given, None, torch.float64)
+    assert (exact.real.dtype, exact.whole.dtype, exact.real.device.type) == (torch.float64, torch.int64, "cpu")

@@ -14,8 +14,8 @@ from torch import Tensor
 from dyngs.conventions import num_sh_terms
 from dyngs.gaussians import Gaussians
 from dyngs.human.pose.nearest_rotation import quats_of
-from dyngs.human.pose.tensor_fields import tensors_to
 from dyngs.human.template.atlas import Texels, scaffold_points
+from dyngs.state import fields_moved_to
 
 MAX_JOINTS = 8
 """Limit on the joints that one Gaussian follows; vertices of the free template follow no more."""
@@ -62,7 +62,7 @@ class Anchors:
 
     def to(self, *, device: torch.device | str) -> Anchors:
         """Return the anchors on ``device``."""
-        return tensors_to(self, device)
+        return fields_moved_to(self, device)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors by field name."""

@@ -17,9 +17,8 @@ from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.posing import BodyPose, Skeleton
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
-from dyngs.human.pose.tensor_fields import tensors_to
 from dyngs.parameters import Parameters
-from dyngs.state import Role
+from dyngs.state import Role, fields_moved_to
 
 LR = {
     "poses": 1e-3,  # of single frames, rad
@@ -53,7 +52,7 @@ class SharedCorrection:
 
     def to(self, *, device: torch.device | str) -> SharedCorrection:
         """Return the correction on ``device``."""
-        return tensors_to(self, device)
+        return fields_moved_to(self, device)
 
 
 def new_corrections(options: HumanModel, clip: MotionClip, skeleton: Skeleton, anchors: Anchors) -> Parameters:

@@ -17,8 +17,8 @@ from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.covariance import transform_covariance
 from dyngs.human.pose.nearest_rotation import nearest_rotations
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
-from dyngs.human.pose.tensor_fields import tensors_to
 from dyngs.human.template.body import BodyTemplate
+from dyngs.state import fields_moved_to
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Skeleton:
 
     def to(self, *, device: torch.device | str) -> Skeleton:
         """Return the skeleton on ``device``."""
-        return tensors_to(self, device)
+        return fields_moved_to(self, device)
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class PoseBlendShapes:
 
     def to(self, *, device: torch.device | str) -> PoseBlendShapes:
         """Return the blend shapes on ``device``."""
-        return tensors_to(self, device)
+        return fields_moved_to(self, device)
 
     def offsets(self, anchors: Anchors, rotations: Tensor) -> Tensor:
         """Return offsets (N, 3) at rest, m: interpolated between the vertices of each anchor's triangle.

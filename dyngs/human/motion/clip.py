@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dyngs.human.motion.motion import Motion, interpolate_rotations
-from dyngs.human.pose.tensor_fields import tensors_to
+from dyngs.state import fields_moved_to
 
 _SAME_TIME = 1e-9
 
@@ -38,7 +38,7 @@ class MotionClip:
 
     def to(self, *, device: torch.device | str) -> MotionClip:
         """Return the clip with its poses, translations and scales on ``device``."""
-        return replace(tensors_to(self, device), times=self.times)
+        return replace(fields_moved_to(self, device), times=self.times)
 
     def select(self, rows: Tensor) -> MotionClip:
         """Return the frames at ``rows`` (long, on the CPU, ascending)."""

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError
 from dyngs.files.limits import VARIABLE, allowed
-from dyngs.human.pose.tensor_fields import tensors_to
 from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.state import fields_moved_to
 
 UpAxis = Literal["auto", "y", "z"]
 
@@ -53,7 +53,7 @@ class Motion:
 
     def to(self, *, device: torch.device | str) -> Motion:
         """Return the motion with its tensors on ``device``."""
-        return tensors_to(self, device)
+        return fields_moved_to(self, device)
 
     def for_joints(self, count: int) -> Motion:
         """Return the motion for a body of 55 (SMPL-X), 52 (SMPL-H) or 24 (SMPL) joints, see ``poses_for_joints``."""

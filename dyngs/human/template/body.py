@@ -18,7 +18,7 @@ from dyngs.human.pose.skinning import (
     check_tree,
     joint_transforms,
 )
-from dyngs.human.pose.tensor_fields import tensors_to
+from dyngs.state import fields_moved_to
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class BodyTemplate:
 
     def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> BodyTemplate:
         """Return the template on ``device``, its floating-point tensors in ``dtype``; None leaves either as it is."""
-        return tensors_to(self, device, dtype)
+        return fields_moved_to(self, device, dtype)
 
 
 def apply_shape(body: BodyTemplate, betas: Tensor | None, expression: Tensor | None = None) -> tuple[Tensor, Tensor]:

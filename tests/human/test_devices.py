@@ -1,0 +1,52 @@
+"""Tensors on a device: dataclasses moved as a whole, and results where their inputs are.
+
+The device "meta", which holds no data, stands for an accelerator: every machine has it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from motion_files import random_motion
+from synthetic_bodies import model, write_npz
+
+from dyngs.human.avatar.anchors import skinning_weights, texel_gaussians
+from dyngs.human.avatar.neighbours import nearest_neighbours
+from dyngs.human.avatar.posing import Skeleton, frame_pose, pose_blend_shapes, pose_gaussians, rest_offsets
+from dyngs.human.motion.clip import motion_clip
+from dyngs.human.motion.floor import place_on_floor
+from dyngs.human.motion.placement import place_like, rest_clip
+from dyngs.human.prediction.network import AtlasNetwork
+from dyngs.human.template.atlas import atlas_texels
+from dyngs.human.template.body_reader import read_body
+
+
+def test_no_tensor_is_made_on_the_default_device(tmp_path: Path) -> None:
+    """With a default device without data, everything is computed where the inputs are."""
+    body, motion = read_body(write_npz(tmp_path / "x.npz", model("smplx"))), random_motion(3)
+    generator = torch.Generator().manual_seed(0)
+    with torch.device("meta"):
+        gaussians, anchors = texel_gaussians(atlas_texels(body, 16), (0.0, 0.02), 1)
+        clip = motion_clip(place_on_floor(motion, body))
+        clip = place_like(clip, rest_clip(clip, body.joints, body.parents), body.joints, body.parents)
+        pose, weights = frame_pose(clip.at(0.3), 0), skinning_weights(anchors, len(body.joints))
+        offsets = rest_offsets(anchors, weights, pose, pose_blend_shapes(body), gaussians.means.repeat(1, 9))
+        found = pose_gaussians(gaussians, weights, Skeleton(body.joints, body.parents), pose, offsets)
+        near = nearest_neighbours(found.means)
+        network = AtlasNetwork(2, 1, (8,), generator)
+    for tensor in (*found.tensors().values(), *anchors.tensors().values(), near, *network.parameters()):
+        assert tensor.device.type == "cpu"
+
+
+def test_the_parts_of_an_avatar_move_to_a_device(tmp_path: Path) -> None:
+    body = read_body(write_npz(tmp_path / "x.npz", model("smplx")))
+    _, anchors = texel_gaussians(atlas_texels(body, 16), (0.0,), 0)
+    shapes = pose_blend_shapes(body)
+    assert shapes is not None
+    assert body.to(device="meta").weights.device.type == "meta"
+    assert anchors.to(device="meta").points.device.type == "meta"
+    assert shapes.to(device="meta").faces.device.type == "meta"
+    assert Skeleton(body.joints, body.parents).to(device="meta").joints.device.type == "meta"
+    clip = motion_clip(random_motion(2)).to(device="meta")
+    assert (clip.poses.device.type, clip.times.device.type) == ("meta", "cpu")
