@@ -118,10 +118,12 @@ harms = {
     "swells": swell,
 }
 case = Case("seed", {"a.txt": b"text"})
-limits = Limits(seconds=2)
+# Only what spins is to meet the limit of time: 900 MB take seconds to fill on a busy machine.
+limits = {"spins": Limits(seconds=2)}
+patient = Limits(seconds=120)
 found = {}
 for name, read in harms.items():
-    verdict = verdict_of(Reader({}, read), case, limits)
+    verdict = verdict_of(Reader({}, read), case, limits.get(name, patient))
     reason = "" if verdict.outcome == "refused" else verdict.reason
     found[name] = f"{verdict.outcome.value}: {reason}"
 print(json.dumps(found))
