@@ -75,6 +75,7 @@ from dyngs.training.state import OTHER_CONFIG, Checkpoint
 from dyngs.training.trainer import Trainer
 from dyngs.training.views import (
     AROUND_ORIGIN,
+    held_out_views,
     resolved_background,
     surroundings,
     training_cameras,
@@ -152,6 +153,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         world_offset=(x, y, z),
         has_test_views=bool(capture.splits.get("test")),
         generator=generator,
+        held_out=held_out_views(capture.splits["train"], config.train.hold_out_every),
     )
 
 

@@ -11,6 +11,8 @@ from typing import Protocol
 
 from torch import Tensor
 
+from dyngs.api import still_first
+from dyngs.api.still_first import StillComparison
 from dyngs.budget.count import count_limit
 from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
@@ -84,8 +86,26 @@ def train(config: Config, *, resume_from: Path | None = None, listeners: Sequenc
         resumed = _start_of_run(config, folder, resuming=resume_from is not None)
         if resumed is not None and resumed.info.step >= config.total_steps and not _owes_file(config, folder):
             return folder
-        _Run(config, folder, resumed).run(listeners)
+        if resumed is None:
+            start = still_first.start(config, folder, _train_still)
+            config, resumed = start.config, start.checkpoint
+        if _Run(config, folder, resumed).run(listeners):
+            return folder
+        start = still_first.still_instead(folder)
+        _Run(start.config, folder, start.checkpoint).run(listeners)
     return folder
+
+
+def _train_still(config: Config, folder: Path, steps: int) -> None:
+    """Train the still model of a run up to a step, or go on with it."""
+    resumed = latest_checkpoint(folder) if checkpoint_paths(folder) else None
+    if resumed is not None and resumed.info.step >= steps:
+        return
+    try:
+        _Run(config, folder, resumed).run((), until=steps)
+    except KeyboardInterrupt as stopped:
+        again = f"go on with: dyngs train --resume {folder.parent}"
+        raise KeyboardInterrupt(f"stopped before anything moves; {again}" if stopped.args else "") from None
 
 
 class _Run:
@@ -119,8 +139,16 @@ class _Run:
         """The configuration as saved; limits may change the number of steps."""
         return self._config if self.limited is None else self.limited.config
 
-    def run(self, listeners: Sequence[Listener]) -> None:
-        """Step until the end, or until interrupted, and keep the limits."""
+    def run(self, listeners: Sequence[Listener], until: int | None = None) -> bool:
+        """Step until the end, or until interrupted, and keep the limits.
+
+        Args:
+            listeners: are told everything.
+            until: last step, before the end of the schedule; None: its end.
+
+        Returns:
+            false where the still model has turned out to be better, so that the run ends before its time.
+        """
         options, loop, done = self.config.train, self.loop, self.loop.trainer.done
         with (
             RunLog(self.folder, done, every=options.log_every, tensorboard=options.tensorboard) as log,
@@ -128,18 +156,23 @@ class _Run:
             Interrupts() as interrupts,
         ):
             loop.subscribe(*self.limits.values(), log, progress, *listeners, self._save_and_evaluate)
-            limited = self.limited
+            limited, comparison = self.limited, None
             if limited is not None:
-                loop.subscribe(PruneStage(loop, lambda: limited.trainer))
-            loop.run(lambda: interrupts.requested)
-            if loop.trainer.done < loop.total:
-                if loop.trainer.done > self._saved:
-                    self._save()
+                comparison = StillComparison(self.folder, lambda: limited.trainer, loop)
+                loop.subscribe(PruneStage(loop, lambda: limited.trainer), comparison)
+            loop.run(lambda: interrupts.requested or loop.trainer.done == until or _is_lost(comparison))
+            if _is_lost(comparison):
+                return False
+            if loop.trainer.done < loop.total and loop.trainer.done > self._saved:
+                self._save()
+            if loop.trainer.done < loop.total and loop.trainer.done != until:
                 raise KeyboardInterrupt(
                     f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume {self.folder}"
                 )
-        for line in self._reached():
-            print(line, flush=True)
+        if until is None:
+            for line in self._reached():
+                print(line, flush=True)
+        return True
 
     def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None) -> None:
         """Set up the limits of the configuration, with the measurements that they need before training."""
@@ -211,6 +244,10 @@ class _Run:
             yield str(write_within(self.limited.trainer, self.folder, self.config.budget.max_mb))
         if _SPEED in self.limits:
             yield self.limits[_SPEED].reached()
+
+
+def _is_lost(comparison: StillComparison | None) -> bool:
+    return comparison is not None and comparison.is_lost
 
 
 def _is_done_and_read_only(config: Config, folder: Path) -> bool:

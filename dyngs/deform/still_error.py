@@ -72,7 +72,8 @@ def still_errors(
             with torch.no_grad():
                 shader = shader_at(picture.time or 0.0)
                 shown = render(gaussians, picture.cameras, options, background=background, shader=shader).rgb[0]
-        found.append(_errors_in(gaussians, picture, options, background, shown))
+        signed, weight = signed_errors(gaussians, picture, options, background, shown)
+        found.append((signed.abs().mean(1), weight))
     errors, weights = torch.stack([x for x, _ in found]), torch.stack([x for _, x in found])
     if not expected:
         mean = errors.sum(0) / weights.sum(0).clamp_min(1e-6)
@@ -83,17 +84,28 @@ def still_errors(
     return StillErrors(ordered[0], ordered.gather(0, usual[None])[0])
 
 
-def _errors_in(
+def signed_errors(
     gaussians: Gaussians, picture: Picture, options: RenderOptions, background: Tensor, expected: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return (N,) sums of errors and of weights over one picture."""
+    """Return, per Gaussian, sums over pixels of its blending weight times the signed error, and of the weight alone.
+
+    Args:
+        gaussians: N, as they are drawn.
+        picture: the truth; masked pixels do not count.
+        options: how to draw.
+        background: (3,) colour.
+        expected: (H, W, 3) picture that is compared with it.
+
+    Returns:
+        (N, 3) and (N,); both come from passes back through the blending of a constant colour.
+    """
     counts = torch.ones(expected.shape[:2], device=expected.device) if picture.mask is None else picture.mask
     error = (expected - picture.composite(background)) * counts[..., None]
     flat = torch.zeros(len(gaussians), 1, 3, requires_grad=True, device=gaussians.means.device)
     blended = render(gaussians.replace(sh=flat), picture.cameras, options).rgb[0]
     (signed,) = torch.autograd.grad(blended, flat, error, retain_graph=True)
     (weight,) = torch.autograd.grad(blended, flat, counts[..., None].expand_as(error).contiguous())
-    return signed[:, 0].abs().mean(1), weight[:, 0, 0]
+    return signed[:, 0], weight[:, 0, 0]
 
 
 def cameras_in_place(views: Sequence[View]) -> list[list[int]]:

@@ -50,6 +50,11 @@ def picture_divisor(options: TrainConfig, step: int) -> int:
     return options.initial_downscale >> sum(step / options.steps >= share for share in shares)
 
 
+def hold_out_until(options: TrainConfig) -> int:
+    """Return the last step that does without the views held out."""
+    return round(options.hold_out_until * options.steps)
+
+
 def rates_of(config: Config) -> Rates:
     """Return the course of the learning rates of a run."""
     stage = config.prune

@@ -28,7 +28,7 @@ from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.training.background import background_colour
 from dyngs.training.events import StepReport
 from dyngs.training.sampler import ViewSampler
-from dyngs.training.schedule import active_sh_degree, means_rate, picture_divisor, rates_of
+from dyngs.training.schedule import active_sh_degree, hold_out_until, means_rate, picture_divisor, rates_of
 from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
 
 
@@ -45,6 +45,7 @@ class Trainer:
         generator: the only source of randomness, on the CPU.
         done: steps done.
         bad_gradients: how often a Gaussian was left out of a step because its gradient was not finite.
+        held_out: indices of the views that are not trained on up to ``train.hold_out_until``.
     """
 
     config: Config
@@ -63,6 +64,7 @@ class Trainer:
     generator: torch.Generator
     done: int = 0
     bad_gradients: int = 0
+    held_out: frozenset[int] = frozenset()
 
     @property
     def num_gaussians(self) -> int:
@@ -108,6 +110,10 @@ class Trainer:
             self.densifier.after_backward(step, probe.grad / divisor, rendering.radii, size)
         finding = self._update(step)
         return StepReport(step, loss, picture, rendered.detach(), truth, finding)
+
+    def holds_out(self, index: int, step: int) -> bool:
+        """Return whether the view ``index`` is held out in ``step``."""
+        return index in self.held_out and step <= hold_out_until(self.config.train)
 
     def keep(self, kept: Tensor) -> None:
         """Leave only the Gaussians where ``kept`` (N,) is true."""
@@ -224,7 +230,7 @@ class Trainer:
             return self.training.trains_on(times[index], step)
 
         def is_wanted(index: int) -> bool:
-            return may_train(index) and not self.colours.holds_out(index, step)
+            return may_train(index) and not self.colours.holds_out(index, step) and not self.holds_out(index, step)
 
         return is_wanted if any(is_wanted(i) for i in range(len(self.pictures))) else may_train
 

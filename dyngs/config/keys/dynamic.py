@@ -109,6 +109,11 @@ class DynamicModel(SceneModel):
     deform: Annotated[
         DeformField, Field(discriminator="kind", description="how the canonical Gaussians are moved over time")
     ] = HexplaneField()
+    compare_with_still: bool = Field(
+        default=False,
+        description="find out first whether anything moves; train a still model, too, compare the two on held-out "
+        "training views, and keep the better one",
+    )
     motion_from: Fraction = Field(
         default=0.13,
         description="share of the run after which motion is learned; until then a static model is trained on all "

@@ -33,6 +33,15 @@ class TrainConfig(Section):
         ge=1,
         description="steps, of a 30,000-step run, after which one more degree of harmonics is trained each time",
     )
+    hold_out_every: int = Field(
+        default=0,
+        ge=0,
+        description="one of so many training views, in order of time, is held out, so that choices can be compared on "
+        "them; 0: none",
+    )
+    hold_out_until: Fraction = Field(
+        default=0.9, description="share of the run after which views that were held out are trained on, too"
+    )
     log_every: int = Field(default=10, ge=1, description="steps between lines of log.jsonl")
     save_every: int = Field(default=0, ge=0, description="steps between checkpoints; 0: only the last")
     eval_every: int = Field(default=0, ge=0, description="steps between evaluations; 0: only by `dyngs eval`")
