@@ -6,6 +6,7 @@ the pictures say so, and what moves must be worth it.
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,8 +26,9 @@ from dyngs.data.loader import Picture
 from dyngs.data.read import read_capture
 from dyngs.deform.evidence import Verdict
 from dyngs.deform.still_error import signed_errors
+from dyngs.files.write import write_text
 from dyngs.metrics import psnr
-from dyngs.runs.checkpoint import Checkpoint, checkpoint_paths, latest_checkpoint, load_run
+from dyngs.runs.checkpoint import Checkpoint, checkpoint_paths, latest_checkpoint, load_run, step_of
 from dyngs.runs.folder import STILL_FOLDER, begin
 from dyngs.scene import Scene
 from dyngs.training.background import background_colour
@@ -36,12 +38,18 @@ from dyngs.training.schedule import hold_out_until
 from dyngs.training.trainer import Trainer
 
 MAX_STILL_STEPS, STILL_SHARE = 3000, 1 / 3
-"""Steps of the still model, and share of the run's length that they are at most."""
+"""Steps of the still model where something moves for sure, and share of the run's length that they are at most."""
+CHECKED, LOOKED_BACK, GAINS = 0.05, 0.3, 0.3
+"""Shares of a run after which a still model is measured, and over which it must gain so many dB to be trained on."""
+MARGIN = 0.3
+"""dB by which motion must be better where it was not sure that anything moves: two runs differ by chance, too."""
+MEASURED_NAME = "held_out.json"
+"""In the folder of a still model: PSNR of the views held out, by step."""
 FEWEST_VIEWS = 8
 """With fewer training views none can be spared for a comparison."""
 FEW_VIEWS, OFTEN, HELD_OUT = 24, 4, 10
 """Below so many views one in four is held out; from there on one in eight, and about ten in all."""
-ERRS, MIN_ERRING = 0.1, 0.003
+ERRS, MIN_ERRING = 0.1, 0.01
 """Colour error from which a still model fails, and the share of held-out views where it does so if things move."""
 CLEAR = 0.05
 """Opacity of what moves up to which a pixel shows what stands."""
@@ -60,13 +68,46 @@ class Start:
     checkpoint: Checkpoint | None = None
 
 
-def start(config: Config, folder: Path, train_still: Callable[[Config, Path, int], None]) -> Start:
+class Plateau:
+    """Listener that finds out when a still model gains no more on the views held out.
+
+    Args:
+        folder: of its run; what was measured is kept there, so that a resumed run ends at the same step.
+        trainer: returns its trainer.
+        last: step after which it ends in any case.
+        fixed: only the last step counts.
+    """
+
+    def __init__(self, folder: Path, trainer: Callable[[], Trainer], last: int, *, fixed: bool) -> None:
+        self._path, self._trainer, self._last, self._fixed = folder / MEASURED_NAME, trainer, last, fixed
+        self._measured = {} if fixed else _read_measured(self._path, trainer().done)
+
+    @property
+    def is_reached(self) -> bool:
+        """Return whether the still model is trained."""
+        done, steps = self._trainer().done, self._trainer().config.train.steps
+        if done >= self._last:
+            return True
+        before = [x for step, x in self._measured.items() if step <= done - LOOKED_BACK * steps]
+        since = [x for step, x in self._measured.items() if step > done - LOOKED_BACK * steps]
+        return bool(before and since) and max(since) < max(before) + GAINS
+
+    def __call__(self, event: Event) -> None:
+        """Measure when it is time to."""
+        match event:
+            case StepDone() if not self._fixed and event.step % max(1, round(CHECKED * event.total)) == 0:
+                self._measured[event.step] = _quality(self._trainer())
+                write_text(self._path, json.dumps(self._measured) + "\n")
+
+
+def start(config: Config, folder: Path, train_still: Callable[[Config, Path, bool], None]) -> Start:
     """Return how the run of ``config`` begins in ``folder``: as a moving scene, or as a still one if nothing moves.
 
     Args:
         config: of a run that has not begun, or was stopped before its first checkpoint.
         folder: of the run.
-        train_still: trains a configuration in a folder up to a step, or goes on with it.
+        train_still: trains a still model in a folder, or goes on with it, until ``Plateau`` says that it is trained;
+            up to ``train.hold_out_until`` in any case, and always to there if told so.
 
     Raises:
         DyngsError: a capture that cannot be read.
@@ -86,21 +127,19 @@ def start(config: Config, folder: Path, train_still: Callable[[Config, Path, int
     if len(views) < FEWEST_VIEWS:
         print(f"{len(views)} views are too few to compare with a still model on some of them", flush=True)
         return Start(config)
-    every = hold_out_every(views)
-    train = config.train.model_copy(update={"hold_out_every": every})
-    still, steps = _still_config(config, every, folder / STILL_FOLDER)
-    said = "something moves" if evidence.verdict is Verdict.MOVES else "something may move"
-    print(f"{said}: {evidence.reason}; first {steps} steps of a still model, to compare with", flush=True)
+    every, moves = hold_out_every(views), evidence.verdict is Verdict.MOVES
+    still = _still_config(config, every, folder / STILL_FOLDER, moves=moves)
+    print(f"something {'moves' if moves else 'may move'}: {evidence.reason}; first a still model", flush=True)
     begin(folder, config)
-    train_still(still, folder / STILL_FOLDER, steps)
-    if evidence.verdict is Verdict.OPEN:
+    train_still(still, folder / STILL_FOLDER, moves)
+    if not moves:
         share = _erring_share(folder / STILL_FOLDER)
+        fails = f"a still model fails in {share:.1%} of held-out training views"
         if share < MIN_ERRING:
-            print(
-                f"nothing moves: a still model fails in {share:.1%} of held-out training views; it goes on", flush=True
-            )
+            print(f"nothing moves: {fails}; it is trained on", flush=True)
             return still_instead(folder)
-        print(f"a still model fails in {share:.1%} of held-out training views: motion is tried", flush=True)
+        print(f"{fails}: motion is tried", flush=True)
+    train = config.train.model_copy(update={"hold_out_every": every})
     return Start(config.model_copy(update={"train": train}))
 
 
@@ -112,7 +151,9 @@ def still_instead(folder: Path) -> Start:
     """
     source = folder / STILL_FOLDER
     still = load_resolved(source)
-    config = still.model_copy(update={"run": still.run.model_copy(update={"dir": folder})})
+    step = step_of(checkpoint_paths(source)[-1])
+    train = still.train.model_copy(update={"hold_out_until": step / still.train.steps})
+    config = still.model_copy(update={"train": train, "run": still.run.model_copy(update={"dir": folder})})
     save_config(config, folder / RESOLVED_NAME)
     shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     (source / "checkpoints").rename(folder / "checkpoints")
@@ -157,7 +198,8 @@ class StillComparison:
         pictures = [trainer.pictures[i] for i in sorted(trainer.held_out)]
         found = [_compared(trainer, still.scene, picture) for picture in pictures]
         moving, standing = _means([x[0] for x in found]), [x[1] for x in found if x[1] is not None]
-        self.is_lost = not moving[0] > moving[1]
+        is_sure = still.config.train.hold_out_until < trainer.config.train.hold_out_until
+        self.is_lost = not moving[0] > moving[1] + (0.0 if is_sure else MARGIN)
         kept = f"the still model of {still.step} steps is kept and trained on" if self.is_lost else "motion is kept"
         text = f"{len(found)} held-out training views: {moving[0]:.2f} dB with motion, {moving[1]:.2f} dB without"
         if standing:
@@ -190,17 +232,33 @@ def _means(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
     return fmean(x for x, _ in values), fmean(x for _, x in values)
 
 
-def _still_config(config: Config, every: int, folder: Path) -> tuple[Config, int]:
-    """Return the configuration of the still model, and how many of its steps are done before anything moves."""
-    steps = min(MAX_STILL_STEPS, max(1, round(STILL_SHARE * config.train.steps)))
+def _still_config(config: Config, every: int, folder: Path, *, moves: bool) -> Config:
+    """Return the configuration of the still model."""
     still = as_still(config)
-    held_out = {"hold_out_every": every, "hold_out_until": steps / config.train.steps}
-    return still.model_copy(
-        update={
-            "train": still.train.model_copy(update=held_out),
-            "run": config.run.model_copy(update={"dir": folder}),
-        }
-    ), steps
+    steps = min(MAX_STILL_STEPS, max(1, round(STILL_SHARE * config.train.steps)))
+    until = steps / config.train.steps if moves else config.train.hold_out_until
+    train = still.train.model_copy(update={"hold_out_every": every, "hold_out_until": until})
+    return still.model_copy(update={"train": train, "run": config.run.model_copy(update={"dir": folder})})
+
+
+def _read_measured(path: Path, done: int) -> dict[int, float]:
+    """Return held-out PSNR by step, up to step ``done``; nothing where the file is lost or damaged."""
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        return {int(step): float(x) for step, x in stored.items() if int(step) <= done}
+    except (OSError, ValueError, AttributeError, TypeError):
+        return {}
+
+
+@torch.no_grad()
+def _quality(trainer: Trainer) -> float:
+    """Return the mean PSNR of the views held out, dB."""
+    background, values = background_colour(trainer.background), list[float]()
+    for index in sorted(trainer.held_out):
+        picture = trainer.pictures[index]
+        shown = trainer.scene.render(picture.cameras, picture.time, options=trainer.options, background=background)
+        values.append(psnr(shown.rgb[0], picture.composite(background), picture.mask))
+    return fmean(values)
 
 
 def _erring_share(folder: Path) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -12,7 +12,7 @@ from typing import Protocol
 from torch import Tensor
 
 from dyngs.api import still_first
-from dyngs.api.still_first import StillComparison
+from dyngs.api.still_first import Plateau, StillComparison
 from dyngs.budget.count import count_limit
 from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
@@ -42,6 +42,7 @@ from dyngs.training.events import Evaluated, Event, Listener, Saved, StepDone
 from dyngs.training.interrupt import Interrupts
 from dyngs.training.limits import require_possible
 from dyngs.training.loop import Loop, Stopwatch
+from dyngs.training.schedule import hold_out_until
 
 _COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"
 """Names of the limits' states in a checkpoint."""
@@ -96,16 +97,21 @@ def train(config: Config, *, resume_from: Path | None = None, listeners: Sequenc
     return folder
 
 
-def _train_still(config: Config, folder: Path, steps: int) -> None:
-    """Train the still model of a run up to a step, or go on with it."""
+def _train_still(config: Config, folder: Path, fixed: bool) -> None:
+    """Train the still model of a run, or go on with it, until it is trained; see ``still_first.start``."""
     resumed = latest_checkpoint(folder) if checkpoint_paths(folder) else None
-    if resumed is not None and resumed.info.step >= steps:
+    run = _Run(config, folder, resumed)
+    trainer = run.built.scene_trainer
+    if trainer is None:
+        raise ValueError("a network is no scene")
+    plateau = Plateau(folder, lambda: trainer, hold_out_until(config.train), fixed=fixed)
+    if plateau.is_reached:
         return
     try:
-        _Run(config, folder, resumed).run((), until=steps)
+        run.run((plateau,), until=lambda: plateau.is_reached)
     except KeyboardInterrupt as stopped:
-        again = f"go on with: dyngs train --resume {folder.parent}"
-        raise KeyboardInterrupt(f"stopped before anything moves; {again}" if stopped.args else "") from None
+        again = f"stopped before anything moves; go on with: dyngs train --resume {folder.parent}"
+        raise KeyboardInterrupt(again if stopped.args else "") from None
 
 
 class _Run:
@@ -119,7 +125,7 @@ class _Run:
 
     def __init__(self, config: Config, folder: Path, resumed: Checkpoint | None) -> None:
         watch = Stopwatch()
-        built = build(config, restored=resumed is not None)
+        self.built = built = build(config, restored=resumed is not None)
         self.folder, self.limits = folder, dict[str, Limit]()
         self.loop = Loop(built.trainer, config.total_steps, watch, lambda: last_good(folder))
         if resumed is not None:
@@ -139,12 +145,12 @@ class _Run:
         """The configuration as saved; limits may change the number of steps."""
         return self._config if self.limited is None else self.limited.config
 
-    def run(self, listeners: Sequence[Listener], until: int | None = None) -> bool:
+    def run(self, listeners: Sequence[Listener], until: Callable[[], bool] = lambda: False) -> bool:
         """Step until the end, or until interrupted, and keep the limits.
 
         Args:
             listeners: are told everything.
-            until: last step, before the end of the schedule; None: its end.
+            until: whether to end before the end of the schedule.
 
         Returns:
             false where the still model has turned out to be better, so that the run ends before its time.
@@ -160,16 +166,16 @@ class _Run:
             if limited is not None:
                 comparison = StillComparison(self.folder, lambda: limited.trainer, loop)
                 loop.subscribe(PruneStage(loop, lambda: limited.trainer), comparison)
-            loop.run(lambda: interrupts.requested or loop.trainer.done == until or _is_lost(comparison))
+            loop.run(lambda: interrupts.requested or until() or _is_lost(comparison))
             if _is_lost(comparison):
                 return False
             if loop.trainer.done < loop.total and loop.trainer.done > self._saved:
                 self._save()
-            if loop.trainer.done < loop.total and loop.trainer.done != until:
+            if loop.trainer.done < loop.total and not until():
                 raise KeyboardInterrupt(
                     f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume {self.folder}"
                 )
-        if until is None:
+        if loop.trainer.done >= loop.total:
             for line in self._reached():
                 print(line, flush=True)
         return True

@@ -65,7 +65,10 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
     limit = freezes_below_px(config)
     if limit is None:
         return []
-    scene = load_run(folder).scene
+    run = load_run(folder)
+    scene = run.scene
+    if freezes_below_px(run.config) is None:
+        return ["motion:  none, so this is a still model, like those of configs/static.yaml"]
     if not scene.times:
         return ["motion:  the capture has no times (or only one), so this is a static model"]
     if scene.is_still:
