@@ -158,7 +158,7 @@ class _Run:
         options, loop, done = self.config.train, self.loop, self.loop.trainer.done
         with (
             RunLog(self.folder, done, every=options.log_every, tensorboard=options.tensorboard) as log,
-            Progress(loop.total, done, options.log_every) as progress,
+            Progress(loop.total, done, options.log_every, config=lambda: self.config) as progress,
             Interrupts() as interrupts,
         ):
             loop.subscribe(*self.limits.values(), log, progress, *listeners, self._save_and_evaluate)

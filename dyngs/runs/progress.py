@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Callable
 from types import TracebackType
 from typing import IO, Any
 
+from dyngs.config import Config
 from dyngs.runs.log import LogRecord, record_of
+from dyngs.runs.remaining import RemainingTime
 from dyngs.training.events import Evaluated, Event, Message, StepDone, TotalChanged
 
 PLAIN_LINES = 10
@@ -27,12 +30,22 @@ class Progress:
         done: steps done.
         every: steps between updates; the last step has one, too.
         stream: where to; None: standard error.
+        config: returns the configuration as it is now, whose schedule decides the time left; None: steps all alike.
     """
 
-    def __init__(self, total: int, done: int, every: int = 1, stream: IO[str] | None = None) -> None:
+    def __init__(
+        self,
+        total: int,
+        done: int,
+        every: int = 1,
+        stream: IO[str] | None = None,
+        config: Callable[[], Config] | None = None,
+    ) -> None:
         self._total, self._start, self._every = total, done, every
         self._stream = sys.stderr if stream is None else stream
         self._since = time.perf_counter()
+        self._remaining = RemainingTime(config, done, self._since)
+        self._has_stepped = False
         self._psnr: float | None = None
         self._next_line = done
         self._bar: Any = None
@@ -42,7 +55,10 @@ class Progress:
         """Show ``event``."""
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
-                self.update(record_of(event))
+                self.update(record_of(event), event.report.truth.shape[0] * event.report.truth.shape[1])
+            case StepDone() if not self._has_stepped:
+                self._has_stepped = True
+                self._remaining.restart(event.step, time.perf_counter())
             case TotalChanged():
                 self.expect(event.total)
             case Evaluated():
@@ -50,18 +66,20 @@ class Progress:
             case Message():
                 self.say(event.text)
 
-    def update(self, record: LogRecord) -> None:
-        """Show ``record``; PSNR is averaged over the last few of them."""
+    def update(self, record: LogRecord, pixels: int = 0) -> None:
+        """Show ``record``, of a step that drew ``pixels``; PSNR is averaged over the last few of them."""
         # One picture says little: views differ by several dB.
         if record.psnr is not None:
             self._psnr = record.psnr if self._psnr is None else 0.95 * self._psnr + 0.05 * record.psnr
-        rate = (record.step - self._start) / max(time.perf_counter() - self._since, 1e-9)
+        now = time.perf_counter()
+        rate = (record.step - self._start) / max(now - self._since, 1e-9)
+        self._remaining.observe(record.step, now, record.num_gaussians, pixels)
+        left = _clock(self._remaining.seconds(self._total))
         psnr = "-" if self._psnr is None else f"{self._psnr:.2f}"
         text = f"loss {record.loss:.4f} psnr {psnr} {record.num_gaussians:,} Gaussians {rate:.1f} steps/s"
         if self._bar is not None:
-            self._bar.update(self._task, completed=record.step, text=text)
+            self._bar.update(self._task, completed=record.step, text=text, left=left)
         elif record.step >= self._next_line or record.step == self._total:
-            left = _clock((self._total - record.step) / max(rate, 1e-9))
             print(f"step {record.step}/{self._total} {text} {left} left", file=self._stream, flush=True)
             self._next_line = record.step + max(1, self._total // PLAIN_LINES)
 
@@ -81,12 +99,14 @@ class Progress:
     def pause(self, seconds: float) -> None:
         """Leave ``seconds`` that were not spent training out of the rate."""
         self._since += seconds
+        self._remaining.pause(seconds)
 
     def __enter__(self) -> Progress:
         if self._stream.isatty() and os.environ.get("TERM") != "dumb":
             self._bar, self._task = _rich_bar(self._total, self._start, self._stream)
             self._bar.start()
         self._since = time.perf_counter()
+        self._remaining.restart(self._start, self._since)
         return self
 
     def __exit__(
@@ -99,13 +119,13 @@ class Progress:
 def _rich_bar(total: int, done: int, stream: IO[str]) -> tuple[Any, Any]:
     """Return a rich progress bar, not yet shown, and its task."""
     from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as RichProgress
 
     steps, text = TextColumn("{task.completed:.0f}/{task.total:.0f}"), TextColumn("{task.fields[text]}")
-    columns = (steps, BarColumn(bar_width=6), text, TimeRemainingColumn(compact=True))  # fits 80 characters
+    columns = (steps, BarColumn(bar_width=6), text, TextColumn("{task.fields[left]}"))  # fits 80 characters
     bar = RichProgress(*columns, console=Console(file=stream), refresh_per_second=4)
-    return bar, bar.add_task("train", total=total, completed=done, text="")
+    return bar, bar.add_task("train", total=total, completed=done, text="", left="")
 
 
 def _clock(seconds: float) -> str:

@@ -1,0 +1,99 @@
+"""The predicted rest of a run against simulated runs whose steps get dearer as those of real ones do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from dyngs.config import Config
+from dyngs.config.io import load_config
+from dyngs.runs.remaining import RemainingTime
+from dyngs.training.schedule import picture_divisor
+
+STEPS = 6000
+
+
+def dynamic(steps: int = STEPS) -> Config:
+    preset = Path(__file__).parents[2] / "configs" / "dynamic.yaml"
+    return load_config(preset, ["data.root=nowhere", f"train.steps={steps}"])
+
+
+@dataclass(frozen=True)
+class Run:
+    """A simulated run: Gaussians and seconds by step, on a machine with proportions of its own."""
+
+    config: Config
+    gaussians: Callable[[float], float]
+    pixels: int
+    fixed: float
+    per_pixel: float
+    per_gaussian: float
+    motion: float = 1.0
+    moves_after: int = 1000
+
+    def share(self, step: int) -> float:
+        return step / self.config.train.steps
+
+    def drawn(self, step: int) -> int:
+        return self.pixels // picture_divisor(self.config.train, step) ** 2
+
+    def seconds(self, first: int, last: int) -> float:
+        """Of the steps after ``first`` up to ``last``."""
+        return sum(
+            (self.motion if s > self.moves_after else 1.0)
+            * (self.fixed + self.per_pixel * self.drawn(s) + self.per_gaussian * self.gaussians(self.share(s)))
+            for s in range(first + 1, last + 1)
+        )
+
+    def predicted(self, until: int, every: int = 20) -> tuple[float, float]:
+        """Return the seconds left after step ``until`` as predicted, and as steps so far would say."""
+        remaining, now = RemainingTime(lambda: self.config, 0, 100.0), 100.0
+        for step in range(every, until + 1, every):
+            now += self.seconds(step - every, step)
+            remaining.observe(step, now, round(self.gaussians(self.share(step))), self.drawn(step))
+        steps = self.config.train.steps
+        return remaining.seconds(steps), (now - 100.0) / until * (steps - until)
+
+
+def sharpening(x: float) -> float:
+    """The Gaussians of a real clip of 854x480: to 30,000 in small pictures, then to the cap of 60,000."""
+    return 4000 + 47000 * min(x, 0.58) + (0 if x < 0.6 else min(1.0, (x - 0.6) / 0.1) * 29000)
+
+
+@pytest.mark.parametrize(
+    "machine", [(0.02, 3e-7, 1e-6, 1.6), (0.01, 2e-7, 4e-7, 1.4), (0.04, 6e-7, 2e-6, 1.9), (0.12, 2e-6, 4e-6, 1.6)]
+)
+def test_small_pictures_first(machine: tuple[float, float, float, float]) -> None:
+    run = Run(dynamic(), sharpening, 854 * 480, *machine)
+    done = STEPS // 10
+    truth = run.seconds(done, STEPS)
+    predicted, naive = run.predicted(done)
+    assert predicted == pytest.approx(truth, rel=0.3)
+    assert naive < truth / 2
+
+
+def test_steps_that_are_all_alike_are_counted() -> None:
+    remaining = RemainingTime(None, 0, 0.0)
+    for step in range(10, 101, 10):
+        remaining.observe(step, 0.5 * step, 1000)
+    assert remaining.seconds(400) == pytest.approx(150.0)
+    assert remaining.seconds(100) == 0.0
+
+
+def test_a_slow_first_step_and_pauses_do_not_count() -> None:
+    remaining = RemainingTime(None, 0, 0.0)
+    remaining.restart(1, 300.0)
+    remaining.observe(11, 301.0, 1000)
+    assert remaining.seconds(111) == pytest.approx(10.0)
+    remaining.pause(50.0)
+    remaining.observe(21, 352.0, 1000)
+    assert remaining.seconds(121) == pytest.approx(10.0)
+
+
+def test_after_densification_nothing_is_expected_to_grow() -> None:
+    run = Run(dynamic(1000), lambda x: 1000 + 9000 * min(x, 0.9), 100 * 100, 1e-3, 0.0, 1e-6)
+    truth = run.seconds(960, 1000)
+    assert run.predicted(960)[0] == pytest.approx(truth, rel=0.15)
