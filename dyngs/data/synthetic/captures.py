@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Scene, render_scene
+from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Scene, render_movers, render_scene
 from dyngs.data.synthetic.scenes import SceneName, scene_at, still_life
+from dyngs.data.synthetic.tracks import true_tracks
+from dyngs.data.true_tracks import write_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image, write_text
 
@@ -102,6 +104,10 @@ def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = 
     time is seen by one camera somewhere else on the hemisphere. ``room`` is a video of several fixed cameras instead:
     ``camAA/frame_BBBB.png`` without alpha, frames with ``camera``; test and val have one camera each, never trained on.
 
+    ``motion/`` holds a mask for each picture, white where something that moves is seen, and ``true_tracks.npz`` the
+    tracks of points on it (``TrueTracks``). Frames of val and test name their mask (``motion_mask_path``), those of
+    train do not: training would take it as a prior.
+
     Raises:
         DyngsError: no such scene, no pictures asked for, ``out`` holds something already, or cannot be written.
     """
@@ -112,6 +118,8 @@ def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = 
     splits = _room_shots(options) if name == "room" else _teleporting_shots(options)
     for split, shots in splits.items():
         _write_split(out, split, shots, lambda shot: scene_at(name, shot.time or 0.0), options)
+    taken = [(shot.name, shot.time or 0.0, shot.world_from_cam) for shots in splits.values() for shot in shots]
+    write_true_tracks(out, true_tracks(lambda time: scene_at(name, time), taken, options.seed))
     return out
 
 
@@ -137,13 +145,18 @@ def _write_split(
         return
     frames = []
     for shot in shots:
-        rgba = render_scene(scene_of(shot), shot.world_from_cam, options.size, options.samples)
+        scene = scene_of(shot)
+        rgba = render_scene(scene, shot.world_from_cam, options.size, options.samples)
         write_image(out / f"{shot.name}.png", rgba if shot.camera is None else rgba[..., :3])
         frame: dict[str, object] = {"file_path": f"./{shot.name}"}
         if shot.camera is not None:
             frame["camera"] = shot.camera
         if shot.time is not None:
             frame["time"] = shot.time
+            moves = render_movers(scene, shot.world_from_cam, options.size, options.samples)
+            write_image(out / "motion" / f"{shot.name}.png", moves.astype(np.uint8) * 255)
+            if split != "train":
+                frame["motion_mask_path"] = f"./motion/{shot.name}.png"
         frames.append(frame | {"transform_matrix": shot.world_from_cam.tolist()})
     transforms = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
     write_text(out / f"transforms_{split}.json", json.dumps(transforms, indent=1) + "\n")

@@ -21,6 +21,8 @@ Paint = Callable[[np.ndarray], np.ndarray]
 
 _MARCH_STEPS = 40
 _BISECTIONS = 18
+_SURFACE = 3e-3
+"""World units by which a surface may seem to lie before one of its own points."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,14 @@ class Sphere:
     def local(self, points: np.ndarray) -> np.ndarray:
         """(R, 3) surface points in the paint's axes."""
         return self.normals(points) @ _f32(self.turn)
+
+    def placed(self, local: np.ndarray) -> np.ndarray:
+        """(R, 3) surface points, of those in the paint's axes: the inverse of ``local``."""
+        return np.float32(self.radius) * local @ _f32(self.turn).T + _f32(self.center)
+
+    def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
+        """(R, 3) points spread evenly over the surface, in the paint's axes."""
+        return _unit(random.normal(size=(count, 3))).astype(np.float32)
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """(R, 3) unit normals at surface points."""
@@ -90,6 +100,19 @@ class Box:
         """(R, 3) surface points in the box's axes, each divided by the half extent."""
         turned = (points - _f32(self.center)) @ self._axes().T
         return turned / _f32(self.half_extents)
+
+    def placed(self, local: np.ndarray) -> np.ndarray:
+        """(R, 3) surface points, of those in the box's axes: the inverse of ``local``."""
+        return (local * _f32(self.half_extents)) @ self._axes() + _f32(self.center)
+
+    def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
+        """(R, 3) points spread evenly over the six faces, in the box's axes, each divided by the half extent."""
+        half = np.asarray(self.half_extents)
+        areas = half.prod() / half
+        local = random.uniform(-1.0, 1.0, (count, 3))
+        rows, face = np.arange(count), random.choice(3, count, p=areas / areas.sum())
+        local[rows, face] = np.where(local[rows, face] < 0, -1.0, 1.0)
+        return local.astype(np.float32)
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """(R, 3) unit normals at surface points."""
@@ -183,6 +206,17 @@ class Sheet:
         flat = (points - _f32(self.center))[:, :2] / _f32(self.half_extents)
         return np.concatenate([flat, np.zeros_like(flat[:, :1])], axis=1)
 
+    def placed(self, local: np.ndarray) -> np.ndarray:
+        """(R, 3) surface points, of those in material coordinates: the inverse of ``local``."""
+        u, v = (local[:, :2] * _f32(self.half_extents)).T
+        return np.stack([u, v, self.height(u, v)], axis=1) + _f32(self.center)
+
+    def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
+        """(R, 3) points spread evenly over the cloth at rest, in material coordinates."""
+        local = random.uniform(-1.0, 1.0, (count, 3))
+        local[:, 2] = 0.0
+        return local.astype(np.float32)
+
     def normals(self, points: np.ndarray) -> np.ndarray:
         """(R, 3) unit normals of the upper side at surface points."""
         u, v, _ = (points - _f32(self.center)).T
@@ -216,15 +250,22 @@ class Scene:
         lamp_size: side of the lamp, world units; it softens the shadows.
         faint: a neighbour that hides no more than this share of a point's sky hides nothing, which leaves what is far
             from a moving thing exactly as it is.
+        num_still: the first so many primitives stand still; None: all do.
     """
 
     primitives: tuple[Primitive, ...]
     lamp: tuple[float, float, float] = (2.2, -2.6, 4.4)
     lamp_size: float = 0.9
     faint: float = 0.0
+    num_still: int | None = None
     _sky: tuple[float, float, float] = field(default=(0.46, 0.50, 0.56), repr=False)
     _ground: tuple[float, float, float] = field(default=(0.20, 0.17, 0.15), repr=False)
     _lamplight: tuple[float, float, float] = field(default=(0.80, 0.74, 0.66), repr=False)
+
+    @property
+    def movers(self) -> range:
+        """Indices of the primitives that move."""
+        return range(len(self.primitives) if self.num_still is None else self.num_still, len(self.primitives))
 
 
 def render_scene(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3) -> np.ndarray:
@@ -254,11 +295,42 @@ def render_scene(scene: Scene, world_from_cam: np.ndarray, size: int, samples: i
     return (rgba * 255.0 + 0.5).astype(np.uint8).reshape(size, size, 4)
 
 
+def render_movers(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3) -> np.ndarray:
+    """(size, size) bool: pixels of ``render_scene`` in which something that moves is seen; light does not count."""
+    seen = np.zeros(size * size, bool)
+    origin = world_from_cam[:3, 3].astype(np.float32)
+    for a in range(samples):
+        for b in range(samples):
+            directions = _pixel_rays(world_from_cam, size, (a + 0.5) / samples, (b + 0.5) / samples)
+            nearest, distance = _nearest(scene, origin, directions)
+            seen |= (nearest >= scene.movers.start) & np.isfinite(distance)
+    return seen.reshape(size, size)
+
+
+def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
+    """(R,) bool: points on surfaces of which a camera sees, somewhere in its picture or not; NaN is never seen.
+
+    Args:
+        scene: what there is.
+        points: (R, 3).
+        world_from_cam: (4, 4) OpenGL camera-to-world pose.
+    """
+    origin = world_from_cam[:3, 3]
+    offset = np.nan_to_num(points - origin)
+    distance = np.maximum(np.sqrt(_dot(offset, offset)), 1e-6)
+    _, nearest = _nearest(scene, _f32(origin), (offset / distance[:, None]).astype(np.float32))
+    return np.isfinite(points).all(axis=1) & (nearest > distance - _SURFACE)
+
+
+def _nearest(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return, per ray, the primitive that it hits first and the distance to it, inf where it hits none."""
+    distances = np.stack([p.intersect(origin[None], directions) for p in scene.primitives])
+    return distances.argmin(axis=0), distances.min(axis=0)
+
+
 def _trace(scene: Scene, origin: np.ndarray, directions: np.ndarray, lamp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return indices of the rays that hit something (R_hit,), and the colours there: sRGB (R_hit, 3)."""
-    distances = np.stack([p.intersect(origin[None], directions) for p in scene.primitives])
-    nearest = distances.argmin(axis=0)
-    distance = distances.min(axis=0)
+    nearest, distance = _nearest(scene, origin, directions)
     hit = np.flatnonzero(np.isfinite(distance))
     nearest, directions = nearest[hit], directions[hit]
     points = origin + distance[hit, None] * directions

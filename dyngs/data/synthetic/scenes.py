@@ -82,6 +82,7 @@ def _spin(time: float) -> Scene:
             ),
         ),
         faint=_FAINT,
+        num_still=2,
     )
 
 
@@ -97,6 +98,7 @@ def _wave(time: float) -> Scene:
             Sheet((0.0, 0.0, 0.16), (0.74, 0.56), waves, _carpet()),
         ),
         faint=_FAINT,
+        num_still=4,
     )
 
 
@@ -119,7 +121,7 @@ def _merge(time: float) -> Scene:
     if grown > 0:
         paint = _swirl((0.40, 0.16, 0.52), (0.93, 0.80, 0.86))
         things.append(Sphere((-0.50, 0.42, _PLATE_TOP + grown), grown, paint, gloss=0.6))
-    return Scene(tuple(things), faint=_FAINT)
+    return Scene(tuple(things), faint=_FAINT, num_still=2)
 
 
 def _room(time: float) -> Scene:
@@ -146,6 +148,7 @@ def _room(time: float) -> Scene:
             ),
         ),
         faint=_FAINT,
+        num_still=7,
     )
 
 

@@ -23,6 +23,7 @@ from dyngs.data.synthetic.captures import (
     SceneName,
     StillOptions,
     hemisphere_cameras,
+    render_movers,
     render_scene,
     scene_at,
     write_dynamic_capture,
@@ -135,6 +136,19 @@ def test_each_picture_shows_its_scene_at_its_time(name: SceneName, tmp_path: Pat
         found = _pixels(root / (frame["file_path"] + ".png"))
         np.testing.assert_array_equal(found, expected[..., : found.shape[2]])
         assert found.shape[2] == (3 if name == "room" else 4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_held_out_pictures_have_masks_of_what_moves(name: SceneName, tmp_path: Path) -> None:
+    root = write_dynamic_capture(name, tmp_path / "out", TINY)
+    for split in ("train", "val", "test"):
+        frames = json.loads((root / f"transforms_{split}.json").read_text())["frames"]
+        assert all(("motion_mask_path" in frame) == (split != "train") for frame in frames)
+        for frame in frames:
+            mask = _pixels(root / "motion" / (frame["file_path"] + ".png"))
+            expected = render_movers(scene_at(name, frame["time"]), np.array(frame["transform_matrix"]), 16, 1)
+            np.testing.assert_array_equal(mask[..., 0], 255 * expected.astype(np.uint8))
+            assert 0 < expected.mean() < 0.6
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -62,6 +62,7 @@ def test_still_primitives_come_first_and_stay(name: SceneName) -> None:
         assert repr(a).split("paint")[0] == repr(b).split("paint")[0]
         np.testing.assert_array_equal(a.paint(a.local(points)), b.paint(b.local(points)))
     assert len(first) == len(second) > still
+    assert scene_at(name, 0.35).movers == range(still, len(first))
     for a, b in zip(first[still:], second[still:], strict=True):
         assert (a.local(points) != b.local(points)).any() or isinstance(a, Sheet)
 
