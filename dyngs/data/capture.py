@@ -151,6 +151,8 @@ class Capture:
         has_alpha: pictures carry straight alpha that means "transparent here".
         body: body parameters of each split, by frame number, for captures of people, else None.
         fps: frames per second of the recording, None where the capture does not say.
+        span: first and last time as written in the files, which are 0 and 1 in the views; None without times.
+        seconds: from time 0 to time 1, None where it is not known.
         warnings: suspicious findings of the reader, one line each.
     """
 
@@ -162,6 +164,8 @@ class Capture:
     has_alpha: bool = False
     body: dict[Split, BodyFrames] | None = None
     fps: float | None = None
+    span: tuple[float, float] | None = None
+    seconds: float | None = None
     warnings: tuple[str, ...] = ()
 
     def replace(self, **changes: object) -> Capture:

@@ -26,7 +26,7 @@ from dyngs.data.readers import (
     zju_mocap,
 )
 from dyngs.data.readers.shared.capture_format import CaptureFormat
-from dyngs.data.times import sequence_warnings, still_if_constant, unit_times
+from dyngs.data.times import clip_seconds, sequence_warnings, span_in_files, still_if_constant, unit_times
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside, pictures_up_to, staying_within
 
@@ -52,8 +52,8 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     """Read the capture in a folder; pictures are not decoded, only their headers are read.
 
     Views are sorted by name. ``frames`` of the options chooses among the times of all splits. Where the format names no
-    test views, every ``test_every``-th picture is one. Times are scaled to [0, 1]; a scene far from the origin is moved
-    there. The splits train, val and test are always present, val and test possibly empty.
+    test views, every ``test_every``-th picture is one. Times are scaled to [0, 1] over all splits; a scene far from
+    the origin is moved there. The splits train, val and test are always present, val and test possibly empty.
 
     Example::
 
@@ -120,7 +120,9 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
     if not splits.get("train"):
         raise DyngsError(f"{capture.root}: the {capture.format} capture has no training views; add posed pictures")
     new_poses = splits.pop("pose", None)
-    splits, notes = _timed(capture.root, splits, options.frames)
+    written = splits
+    splits, notes = _timed(capture, splits, options.frames)
+    span, seconds = span_in_files(written, splits), clip_seconds(splits, capture.fps)
     if "test" not in splits:
         splits["train"], splits["test"] = hold_out(splits["train"], options.test_every)
         if not splits["train"]:
@@ -140,6 +142,8 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         splits=splits,
         points=points,
         has_alpha=_first_has_alpha(splits["train"]),
+        span=span,
+        seconds=seconds,
         warnings=(*warnings, *notes, *more),
     )
     return recenter(capture)
@@ -182,11 +186,14 @@ def _first_has_alpha(views: tuple[View, ...]) -> bool:
     return False
 
 
-def _timed(root: Path, splits: Splits, frames: str | None) -> tuple[Splits, list[str]]:
-    """Return the splits with final times, without views of frames that are not selected, and warnings."""
-    splits, notes = unit_times(root, splits)
+def _timed(capture: Capture, splits: Splits, frames: str | None) -> tuple[Splits, list[str]]:
+    """Return the splits with final times, without views of frames that are not selected, and warnings.
+
+    People move by frame number: of their captures, times within [0, 1] are left as they are.
+    """
+    splits, notes = unit_times(capture.root, splits, stretch=capture.body is None)
     if frames is not None:
-        splits = select_frames(root, splits, frames)
+        splits = select_frames(capture.root, splits, frames)
     splits, more = still_if_constant(splits)
     return splits, [*notes, *more, *sequence_warnings(splits)]
 

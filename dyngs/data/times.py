@@ -6,6 +6,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 from dyngs.data.capture import Splits, View, all_views
@@ -14,13 +15,22 @@ from dyngs.files.fields import is_number
 
 SAME_TIME = 1e-6
 """Times closer than this are the same time: files of one capture are often rounded differently."""
+MENTIONED_CHANGE = 0.05
+"""Times that are scaled by less than this are not mentioned: the last of n times is often written as (n - 1) / n."""
 _MAX_NAMED = 5
+_EVEN = 1.1
+"""Longest over shortest gap of evenly spaced times, with allowance for rounding in the files."""
 
 
-def unit_times(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
-    """Return the splits with times in [0, 1], and warnings; all times are scaled together where one lies outside.
+def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Splits, list[str]]:
+    """Return the splits with the first time at 0 and the last one at 1, and warnings; one scale for all splits.
 
     Times that are all equal are left as they are, see ``still_if_constant``.
+
+    Args:
+        root: the capture, for messages.
+        splits: views with times as in the files, or all without.
+        stretch: scale times that lie within [0, 1], too; otherwise only those that do not.
 
     Raises:
         DyngsError: a time that is no finite number, or some views with and some without a time; names the view.
@@ -36,13 +46,45 @@ def unit_times(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
         untimed = next(view.name for view in views if view.time is None)
         raise DyngsError(f"{root}: {untimed} has no time although other pictures have; give time for all or none")
     first, last = min(timed), max(timed)
-    if (first >= 0 and last <= 1) or first == last:
+    within = first >= 0 and last <= 1
+    if first == last or (within and (not stretch or (first, last) == (0, 1) or last - first <= SAME_TIME)):
         return splits, []
     scaled: Splits = {
         name: tuple(replace(view, time=((view.time or 0.0) - first) / (last - first)) for view in kept)
         for name, kept in splits.items()
     }
+    if within and max(first, 1 - last) < MENTIONED_CHANGE:
+        return scaled, []
     return scaled, [f"times run from {first:g} to {last:g} and were scaled to [0, 1]"]
+
+
+def span_in_files(written: Splits, kept: Splits) -> tuple[float, float] | None:
+    """Return the first and the last time of the ``kept`` views as ``written`` in the files; None without times."""
+    names = {view.name for view in all_views(kept) if view.time is not None}
+    times = [view.time for view in all_views(written) if view.time is not None and view.name in names]
+    return (min(times), max(times)) if times else None
+
+
+def clip_seconds(splits: Splits, fps: float | None) -> float | None:
+    """Return the seconds from time 0 to time 1, None where they are not known.
+
+    From the frame numbers where all views have one, else from the number of times where these are evenly spaced.
+
+    Args:
+        splits: views with times in [0, 1].
+        fps: frames per second of the recording.
+    """
+    views = all_views(splits)
+    times = sorted(set(distinct_times(views).values()))
+    if fps is None or len(times) < 2:
+        return None
+    frames = [view.frame for view in views if view.frame is not None]
+    if len(frames) == len(views):
+        steps = max(frames) - min(frames)
+    else:
+        gaps = [after - before for before, after in pairwise(times)]
+        steps = len(gaps) if max(gaps) < _EVEN * min(gaps) else 0
+    return steps / fps if steps else None
 
 
 def still_if_constant(splits: Splits) -> tuple[Splits, list[str]]:

@@ -20,6 +20,7 @@ from dyngs.config import DataConfig
 from dyngs.data import readers
 from dyngs.data.capture import Capture
 from dyngs.data.geometry.poses import camera_center
+from dyngs.data.inspection.report import report_on
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import FORMATS, read_capture
 from dyngs.errors import DyngsError
@@ -175,12 +176,29 @@ def test_times_in_frames_are_scaled_to_one(blender_root: Path) -> None:
     assert "times run from 0 to 20" in capture.warnings[0]
 
 
-def test_times_in_range_are_left_alone(blender_root: Path) -> None:
-    set_times(blender_root, "train", [0.25 + i / 100 for i in range(16)])
-    set_times(blender_root, "test", [0.5, 0.5])
+def test_times_are_stretched_to_the_span_of_all_splits(blender_root: Path) -> None:
+    """As in D-NeRF-like folders whose times run from 0 to 0.055."""
+    set_times(blender_root, "train", [0.003 * i for i in range(16)])
+    set_times(blender_root, "test", [0.015, 0.06])
+    edit_json(blender_root / "transforms_train.json", lambda c: c.update(fps=30))
     capture = read(blender_root)
-    assert [view.time for view in capture.splits["test"]] == [0.5, 0.5]
-    assert capture.warnings == ()
+    assert [view.time for view in capture.splits["test"]] == pytest.approx([0.25, 1.0])
+    assert sorted(view.time or 0.0 for view in capture.splits["train"]) == pytest.approx([0.05 * i for i in range(16)])
+    assert capture.warnings == ("times run from 0 to 0.06 and were scaled to [0, 1]",)
+    assert (capture.span, capture.seconds) == ((0.0, 0.06), None)
+    assert dict(report_on(capture).facts)["times"] == "17 in 0 to 1 (0 to 0.06 in the files)"
+
+
+def test_times_from_0_to_1_are_kept_exactly(blender_root: Path) -> None:
+    set_times(blender_root, "train", [i / 15 for i in range(16)])
+    set_times(blender_root, "test", [0.1, 0.3])
+    edit_json(blender_root / "transforms_train.json", lambda c: c.update(fps=30))
+    edit_json(blender_root / "transforms_test.json", lambda c: c["frames"].clear())
+    capture = read(blender_root)
+    assert {view.time for view in capture.splits["train"]} == {i / 15 for i in range(16)}
+    assert (capture.span, capture.seconds) == ((0.0, 1.0), pytest.approx(0.5))
+    facts = dict(report_on(capture).facts)
+    assert (facts["times"], facts["duration"]) == ("16 in 0 to 1", "0.5 seconds from time 0 to time 1")
 
 
 def test_time_for_some_is_an_error(blender_root: Path) -> None:

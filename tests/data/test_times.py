@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from tiny_captures import opengl_pose
 
 from dyngs.data.capture import Split, View
-from dyngs.data.times import sequence_warnings, still_if_constant, unit_times
+from dyngs.data.times import clip_seconds, sequence_warnings, span_in_files, still_if_constant, unit_times
 from dyngs.errors import DyngsError
 
 ROOT = Path("capture")
@@ -44,17 +45,53 @@ def test_missing_in_some() -> None:
 
 @given(st.lists(st.integers(-50, 50).map(float), min_size=2, max_size=8, unique=True), st.integers(0, 6))
 def test_scaled_over_all_splits(times: list[float], cut: int) -> None:
-    """Whatever the order: one affine map for all splits, onto [0, 1] unless that is where they were."""
+    """Whatever the order: one affine map for all splits, onto [0, 1]."""
     views = [view(f"v{i}", time) for i, time in enumerate(times)]
     cut = min(cut, len(views) - 1)
     splits, notes = unit_times(ROOT, {"train": tuple(views[cut:]), "test": tuple(views[:cut])})
     found = times_of(splits, "test") + times_of(splits)
     low, high = min(times), max(times)
-    if low >= 0 and high <= 1:
+    if (low, high) == (0, 1):
         assert (found, notes) == (times, [])
     else:
         assert found == pytest.approx([(time - low) / (high - low) for time in times])
         assert notes == [f"times run from {low:g} to {high:g} and were scaled to [0, 1]"]
+
+
+@pytest.mark.parametrize(
+    ("times", "mentioned"),
+    [
+        ([0.0, 0.011, 0.055], True),
+        ([0.1, 0.2, 1.0], True),
+        ([0.0, 0.49, 0.98], False),
+        ([0.3, 0.3 + 1e-8, 0.3], None),
+        ([0.0, 0.125, 1.0], None),
+    ],
+)
+def test_stretched_to_the_span_of_the_clip(times: list[float], mentioned: bool | None) -> None:
+    """None: nothing changes, not by rounding either; so do the times of people."""
+    splits = train(*(view(f"v{i}", time) for i, time in enumerate(times)))
+    scaled, notes = unit_times(ROOT, splits)
+    if mentioned is None:
+        assert (times_of(scaled), notes) == (times, [])
+    else:
+        span = max(times) - min(times)
+        assert times_of(scaled) == pytest.approx([(time - min(times)) / span for time in times])
+        assert [f"times run from {min(times):g} to {max(times):g}" in note for note in notes] == [True] * mentioned
+    assert unit_times(ROOT, splits, stretch=False) == (splits, [])
+
+
+def test_span_and_seconds() -> None:
+    written = train(*(view(f"v{i}", 2.0 + i) for i in range(5)))
+    kept, _ = unit_times(ROOT, train(*written["train"][1:4]))
+    assert span_in_files(written, kept) == (3.0, 5.0)
+    assert clip_seconds(kept, 4.0) == pytest.approx(0.5)
+    assert clip_seconds(kept, None) is None
+    uneven, _ = unit_times(ROOT, train(*written["train"][:2], written["train"][4]))
+    assert clip_seconds(uneven, 4.0) is None
+    numbered = train(*(replace(kept, frame=10 * i) for i, kept in enumerate(uneven["train"])))
+    assert clip_seconds(numbered, 4.0) == pytest.approx(5.0)
+    assert span_in_files(train(view("a", None)), train(view("a", None))) is None
 
 
 def test_without_times() -> None:

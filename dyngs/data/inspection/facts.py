@@ -55,7 +55,8 @@ def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
         yield "times", "none (a still scene)"
         return
     times = set(distinct_times(views).values())
-    yield "times", f"{len(times)} in {_range(times)}"
+    written = "" if capture.span in (None, (0.0, 1.0)) else f" ({_range(capture.span)} in the files)"
+    yield "times", f"{len(times)} in {_range(times)}{written}"
     cameras: defaultdict[int, set[bytes]] = defaultdict(set)
     for view in views:
         cameras[view.camera_id].add(view.cam_from_world.round(9).tobytes())
@@ -65,6 +66,8 @@ def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
     yield "sequence", f"{len(cameras)} {what}{motion} x {len(times)} times, {len(views)} pictures"
     if capture.fps is not None:
         yield "frame rate", f"{capture.fps:.6g} per second"
+    if capture.seconds is not None:
+        yield "duration", f"{capture.seconds:.4g} seconds from time 0 to time 1"
     frames = [view.image_path for view in views if view.video is not None]
     if frames:
         yield "video frames", f"{sum(path.is_file() for path in frames)} of {len(frames)} are decoded already"
