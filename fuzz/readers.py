@@ -61,6 +61,7 @@ def read_whole_capture(root: Path) -> object:
     from dyngs.data.inspection.report import format_report, inspect_capture
     from dyngs.data.loader import PictureLoader
     from dyngs.data.read import read_capture
+    from dyngs.data.tracks import read_tracks
     from dyngs.errors import DyngsError
     from dyngs.human.motion.captured import captured_motion
 
@@ -83,7 +84,9 @@ def read_whole_capture(root: Path) -> object:
             for split, own in capture.body.items()
             if capture.splits.get(split)
         ]
-    loader = PictureLoader(views, options)
+    if capture.tracks_path is not None:
+        found.append(read_tracks(capture.tracks_path))
+    loader = PictureLoader(views, options, with_maps=True)
     found += [loader[i] for i in range(min(len(loader), 2))]
     return found
 
@@ -100,6 +103,28 @@ def read_a_picture(root: Path) -> object:
 
     path = only(root)
     return check_picture(path), read_picture(path)
+
+
+def read_a_depth_map(root: Path) -> object:
+    """Read a depth map, and the same file as labels where it is a picture."""
+    from dyngs.data.pictures.depth import read_depth, read_labels
+
+    path = only(root)
+    return read_depth(path), read_labels(path) if path.suffix == ".png" else None
+
+
+def read_a_flow_field(root: Path) -> object:
+    """Read optical flow; NaN in it is no failure: it means unknown."""
+    from dyngs.data.pictures.flow import read_flow
+
+    return read_flow(only(root)).nan_to_num(0.0)
+
+
+def read_2d_tracks(root: Path) -> object:
+    """Read 2D tracks."""
+    from dyngs.data.tracks import read_tracks
+
+    return read_tracks(only(root))
 
 
 def read_a_video(root: Path) -> object:
@@ -298,6 +323,9 @@ _BODIES: dict[str, Seed] = {
 READERS: dict[str, Reader] = {
     **{name: Reader(seeds, read_whole_capture, needs=_NEEDS.get(name)) for name, seeds in CAPTURES.items()},
     "pictures": Reader(_PICTURES, read_a_picture),
+    "depth": Reader({"png16": files.write_png16, "npz": files.write_depth_npz}, read_a_depth_map),
+    "flow": Reader({"npy": files.write_flow_npy, "flo": files.write_flo}, read_a_flow_field),
+    "tracks": Reader({"npz": files.write_tracks}, read_2d_tracks),
     "video": Reader({"mp4": files.write_mp4}, read_a_video),
     "pickles": Reader({"new": files.write_fits, "old": files.write_old_fits}, read_a_pickle),
     "bodies": Reader(_BODIES, read_a_body),

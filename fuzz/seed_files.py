@@ -48,6 +48,28 @@ def write_jpeg(root: Path) -> None:
     write_picture(root / "a.jpg", random_pixels(9, 17, 3))
 
 
+def write_depth_npz(root: Path) -> None:
+    """Write a depth map as an array in an archive."""
+    np.savez(root / "a.npz", depth=np.full((4, 6), 2.0, np.float32))
+
+
+def write_flow_npy(root: Path) -> None:
+    """Write optical flow as an array."""
+    np.save(root / "a.npy", np.ones((4, 6, 2), np.float32))
+
+
+def write_flo(root: Path) -> None:
+    """Write optical flow as Middlebury does."""
+    header = np.array([202021.25], "<f4").tobytes() + np.array([6, 4], "<i4").tobytes()
+    (root / "a.flo").write_bytes(header + np.ones((4, 6, 2), "<f4").tobytes())
+
+
+def write_tracks(root: Path) -> None:
+    """Write two tracks in three pictures."""
+    names = np.array(["0", "1", "2"])
+    np.savez(root / "a.npz", xy=np.ones((3, 2, 2), np.float32), visible=np.ones((3, 2), bool), names=names)
+
+
 def write_exr(root: Path) -> None:
     """Write an EXR of floats with alpha."""
     write_picture(root / "a.exr", random_pixels(5, 7, 4).astype(np.float32) / 255)

@@ -40,7 +40,7 @@ def write_blender(root: Path) -> None:
 
 
 def write_nerfstudio(root: Path) -> None:
-    """Write three JPEG pictures with a lens, times, a mask and points."""
+    """Write three JPEG pictures with a lens, times, a mask, points, and every kind of prior."""
     names = [f"images/{i:02d}.jpg" for i in range(3)]
     for i, name in enumerate(names):
         write_picture(root / name, random_pixels(4, 6, 3, seed=i))
@@ -49,7 +49,13 @@ def write_nerfstudio(root: Path) -> None:
     write_frames(root / "transforms.json", names, {**fields, "applied_transform": np.eye(4)[:3].tolist()})
     content = json.loads((root / "transforms.json").read_text())
     for i, frame in enumerate(content["frames"]):
-        frame |= {"time": i / 2, "mask_path": f"masks/{i:02d}.png"}
+        frame |= {"time": i / 2, "mask_path": f"masks/{i:02d}.png", "motion_mask_path": f"masks/{i:02d}.png"}
+        frame |= {"depth_file_path": f"depth{i}.npy", "flow_file_path": f"flow{i}.npz"}
+        np.save(root / f"depth{i}.npy", np.full((4, 6), 2.0, np.float32))
+        np.savez(root / f"flow{i}.npz", flow=np.ones((4, 6, 2), np.float32))
+    content["tracks_file_path"] = "tracks.npz"
+    tracks = {"xy": np.ones((3, 2, 2), np.float32), "visible": np.ones((3, 2), bool), "names": np.array(names)}
+    np.savez(root / "tracks.npz", **tracks)
     (root / "transforms.json").write_text(json.dumps(content))
     lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {axis}" for axis in "xyz")]
     lines += [*(f"property uchar {name}" for name in ("red", "green", "blue")), "end_header"]

@@ -71,6 +71,11 @@ class View:
         frame: frame number of a sequence, or None.
         video: the video frame that ``image_path`` is decoded from, None where it is a file of the capture.
         silhouette: mask of the person, which becomes the picture's alpha; None where nobody is cut out.
+        depth_path: depth map, in any unit, see ``pictures.depth``; None without one.
+        motion_mask_path: white = moves; None without one.
+        motion_mask_labels: the mask holds labels instead: all but 0 moves.
+        flow_path: optical flow to the view ``flow_to``, see ``pictures.flow``; None without one.
+        flow_to: name of the next view of this camera in its file, None for the last one.
     """
 
     name: str
@@ -86,6 +91,11 @@ class View:
     frame: int | None = None
     video: VideoFrame | None = None
     silhouette: Silhouette | None = None
+    depth_path: Path | None = None
+    motion_mask_path: Path | None = None
+    motion_mask_labels: bool = False
+    flow_path: Path | None = None
+    flow_to: str | None = None
 
 
 Splits = dict[Split, tuple[View, ...]]
@@ -153,6 +163,7 @@ class Capture:
         fps: frames per second of the recording, None where the capture does not say.
         span: first and last time as written in the files, which are 0 and 1 in the views; None without times.
         seconds: from time 0 to time 1, None where it is not known.
+        tracks_path: 2D tracks, see ``data.tracks``; None without any.
         warnings: suspicious findings of the reader, one line each.
     """
 
@@ -166,6 +177,7 @@ class Capture:
     fps: float | None = None
     span: tuple[float, float] | None = None
     seconds: float | None = None
+    tracks_path: Path | None = None
     warnings: tuple[str, ...] = ()
 
     def replace(self, **changes: object) -> Capture:

@@ -15,6 +15,8 @@ from dyngs.camera import Cameras
 from dyngs.config import DataConfig
 from dyngs.data.capture import View
 from dyngs.data.geometry.intrinsics import scaled_intrinsics
+from dyngs.data.pictures.depth import read_depth, read_labels
+from dyngs.data.pictures.flow import read_flow
 from dyngs.data.pictures.images import (
     area_downscale,
     check_picture,
@@ -25,6 +27,7 @@ from dyngs.data.pictures.images import (
     target_size,
 )
 from dyngs.data.pictures.lens import LensMap, is_pinhole, undistort, undistort_map
+from dyngs.data.pictures.resampling import flow_at, nearest_positions, resized, taken_at
 from dyngs.data.pictures.silhouettes import cut_out
 from dyngs.errors import DyngsError
 from dyngs.files.containment import pictures_up_to
@@ -45,6 +48,10 @@ class Picture:
         mask: (H, W) float32, 1 = counts in the loss, 0 = ignore; None where all pixels count.
         time: in [0, 1] or None.
         frame: the view's frame number or None.
+        moves: (H, W) float32, the share of each pixel that moves, by the motion mask; None without one.
+        depth: (H, W) float32 depth in the unit of its map, 0 where unknown; None without one.
+        flow: (H, W, 2) float32 displacement in pixels of this picture up to the view ``flow_to``, NaN where unknown;
+            None without one.
     """
 
     name: str
@@ -54,6 +61,9 @@ class Picture:
     mask: Tensor | None
     time: float | None
     frame: int | None = None
+    moves: Tensor | None = None
+    depth: Tensor | None = None
+    flow: Tensor | None = None
 
     def composite(self, background: Tensor) -> Tensor:
         """Return the (H, W, 3) picture over the colour ``background`` (3,)."""
@@ -63,14 +73,17 @@ class Picture:
 
     def to(self, device: torch.device | str) -> Picture:
         """Return the same picture, with its camera, on another device."""
-        alpha, mask = (None if x is None else x.to(device) for x in (self.alpha, self.mask))
+        maps = {name: None if x is None else x.to(device) for name, x in self._maps().items()}
         return replace(
             self,
             cameras=self.cameras.to(device=device),
             rgb_premultiplied=self.rgb_premultiplied.to(device),
-            alpha=alpha,
-            mask=mask,
+            **maps,
         )
+
+    def _maps(self) -> dict[str, Tensor | None]:
+        """Return everything per pixel beside the colours, by name."""
+        return {name: getattr(self, name) for name in ("alpha", "mask", "moves", "depth", "flow")}
 
     def shrunk(self, factor: int) -> Picture:
         """Return the picture with both sides divided by ``factor``, averaged over pixel areas, and its camera."""
@@ -79,28 +92,36 @@ class Picture:
         old = self.cameras
         width, height = max(1, round(old.width / factor)), max(1, round(old.height / factor))
         scale = old.intrinsics.new_tensor([width / old.width, height / old.height, 1.0])
-        alpha, mask = (
-            None if x is None else area_downscale(x[..., None], width, height)[..., 0] for x in (self.alpha, self.mask)
+        alpha, mask, moves = (
+            None if x is None else area_downscale(x[..., None], width, height)[..., 0]
+            for x in (self.alpha, self.mask, self.moves)
         )
+        places = nearest_positions(width, height)
         return replace(
             self,
             cameras=Cameras(old.cam_from_world, scale[:, None] * old.intrinsics, width, height),
             rgb_premultiplied=area_downscale(self.rgb_premultiplied, width, height),
             alpha=alpha,
             mask=None if mask is None else (mask > FULLY_KEPT).float(),
+            moves=moves,
+            depth=None if self.depth is None else taken_at(self.depth[..., None], places)[..., 0],
+            flow=None if self.flow is None else resized(self.flow, width, height),
         )
 
 
 @dataclass(frozen=True)
 class _Decoded:
-    """A cached picture: (H, W, 3 or 4) uint8 straight-alpha pixels and the (H, W) bool mask."""
+    """A cached picture: (H, W, 3 or 4) uint8 straight-alpha pixels, the (H, W) bool mask, and the maps of a picture."""
 
     pixels: Tensor
     mask: Tensor | None
+    moves: Tensor | None = None
+    depth: Tensor | None = None
+    flow: Tensor | None = None
 
     @property
     def num_bytes(self) -> int:
-        return self.pixels.numel() + (0 if self.mask is None else self.mask.numel())
+        return sum(x.nbytes for x in (self.pixels, self.mask, self.moves, self.depth, self.flow) if x is not None)
 
 
 class PictureLoader:
@@ -109,18 +130,20 @@ class PictureLoader:
     The same index always gives the same bytes, cached or not. Safe to use from several threads. Tensors are on the CPU.
     """
 
-    def __init__(self, views: Sequence[View], options: DataConfig | None = None) -> None:
+    def __init__(self, views: Sequence[View], options: DataConfig | None = None, *, with_maps: bool = False) -> None:
         """Check every file (not every pixel) at once, so that a bad capture fails before training starts.
 
         Args:
             views: one split of a capture.
             options: ``downscale``, ``longest_side``, ``cache_mb`` and ``max_megapixels`` count; None: the defaults.
+            with_maps: read depth maps and flow, too, where views have them.
 
         Raises:
             DyngsError: missing pictures (count and first), damaged ones, or a size that is not the view's.
         """
         self._views = tuple(views)
         self._options = options = options or DataConfig(root=Path())
+        self._with_maps = with_maps
         self._cache: OrderedDict[int, _Decoded] = OrderedDict()
         self._cached_bytes = 0
         self._last_map: tuple[object, LensMap] | None = None
@@ -165,6 +188,9 @@ class PictureLoader:
             mask=None if decoded.mask is None else decoded.mask.float(),
             time=view.time,
             frame=view.frame,
+            moves=decoded.moves,
+            depth=decoded.depth,
+            flow=decoded.flow,
         )
 
     @property
@@ -193,14 +219,12 @@ class PictureLoader:
         if view.silhouette is not None:
             pixels = cut_out(pixels, view.silhouette)
         mask = None if view.mask_path is None else read_mask(view.mask_path)
-        if mask is not None and mask.shape != pixels.shape[:2]:
-            raise DyngsError(
-                f"{view.mask_path}: the mask is {mask.shape[1]}x{mask.shape[0]} but its picture is {view.width}x"
-                f"{view.height}; make them the same size"
-            )
+        if mask is not None:
+            _require_shape(view, view.mask_path, mask, "mask")
         size = target_size(view.width, view.height, self._options.downscale, self._options.longest_side)
+        maps = self._maps(view, size)
         if is_pinhole(view.lens) and size == (view.width, view.height):
-            return _Decoded(pixels, mask)
+            return _Decoded(pixels, mask, **maps)
         linear = premultiplied(pixels)
         if not is_pinhole(view.lens):
             lens_map = self._lens_map(view)
@@ -210,7 +234,29 @@ class PictureLoader:
         if mask is not None:
             # A pixel counts only if all that it covers is kept: otherwise masked colours would bleed in.
             mask = area_downscale(mask.float()[..., None], *size)[..., 0] > FULLY_KEPT
-        return _Decoded(straight_uint8(linear), mask)
+        return _Decoded(straight_uint8(linear), mask, **maps)
+
+    def _maps(self, view: View, size: tuple[int, int]) -> dict[str, Tensor]:
+        """Return motion mask, depth and flow of a view, as far as it has them, for the picture of ``size``."""
+        maps: dict[str, Tensor] = {}
+        lens_map = None if is_pinhole(view.lens) else self._lens_map(view)
+        if view.motion_mask_path is not None:
+            read = read_labels if view.motion_mask_labels else read_mask
+            moves = read(view.motion_mask_path).float()
+            _require_shape(view, view.motion_mask_path, moves, "motion mask")
+            if lens_map is not None:
+                moves = undistort(moves[..., None], lens_map)[..., 0]
+            maps["moves"] = area_downscale(moves[..., None], *size)[..., 0]
+        if self._with_maps and view.depth_path is not None:
+            places = nearest_positions(*size, None if lens_map is None else lens_map.grid)
+            depth = taken_at(read_depth(view.depth_path)[..., None], places)[..., 0]
+            seen = None if lens_map is None else taken_at(lens_map.valid.float()[..., None], nearest_positions(*size))
+            maps["depth"] = depth if seen is None else depth * seen[..., 0]
+        if self._with_maps and view.flow_path is not None:
+            flow = read_flow(view.flow_path)
+            _require_shape(view, view.flow_path, flow, "flow field")
+            maps["flow"] = flow_at(flow, view, size, lens_map)
+        return maps
 
     def _lens_map(self, view: View) -> LensMap:
         """Return the undistortion map; only the last is cached: most captures have one camera, and maps are large."""
@@ -245,6 +291,14 @@ def check_files(views: Sequence[View]) -> None:
             )
         if view.mask_path is not None:
             check_picture(view.mask_path)
+
+
+def _require_shape(view: View, path: Path | None, found: Tensor, what: str) -> None:
+    if found.shape[:2] != (view.height, view.width):
+        raise DyngsError(
+            f"{path}: the {what} is {found.shape[1]}x{found.shape[0]} but its picture is {view.width}x{view.height}; "
+            "make them the same size"
+        )
 
 
 def _undistorted_mask(mask: Tensor | None, lens_map: LensMap) -> Tensor | None:

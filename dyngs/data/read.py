@@ -13,6 +13,7 @@ from dyngs.data.frame_selection import select_frames
 from dyngs.data.geometry.recenter import recenter
 from dyngs.data.pictures.frame_cache import decode_frames
 from dyngs.data.pictures.images import read_header
+from dyngs.data.prior_files import present_priors
 from dyngs.data.readers import (
     blender,
     body_json,
@@ -132,6 +133,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         splits["pose"] = new_poses
     for view in all_views(splits):
         _check_places(view)
+    splits, tracks, absent = present_priors(splits, capture.tracks_path)
     if decode_videos:
         frames = {view.image_path: view.video for view in all_views(splits) if view.video is not None}
         decode_frames(capture.root, frames, options.frame_cache_mb)
@@ -141,18 +143,20 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         capture,
         splits=splits,
         points=points,
+        tracks_path=tracks,
         has_alpha=_first_has_alpha(splits["train"]),
         span=span,
         seconds=seconds,
-        warnings=(*warnings, *notes, *more),
+        warnings=(*warnings, *notes, *more, *absent),
     )
     return recenter(capture)
 
 
 def _check_places(view: View) -> None:
-    """Refuse pictures, masks and silhouettes that lie outside the capture."""
+    """Refuse pictures, masks and maps that lie outside the capture."""
     picture = view.image_path if view.video is None else view.video.video
-    for path in (picture, view.mask_path, view.silhouette and view.silhouette.path):
+    priors = (view.depth_path, view.motion_mask_path, view.flow_path)
+    for path in (picture, view.mask_path, view.silhouette and view.silhouette.path, *priors):
         if path is not None:
             inside(path)
 

@@ -59,6 +59,23 @@ def read_npy(path: Path) -> np.ndarray:
         return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
 
 
+def read_map(path: Path, key: str) -> np.ndarray:
+    """Read the numbers of a ``.npy``, or the array ``key`` or else the only one of a ``.npz``, as float64.
+
+    Raises:
+        DyngsError: the file is missing, damaged, holds no numbers, or several arrays of which none is ``key``.
+    """
+    if not inside(path).is_file():
+        raise DyngsError(f"{path}: no such file; restore it or remove it from the capture")
+    if path.suffix.lower() != ".npz":
+        return read_npy(path)
+    found = read_arrays(path, lambda names: [key] if key in names or len(names) != 1 else names)
+    values = next(iter(found.values()))
+    if values.dtype.kind not in "biuf":
+        raise DyngsError(f"{path}: holds no numbers but {values.dtype}; export it again")
+    return values.astype(np.float64)
+
+
 def read_npz(path: Path, keys: Collection[str], optional: Collection[str] = ()) -> dict[str, np.ndarray]:
     """Read the arrays ``keys`` of a ``.npz`` file, and those of ``optional`` that exist; Python objects are refused.
 

@@ -112,6 +112,27 @@ def _decoded(path: Path) -> Tensor:
     return torch.as_tensor(np.ascontiguousarray(rgb if alpha is None else np.dstack([rgb, alpha])), device="cpu")
 
 
+def read_raw(path: Path) -> tuple[np.ndarray, bool]:
+    """Read the numbers of a picture as they are stored, (H, W, D) float32, and whether they are whole numbers.
+
+    Raises:
+        DyngsError: as ``read_picture``.
+    """
+    import OpenImageIO as oiio
+
+    with _reading(path):
+        source = _open(path)
+        spec = source.spec()
+        check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
+        whole = spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+        numbers = source.read_image(spec.format if whole else oiio.FLOAT)
+        message = picture_error(source)
+        source.close()
+        if numbers is None:
+            raise DyngsError(f"{path}: the picture is truncated or damaged ({message}); copy it again")
+        return numbers.reshape(spec.height, spec.width, spec.nchannels).astype(np.float32), whole
+
+
 def read_mask(path: Path) -> Tensor:
     """Read a mask as (H, W) bool, true = keep: the mean of the colour channels is at least one half.
 

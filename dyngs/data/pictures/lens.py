@@ -11,6 +11,8 @@ from torch import Tensor
 from dyngs.data.capture import Lens
 
 _ROWS_PER_CHUNK = 256
+_ITERATIONS = 30
+_CLOSE_PX = 0.05
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,27 @@ def distort(lens: Lens, points: Tensor) -> Tensor:
     identity = torch.eye(3, dtype=points.dtype, device=points.device)[None]
     coefficients = torch.tensor([_padded(lens.params)], dtype=points.dtype, device=points.device)
     return distort_points(points.reshape(1, -1, 2), identity, coefficients).reshape(points.shape)
+
+
+def undistorted_points(lens: Lens, intrinsics: np.ndarray, points: Tensor) -> Tensor:
+    """Return the (..., 2) pixel positions in the pinhole picture of ``points`` (..., 2) in the stored, distorted one.
+
+    By fixed-point iteration, in float64; NaN where it does not converge to ``_CLOSE_PX``, as far outside the field of
+    view, and where a point is NaN.
+
+    Args:
+        intrinsics: (3, 3) camera matrix in pixels.
+    """
+    if is_pinhole(lens):
+        return points
+    k = torch.as_tensor(intrinsics, dtype=torch.float64, device=points.device)
+    focal, center = k.diagonal()[:2], k[:2, 2]
+    wanted = (points.double() - center) / focal
+    found = wanted
+    for _ in range(_ITERATIONS):
+        found = found + (wanted - distort(lens, found))
+    close = ((distort(lens, found) - wanted) * focal).norm(dim=-1, keepdim=True) < _CLOSE_PX
+    return torch.where(close, found * focal + center, torch.nan).to(points.dtype)
 
 
 def undistort_map(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> LensMap:

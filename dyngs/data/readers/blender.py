@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dyngs.data.capture import Capture, Split, Splits
 from dyngs.data.readers.shared.capture_format import CaptureFormat
-from dyngs.data.readers.shared.transforms import read_frame_file, read_views
+from dyngs.data.readers.shared.transforms import read_frame_file, read_views, tracks_path_of
 
 
 def is_blender(root: Path) -> bool:
@@ -24,7 +24,7 @@ def read_blender(root: Path) -> Capture:
     """
     splits: Splits = {}
     warnings: list[str] = []
-    fps = None
+    fps = tracks = None
     names: tuple[Split, ...] = ("train", "val", "test")
     for name in names:
         path = root / f"transforms_{name}.json"
@@ -32,12 +32,13 @@ def read_blender(root: Path) -> Capture:
             continue
         file = read_frame_file(path)
         views, notes = read_views(file)
-        fps = file.fps if name == "train" else fps
+        if name == "train":
+            fps, tracks = file.fps, tracks_path_of(file)
         splits[name] = tuple(views.values())
         warnings += [f"{path.name}: {note}" for note in notes]
         if not views:
             warnings.append(f"{path.name}: lists no frames")
-    return Capture(root, "blender", splits, fps=fps, warnings=tuple(warnings))
+    return Capture(root, "blender", splits, fps=fps, tracks_path=tracks, warnings=tuple(warnings))
 
 
 FORMAT = CaptureFormat("blender", "transforms_train.json", is_blender, read_blender)

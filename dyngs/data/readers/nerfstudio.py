@@ -9,7 +9,7 @@ import numpy as np
 
 from dyngs.data.capture import Capture, PointCloud, Split, Splits, View
 from dyngs.data.readers.shared.capture_format import CaptureFormat
-from dyngs.data.readers.shared.transforms import FrameFile, read_frame_file, read_views
+from dyngs.data.readers.shared.transforms import FrameFile, read_frame_file, read_views, tracks_path_of
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 
@@ -34,7 +34,8 @@ def read_nerfstudio(root: Path) -> Capture:
     splits, notes = _splits(file, views)
     written = file.fields.get("ply_file_path")
     points = read_points(inside(root / written)) if isinstance(written, str) and written else None
-    return Capture(root, "nerfstudio", splits, points, fps=file.fps, warnings=(*warnings, *notes))
+    tracks, notes = tracks_path_of(file), [*warnings, *notes]
+    return Capture(root, "nerfstudio", splits, points, fps=file.fps, tracks_path=tracks, warnings=tuple(notes))
 
 
 def read_points(path: Path) -> PointCloud:

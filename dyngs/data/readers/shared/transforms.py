@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -133,7 +134,15 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
     for frame, path, header in zip(file.frames, paths, headers, strict=True):
         stored = (header.width, header.height) if header else None
         views[str(frame.own["file_path"])] = _view(frame, root, path, stored, common, notes)
-    return views, notes.lines()
+    return _with_flow_targets(views), notes.lines()
+
+
+def tracks_path_of(file: FrameFile) -> Path | None:
+    """Return the file of 2D tracks that ``tracks_file_path`` names, None without one."""
+    written = file.fields.get("tracks_file_path")
+    if written is not None and not isinstance(written, str):
+        raise DyngsError(f"{file.path}: 'tracks_file_path' must be a string, got {written!r:.40}")
+    return _below(file.path.parent, written, str(file.path)) if written else None
 
 
 def view_name(path: Path, root: Path) -> str:
@@ -159,7 +168,7 @@ def _view(
         notes.rescaled.append(frame.where)
     pose, error = checked_pose(_matrix(frame), frame.where)
     notes.repaired[frame.where] = error
-    mask = frame.text("mask_path")
+    masks = [_named_file(root, frame, key) for key in ("motion_mask_path", "instance_mask_path")]
     camera = frame.integer("camera")
     return View(
         name=view_name(path, root),
@@ -170,11 +179,32 @@ def _view(
         height=size[1],
         lens=_lens(frame),
         camera_id=(camera if camera is not None else frame.integer("camera_id")) or 0,
-        mask_path=_below(root, mask, frame.where) if mask else None,
+        mask_path=_named_file(root, frame, "mask_path"),
         time=_number(frame.own.get("time"), "time", frame.where),
         frame=frame.integer("frame"),
         video=frame.video,
+        depth_path=_named_file(root, frame, "depth_file_path"),
+        motion_mask_path=masks[0] or masks[1],
+        motion_mask_labels=masks[0] is None and masks[1] is not None,
+        flow_path=_named_file(root, frame, "flow_file_path"),
     )
+
+
+def _with_flow_targets(views: dict[str, View]) -> dict[str, View]:
+    """Return the views of a file with the next view of the same camera in ``flow_to`` where they have flow."""
+    if all(view.flow_path is None for view in views.values()):
+        return views
+    ordered = sorted(views.items(), key=lambda item: (item[1].camera_id, item[1].time or 0.0, item[1].name))
+    following = {
+        key: after.name if after.camera_id == view.camera_id else None for (key, view), (_, after) in pairwise(ordered)
+    }
+    return {key: replace(view, flow_to=following.get(key)) for key, view in views.items()}
+
+
+def _named_file(root: Path, frame: Frame, key: str) -> Path | None:
+    """Return the file that a frame names at ``key``, None where it names none."""
+    written = frame.text(key)
+    return _below(root, written, frame.where) if written else None
 
 
 def _number(value: object, key: str, where: str) -> float | None:
