@@ -52,6 +52,8 @@ def report_table(report: EvalReport) -> Table:
     table.add_row("SSIM", f"{report.ssim:.4f}")
     if report.psnr_person is not None and report.ssim_person is not None:
         table.add_row("in the person's box", f"{report.psnr_person:.2f} dB, SSIM {report.ssim_person:.4f}")
+    for label, value in _rows_of_regions(report):
+        table.add_row(label, escape(value))
     for label, name, value in (
         ("FLIP", "flip", report.flip),
         (f"LPIPS ({report.lpips_net})", "lpips", report.lpips),
@@ -74,6 +76,22 @@ def report_table(report: EvalReport) -> Table:
     return table
 
 
+def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
+    """Return labels and values of the PSNR of parts of pictures; of a still capture only what is known."""
+    rows = []
+    if report.psnr_foreground is not None:
+        rows.append(("on the foreground", f"{report.psnr_foreground:.2f} dB"))
+    for label, name, value in (
+        ("on what moves", "psnr_moving", report.psnr_moving),
+        ("on what does not", "psnr_still", report.psnr_still),
+    ):
+        if value is not None:
+            rows.append((label, f"{value:.2f} dB (by {report.moving_from})"))
+        elif report.psnr_per_time:
+            rows.append((label, report.reasons.get(name, "not measured")))
+    return rows
+
+
 def _rows_over_time(report: EvalReport) -> list[tuple[str, str]]:
     """Return labels and values of the metrics over time."""
     if not report.psnr_per_time:
@@ -90,4 +108,8 @@ def _rows_over_time(report: EvalReport) -> list[tuple[str, str]]:
         reason = report.reasons.get(name, "not measured")
         known = "0 (nothing moves)" if name == "flicker" and not report.num_moving else f"{value or 0:.3f} of 255"
         rows.append((label, reason if value is None else known))
+    if report.track_error_px is not None:
+        close = f"{report.track_within_5px or 0:.0%} within 5 px"
+        still = f"{report.track_motion_px or 0:.2f} px if nothing moved"
+        rows.append(("tracks", f"{report.track_error_px:.2f} px off, {close}; {still}"))
     return rows

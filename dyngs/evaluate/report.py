@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import fmean, median
 from typing import cast
@@ -16,19 +16,30 @@ import torch
 from torch import Tensor
 
 from dyngs.config.kinds import field_of
-from dyngs.data.capture import Capture, Split, View
+from dyngs.data.capture import Capture, Split, View, all_views
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
+from dyngs.data.true_tracks import read_true_tracks
 from dyngs.errors import DyngsError
+from dyngs.evaluate.regions import RegionName, Regions, RegionScores
 from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
+from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.files.write import write_text
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.captured import captured_motion, same_bodies
-from dyngs.metrics import Lpips, LpipsNet, flip, load_lpips, psnr, ssim
+from dyngs.metrics import Lpips, LpipsNet, MetricValue, flip, load_lpips, psnr, ssim
 from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 from dyngs.scene import Scene, render_options
 from dyngs.training.background import evaluation_background
+from dyngs.training.views import training_cameras
+
+REGION_METRICS: dict[str, RegionName] = {
+    "psnr_foreground": "foreground",
+    "psnr_moving": "moving",
+    "psnr_still": "still",
+}
+"""Metrics of regions: their names, and the regions."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +62,9 @@ class ViewScore:
     time: float | None = None
     psnr_person: float | None = None
     ssim_person: float | None = None
+    psnr_foreground: float | None = None
+    psnr_moving: float | None = None
+    psnr_still: float | None = None
 
 
 @dataclass(frozen=True)
@@ -81,6 +95,10 @@ class EvalReport:
         stored_mb: size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others.
         psnr_person, ssim_person: means inside the box around the person, where the true picture is not transparent;
             only of a human model, and None where pictures have no alpha.
+        psnr_foreground, psnr_moving, psnr_still: means over the views that have such a region, see
+            ``dyngs.evaluate.regions``.
+        moving_from: how it was found what moves, None where it was not.
+        track_error_px, track_within_5px, track_motion_px: see ``dyngs.evaluate.tracks``.
     """
 
     split: str
@@ -112,6 +130,13 @@ class EvalReport:
     psnr_person: float | None = None
     ssim_person: float | None = None
     stored_mb: float | None = None
+    psnr_foreground: float | None = None
+    psnr_moving: float | None = None
+    psnr_still: float | None = None
+    moving_from: str | None = None
+    track_error_px: float | None = None
+    track_within_5px: float | None = None
+    track_motion_px: float | None = None
 
     def to_json(self) -> str:
         """Return the report as strict JSON (no NaN or Infinity), ending in a newline."""
@@ -138,12 +163,11 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
     drawing = Drawing(scene, render_options(run.config.model), colour)
     with _num_threads(threads):
         loader = PictureLoader(views, run.config.data)
+        regions = Regions(views, loader, colour)
         pictures = (loader[i] for i in range(len(loader)))
-        scores, reasons = score_views(scene, pictures, drawing.options, colour, load_lpips(lpips_net))
-        temporal = {
-            "flicker": flicker_of_split(drawing, loader, views),
-            "flicker_error": flicker_error(drawing, loader, views),
-        }
+        scores, reasons = score_views(scene, pictures, drawing.options, colour, load_lpips(lpips_net), regions)
+        temporal = _temporal(drawing, loader, views)
+        tracks = _track_scores(run, capture, scene, views)
     reasons |= {name: measured.reason for name, measured in temporal.items() if measured.reason is not None}
     report = EvalReport(
         split=split,
@@ -176,8 +200,33 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
         ssim_person=_mean([s.ssim_person for s in scores]),
         stored_mb=1e-6 * (run_dir / SCENE_FILE).stat().st_size if has_only_scene_file(run_dir) else None,
     )
+    report = _with_parts(report, regions, tracks)
     write_text(report_path(run_dir, split), report.to_json())
     return report
+
+
+def _with_parts(report: EvalReport, regions: Regions, tracks: TrackScores) -> EvalReport:
+    """Return the report with the means of the regions' metrics, and the errors of tracks."""
+    reasons: dict[str, str] = {}
+    means: dict[str, float | None] = {}
+    for metric, region in REGION_METRICS.items():
+        known = [value for value in (getattr(view, metric) for view in report.per_view) if value is not None]
+        means[region] = fmean(known) if known else None
+        if not known:
+            reasons[metric] = regions.reason(region)
+    if tracks.reason is not None:
+        reasons["track_error_px"] = tracks.reason
+    return replace(
+        report,
+        psnr_foreground=means["foreground"],
+        psnr_moving=means["moving"],
+        psnr_still=means["still"],
+        moving_from=regions.moving_from,
+        track_error_px=tracks.error_px,
+        track_within_5px=tracks.within_5px,
+        track_motion_px=tracks.motion_px,
+        reasons=report.reasons | reasons,
+    )
 
 
 def report_path(run_dir: Path, split: str) -> Path:
@@ -186,7 +235,12 @@ def report_path(run_dir: Path, split: str) -> Path:
 
 
 def score_views(
-    scene: Scene, pictures: Iterable[Picture], options: RenderOptions, background: Tensor, lpips: Lpips
+    scene: Scene,
+    pictures: Iterable[Picture],
+    options: RenderOptions,
+    background: Tensor,
+    lpips: Lpips,
+    regions: Regions | None = None,
 ) -> tuple[list[ViewScore], dict[str, str]]:
     """Return scores of the Gaussians against pictures, and the reasons for metrics that are None.
 
@@ -196,6 +250,7 @@ def score_views(
         options: as in training, without depth.
         background: (3,) colour behind both the truth and the render.
         lpips: from ``load_lpips``.
+        regions: of the split of the pictures; None: they are not measured.
 
     Raises:
         DyngsError: a value that is not finite, naming the view.
@@ -210,6 +265,7 @@ def score_views(
             raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
         truth, mask = picture.composite(background), picture.mask
         box = person_box(picture) if avatar_of(scene) is not None else None
+        parts = RegionScores() if regions is None else regions.scores(picture, rendered, truth)
         optional = {"flip": flip(rendered, truth, mask), "lpips": lpips(rendered, truth, mask)}
         for name, metric in optional.items():
             if metric.reason is not None:
@@ -227,6 +283,9 @@ def score_views(
             time=picture.time,
             psnr_person=None if box is None else psnr(rendered[box], truth[box], None if mask is None else mask[box]),
             ssim_person=None if box is None else ssim(rendered[box], truth[box], None if mask is None else mask[box]),
+            psnr_foreground=parts.foreground,
+            psnr_moving=parts.moving,
+            psnr_still=parts.still,
         )
         _require_finite(score, mask)
         scores.append(score)
@@ -265,6 +324,21 @@ def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
         return run.scene
     shown = captured_motion(capture.root, given, split_views(capture, split), avatar.skeleton.joints)
     return avatar.playing(shown.clip)
+
+
+def _temporal(drawing: Drawing, loader: PictureLoader, views: Sequence[View]) -> dict[str, MetricValue]:
+    """Return the flicker of a split, and the error of its changes in time."""
+    return {
+        "flicker": flicker_of_split(drawing, loader, views),
+        "flicker_error": flicker_error(drawing, loader, views),
+    }
+
+
+def _track_scores(run: LoadedRun, capture: Capture, scene: Scene, views: Sequence[View]) -> TrackScores:
+    """Return the errors of the scene's motion where the capture has true tracks."""
+    tracks = read_true_tracks(capture.root, capture.world_offset)
+    cameras = training_cameras(views, run.config.data)
+    return track_scores(scene, tracks, list(zip(views, cameras, strict=True)), all_views(capture.splits))
 
 
 def parameter_megabytes(scene: Scene) -> float:

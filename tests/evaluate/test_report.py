@@ -7,17 +7,20 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from moving_scene import TEST_TIMES, Sliding, moving_scene, still_scene, write_moving_run
+from moving_scene import TEST_TIMES, Sliding, moving_scene, row_of_balls, still_scene, write_moving_run
 
 from dyngs.camera import Cameras
+from dyngs.cli import main
 from dyngs.config import Config, DataConfig, StaticModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import RasterizeMode
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Picture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.true_tracks import TrueTracks, write_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import (
     evaluate_run,
@@ -27,6 +30,7 @@ from dyngs.evaluate.report import (
     score_views,
     split_views,
 )
+from dyngs.files.write import write_image
 from dyngs.gaussians import Gaussians
 from dyngs.metrics import Lpips, psnr
 from dyngs.rendering import RenderOptions, render
@@ -128,7 +132,8 @@ def test_report_of_a_run(tmp_path) -> None:
     over_time = (
         "num_moving moving_share field_mb deform_share flicker flicker_error psnr_per_time psnr_person ssim_person"
     )
-    rest = {"seconds_train", "step", "reasons", "notes", "per_view", "colour_floats", "stored_mb"}
+    parts = "psnr_foreground psnr_moving psnr_still moving_from track_error_px track_within_5px track_motion_px"
+    rest = {*parts.split(), "seconds_train", "step", "reasons", "notes", "per_view", "colour_floats", "stored_mb"}
     assert set(keys.split()) | set(over_time.split()) | rest == set(stored)
     facts = {"split": "test", "num_views": 3, "width": 16, "height": 16, "background": "white", "lpips_net": "alex"}
     facts |= {"num_gaussians": 12, "step": 7, "seconds_train": 12.5}
@@ -136,7 +141,8 @@ def test_report_of_a_run(tmp_path) -> None:
     assert stored["model_mb"] == pytest.approx(12 * 4 * (3 + 4 + 3 + 1 + 12) / 1e6)
     assert stored["psnr"] == pytest.approx(sum(view["psnr"] for view in stored["per_view"]) / 3)
     assert stored["ssim"] == pytest.approx(sum(view["ssim"] for view in stored["per_view"]) / 3)
-    for name in ("flip", "lpips", "flicker", "flicker_error"):
+    optional = ("psnr_foreground", "psnr_moving", "psnr_still", "track_error_px")
+    for name in ("flip", "lpips", "flicker", "flicker_error", *optional):
         assert (stored[name] is None) == (name in stored["reasons"])
     assert stored["fps"] > 0
     assert 0 <= stored["deform_share"] < 1
@@ -216,6 +222,37 @@ def test_report_of_a_moving_run(tmp_path) -> None:
     assert report.flicker_error > 0
     assert 0 < report.deform_share < 1
     assert report.notes == ()
+
+
+def test_parts_of_a_moving_scene_are_measured(tmp_path, capsys) -> None:
+    """With a mask for each test picture, and true tracks that the model follows exactly."""
+    run_dir = write_moving_run(tmp_path)
+    root = tmp_path / "capture"
+    document = json.loads((root / "transforms_test.json").read_text())
+    moves = np.zeros((16, 16), np.uint8)
+    moves[4:12] = 255
+    write_image(root / "moves.png", moves)
+    for frame in document["frames"]:
+        frame["motion_mask_path"] = "moves.png"
+    (root / "transforms_test.json").write_text(json.dumps(document))
+    start = row_of_balls().means[[1, 3]].numpy()
+    points = np.stack([start + np.array([t - 0.5, 0, 0]) for t in TEST_TIMES])
+    names = np.array([f"test/r_{i:03d}" for i in range(3)])
+    write_true_tracks(root, TrueTracks(points, np.array(TEST_TIMES), names, np.ones((3, 2), bool)))
+    report = evaluate_run(run_dir)
+    assert report.psnr_foreground is not None
+    assert report.psnr_foreground < report.psnr, "less white background"
+    assert report.track_error_px is not None
+    assert report.track_motion_px is not None
+    assert 0 < report.track_error_px < report.track_motion_px
+    assert not {"track_error_px", "psnr_foreground"} & set(report.reasons)
+    known = [view.psnr_foreground for view in report.per_view if view.psnr_foreground is not None]
+    assert report.psnr_foreground == pytest.approx(sum(known) / len(known))
+    assert main(["eval", str(run_dir)]) == 0
+    shown = capsys.readouterr().out
+    assert "on the foreground" in shown
+    assert "on what moves" in shown
+    assert "px off" in shown
 
 
 def test_still_models_of_moving_captures(tmp_path) -> None:

@@ -1,0 +1,148 @@
+"""Parts of pictures that are measured on their own: the foreground, what moves, and what does not.
+
+Local letters: T pictures of a camera, H x W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dyngs.data.capture import View
+from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.times import static_cameras
+from dyngs.metrics import psnr
+
+RegionName = Literal["foreground", "moving", "still"]
+
+FEWEST_PIXELS = 25
+"""A region of fewer pixels in a view is not measured there: a few pixels of an outline say nothing."""
+CHANGE = 0.05
+"""Mean difference of the channels from the camera's median, in [0, 1], from which a pixel counts as moving."""
+MEDIAN_PICTURES = 31
+"""Number of pictures, spread over the clip, from which a camera's median is taken."""
+FEWEST_PICTURES = 3
+
+NO_ALPHA = "the pictures have no alpha and no silhouettes"
+NO_TIMES = "the pictures have no times"
+NO_MOTION_KNOWN = "the views have no motion masks, and no camera of this split stands still while time passes"
+TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in every view"
+
+
+@dataclass(frozen=True)
+class RegionScores:
+    """PSNR of one view in dB inside each region; None where it has too few such pixels, or they are not known."""
+
+    foreground: float | None = None
+    moving: float | None = None
+    still: float | None = None
+
+
+class Regions:
+    """The regions of the pictures of one split.
+
+    The foreground is where the true picture is not fully transparent. What moves is known, in this order, from motion
+    masks that the views come with, and from the truth's change over time before cameras that stand still: where it
+    differs by ``CHANGE`` from the camera's median over time, less single pixels. What is left does not move. Where
+    there is a foreground, both are parts of it, so that an empty background counts nowhere.
+
+    Args:
+        views: the split.
+        loader: pictures of ``views``, in their order.
+        background: (3,) colour behind the truth.
+    """
+
+    def __init__(self, views: Sequence[View], loader: PictureLoader, background: Tensor) -> None:
+        self._loader, self._background = loader, background
+        self._cameras = {
+            views[i].name: indices
+            for indices in static_cameras(views)
+            if len(indices) >= FEWEST_PICTURES
+            for i in indices
+        }
+        self._medians: dict[tuple[int, ...], Tensor] = {}
+        self._has_times = any(view.time is not None for view in views)
+        self._moving_from: set[str] = set()
+        self._has_alpha = False
+
+    def scores(self, picture: Picture, rendered: Tensor, truth: Tensor) -> RegionScores:
+        """Return the PSNR of a view's regions.
+
+        Args:
+            picture: of the view.
+            rendered, truth: (H, W, 3) on the same background.
+        """
+        foreground, moves = foreground_of(picture), self.moving(picture)
+        self._has_alpha |= foreground is not None
+        inside = torch.ones_like(truth[..., 0], dtype=torch.bool) if foreground is None else foreground
+        parts = {
+            "foreground": foreground,
+            "moving": None if moves is None else moves & inside,
+            "still": None if moves is None else ~moves & inside,
+        }
+        return RegionScores(**{name: _psnr_inside(part, picture, rendered, truth) for name, part in parts.items()})
+
+    def moving(self, picture: Picture) -> Tensor | None:
+        """Return (H, W) bool, the pixels in which something moves; None where that is not known."""
+        given = given_motion(picture)
+        if given is not None:
+            self._moving_from.add("motion masks")
+            return given
+        indices = self._cameras.get(picture.name)
+        if indices is None:
+            return None
+        self._moving_from.add("change over time")
+        change = (picture.composite(self._background) - self._median(indices)).abs().mean(-1)
+        return _opened(change > CHANGE)
+
+    @property
+    def moving_from(self) -> str | None:
+        """How it was found what moves in the pictures so far; None where it was not."""
+        return " and ".join(sorted(self._moving_from)) or None
+
+    def reason(self, name: RegionName) -> str:
+        """Return why no picture so far has a score of this region."""
+        if name == "foreground":
+            return TOO_SMALL if self._has_alpha else NO_ALPHA
+        if self._moving_from:
+            return TOO_SMALL
+        return NO_MOTION_KNOWN if self._has_times else NO_TIMES
+
+    def _median(self, indices: Sequence[int]) -> Tensor:
+        """Return the (H, W, 3) median over time of the pictures of a camera that stands still."""
+        key = tuple(indices)
+        if key not in self._medians:
+            chosen = [indices[i] for i in evenly_spaced(len(indices), MEDIAN_PICTURES)]
+            shown = [(255 * self._loader[i].composite(self._background).clamp(0, 1)).round().byte() for i in chosen]
+            self._medians[key] = torch.stack(shown).median(dim=0).values
+        return self._medians[key].float() / 255
+
+
+def foreground_of(picture: Picture) -> Tensor | None:
+    """Return (H, W) bool, the pixels that are not fully transparent; None where the picture has no alpha."""
+    return None if picture.alpha is None else picture.alpha > 0
+
+
+def given_motion(picture: Picture) -> Tensor | None:
+    """Return (H, W) bool, the pixels of which the view's motion mask says that they move; None without one."""
+    moves = getattr(picture, "moves", None)
+    return None if moves is None else moves >= 0.5
+
+
+def _psnr_inside(part: Tensor | None, picture: Picture, rendered: Tensor, truth: Tensor) -> float | None:
+    if part is None:
+        return None
+    weights = part.float() if picture.mask is None else part * picture.mask
+    return psnr(rendered, truth, weights) if int((weights > 0).sum()) >= FEWEST_PIXELS else None
+
+
+def _opened(shown: Tensor) -> Tensor:
+    """Return (H, W) bool, ``shown`` less what no square of 3x3 pixels fits into."""
+    grown = torch.nn.functional.max_pool2d((~shown)[None, None].float(), 3, stride=1, padding=1)
+    kept = 1 - grown
+    return torch.nn.functional.max_pool2d(kept, 3, stride=1, padding=1)[0, 0] > 0.5

@@ -1,0 +1,174 @@
+"""How far the motion of a model is off, where the true tracks of a scene are known.
+
+Local letters: P true points, N Gaussians, K Gaussians that carry a point.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from dyngs.camera import Cameras
+from dyngs.data.capture import View
+from dyngs.data.times import SAME_TIME
+from dyngs.data.true_tracks import TRACKS_FILE, TrueTracks
+from dyngs.scene import Scene
+
+CARRIERS = 4
+"""K, nearest Gaussians that carry a point, weighted by opacity."""
+MIN_OPACITY = 0.3
+"""Fainter Gaussians carry nothing."""
+CLOSE_PX = 5.0
+
+NO_TRACKS = f"the capture has no {TRACKS_FILE}"
+NONE_SEEN = "no view of this split shows a point of the true tracks at a time other than that of its binding"
+NONE_OPAQUE = f"no Gaussian is more opaque than {MIN_OPACITY:g}"
+
+
+@dataclass(frozen=True)
+class TrackScores:
+    """Errors of tracks over all pairs of a view and a point that it shows; None where ``reason`` says why.
+
+    Attributes:
+        error_px: mean distance in the picture between where the model carries a point and where it truly is.
+        within_5px: share of distances below ``CLOSE_PX``.
+        motion_px: mean distance of a model in which nothing moves, for comparison.
+    """
+
+    error_px: float | None = None
+    within_5px: float | None = None
+    motion_px: float | None = None
+    reason: str | None = None
+
+
+def track_scores(
+    scene: Scene,
+    tracks: TrueTracks | None,
+    split: Sequence[tuple[View, Cameras]],
+    views: Sequence[View],
+) -> TrackScores:
+    """Return the errors of a scene's motion in the pictures of a split.
+
+    Each point is bound to the ``CARRIERS`` nearest Gaussians at the time nearest to the middle of those at which any
+    view shows it; from there their mean displacement carries it. Distances are at most the diagonal of the picture.
+
+    Args:
+        scene: whose motion is measured.
+        tracks: of its capture, in the same world; None without any.
+        split: views that are measured, each with its camera at the size of the evaluated picture.
+        views: of all splits.
+    """
+    if tracks is None:
+        return TrackScores(reason=NO_TRACKS)
+    scene = scene.unmasked()
+    if not bool((_opacities(scene, None) > MIN_OPACITY).any()):
+        return TrackScores(reason=NONE_OPAQUE)
+    bound = _bind(scene, tracks, views)
+    rows = {name: row for row, name in enumerate(tracks.views.tolist())}
+    moved: dict[float, np.ndarray] = {}
+    errors, motions = [], []
+    for view, cameras in split:
+        truth = None if view.time is None else tracks.at(view.time)
+        if truth is None or view.time is None or view.name not in rows:
+            continue
+        shown = tracks.visible[rows[view.name]] & (np.abs(bound.times - view.time) > SAME_TIME)
+        if not shown.any():
+            continue
+        if view.time not in moved:
+            moved = {view.time: bound.carried(scene, view.time)}
+        limit = float(np.hypot(cameras.width, cameras.height))
+        true = _pixels(truth[shown], cameras)
+        for found, kept in ((moved[view.time], errors), (bound.points, motions)):
+            distance = np.linalg.norm(_pixels(found[shown], cameras) - true, axis=1)
+            kept.append(np.minimum(np.nan_to_num(distance, nan=limit), limit))
+    if not errors:
+        return TrackScores(reason=NONE_SEEN)
+    error = np.concatenate(errors)
+    return TrackScores(float(error.mean()), float((error < CLOSE_PX).mean()), float(np.concatenate(motions).mean()))
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """Points and the Gaussians that carry them.
+
+    Attributes:
+        points: (P, 3) where they were bound, NaN where they were not.
+        times: (P,) when they were bound, NaN where they were not.
+        carriers: (P, K) rows of Gaussians.
+        weights: (P, K), each row sums to 1.
+        places: (P, K, 3) of the carriers when they were bound.
+    """
+
+    points: np.ndarray
+    times: np.ndarray
+    carriers: np.ndarray
+    weights: np.ndarray
+    places: np.ndarray
+
+    def carried(self, scene: Scene, time: float) -> np.ndarray:
+        """Return the (P, 3) points at ``time``."""
+        means = scene.at(time).means.detach().cpu().double().numpy()
+        return self.points + (self.weights[..., None] * (means[self.carriers] - self.places)).sum(axis=1)
+
+
+def _bind(scene: Scene, tracks: TrueTracks, views: Sequence[View]) -> _Bound:
+    """Return the points bound to the nearest Gaussians, each at its own time."""
+    from scipy.spatial import KDTree
+
+    count = tracks.points.shape[1]
+    carriers_each = min(CARRIERS, int((_opacities(scene, None) > MIN_OPACITY).sum()))
+    bound = _Bound(
+        np.full((count, 3), np.nan),
+        np.full(count, np.nan),
+        np.zeros((count, carriers_each), np.int64),
+        np.full((count, carriers_each), 1.0 / carriers_each),
+        np.zeros((count, carriers_each, 3)),
+    )
+    for row, members in _binding_times(tracks, views).items():
+        time = float(tracks.times[row])
+        means = scene.at(time).means.detach().cpu().double().numpy()
+        opacities = _opacities(scene, time)
+        # A field may fade Gaussians: of those that are too faint now, the least faint fill up.
+        opaque = np.argsort(-opacities, kind="stable")[: max(carriers_each, int((opacities > MIN_OPACITY).sum()))]
+        points = tracks.points[row, members].astype(np.float64)
+        _, nearest = KDTree(means[opaque]).query(points, k=carriers_each)
+        chosen = opaque[np.reshape(nearest, (len(points), carriers_each))]
+        bound.points[members], bound.times[members] = points, time
+        bound.carriers[members], bound.places[members] = chosen, means[chosen]
+        bound.weights[members] = opacities[chosen] / opacities[chosen].sum(axis=1, keepdims=True)
+    return bound
+
+
+def _binding_times(tracks: TrueTracks, views: Sequence[View]) -> dict[int, list[int]]:
+    """Return, by row of ``tracks.times``, the points bound then: nearest to the middle of when they are seen."""
+    times_of = {view.name: view.time for view in views}
+    seen = np.zeros(tracks.points.shape[:2], bool)
+    for name, visible in zip(tracks.views.tolist(), tracks.visible, strict=True):
+        time = times_of.get(name)
+        if time is not None:
+            seen[np.abs(tracks.times - time) <= SAME_TIME] |= visible
+    seen &= np.isfinite(tracks.points).all(axis=2)
+    middle = 0.5 * (tracks.times[0] + tracks.times[-1])
+    distance = np.where(seen, np.abs(tracks.times - middle)[:, None], np.inf)
+    rows: defaultdict[int, list[int]] = defaultdict(list)
+    for point in np.flatnonzero(seen.any(axis=0)).tolist():
+        rows[int(distance[:, point].argmin())].append(point)
+    return rows
+
+
+def _opacities(scene: Scene, time: float | None) -> np.ndarray:
+    """Return the (N,) opacities at ``time``; None: canonical ones."""
+    gaussians = scene.gaussians if time is None else scene.at(time)
+    return torch.sigmoid(gaussians.logit_opacities.detach()).cpu().double().numpy()
+
+
+def _pixels(points: np.ndarray, cameras: Cameras) -> np.ndarray:
+    """Return the (P, 2) pixels of ``points`` (P, 3); NaN of those behind the camera."""
+    pose, intrinsics = (x[0].cpu().double().numpy() for x in (cameras.cam_from_world, cameras.intrinsics))
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    depth = np.where(local[:, 2:] > 1e-6, local[:, 2:], np.nan)
+    return (local / depth) @ intrinsics[:2].T

@@ -1,0 +1,137 @@
+"""Regions of pictures against pictures whose moving pixels are known, and the PSNR inside them against closed forms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pytest
+import torch
+from moving_scene import camera
+
+from dyngs.data.capture import View
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.evaluate.regions import (
+    NO_ALPHA,
+    NO_MOTION_KNOWN,
+    NO_TIMES,
+    TOO_SMALL,
+    Regions,
+    foreground_of,
+    given_motion,
+)
+
+SIDE = 24
+WHITE = torch.ones(3)
+
+
+@dataclass(frozen=True)
+class Masked(Picture):
+    """A picture with a motion mask."""
+
+    moves: torch.Tensor | None = None
+
+
+def pictures_of_a_walk(count: int = 5) -> list[Picture]:
+    """A white square of 6x6 pixels walks over grey ground; a single pixel flashes in the third picture."""
+    shown = []
+    for k in range(count):
+        rgb = torch.full((SIDE, SIDE, 3), 0.4)
+        rgb[9:15, 3 * k : 3 * k + 6] = 1.0
+        if k == 2:
+            rgb[20, 20] = 1.0
+        shown.append(Picture(f"v{k}", camera(SIDE, SIDE), rgb, None, None, k / (count - 1)))
+    return shown
+
+
+def views_of(pictures: Sequence[Picture], *, standing: bool = True) -> list[View]:
+    poses = [np.eye(4) for _ in pictures]
+    for k, pose in enumerate(poses):
+        pose[0, 3] = 0.0 if standing else k
+    return [
+        View(p.name, Path(p.name), pose, np.eye(3), SIDE, SIDE, time=p.time)
+        for p, pose in zip(pictures, poses, strict=True)
+    ]
+
+
+def regions_of(pictures: Sequence[Picture], *, standing: bool = True) -> Regions:
+    return Regions(views_of(pictures, standing=standing), cast(PictureLoader, pictures), WHITE)
+
+
+def test_what_changes_before_a_standing_camera_moves() -> None:
+    pictures = pictures_of_a_walk()
+    regions = regions_of(pictures)
+    for k, picture in enumerate(pictures):
+        expected = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+        expected[9:15, 3 * k : 3 * k + 6] = True
+        moving = regions.moving(picture)
+        assert moving is not None
+        assert torch.equal(moving, expected), "and the single pixel does not count"
+    assert regions.moving_from == "change over time"
+
+
+def test_scores_are_those_of_the_pixels_of_each_region() -> None:
+    pictures = pictures_of_a_walk()
+    regions, picture = regions_of(pictures), pictures[1]
+    rendered = picture.rgb_premultiplied.clone()
+    rendered[9:15, 3:9] -= 0.1
+    rendered[0, :, :] += 0.01
+    scores = regions.scores(picture, rendered, picture.rgb_premultiplied)
+    assert scores.foreground is None
+    assert scores.moving == pytest.approx(20.0, abs=1e-3)
+    rest = SIDE * SIDE - 36
+    assert scores.still == pytest.approx(-10 * np.log10(SIDE * 1e-4 / rest), abs=1e-3)
+    assert regions.reason("foreground") == NO_ALPHA
+
+
+def test_motion_masks_come_first_and_empty_background_counts_nowhere() -> None:
+    moves, alpha = torch.zeros(SIDE, SIDE), torch.zeros(SIDE, SIDE)
+    moves[:, :12], alpha[:12] = 1.0, 1.0
+    plain = replace(pictures_of_a_walk()[0], alpha=alpha, rgb_premultiplied=torch.zeros(SIDE, SIDE, 3))
+    picture = Masked("v0", plain.cameras, plain.rgb_premultiplied, alpha, None, 0.0, moves=moves)
+    regions = regions_of([picture])
+    truth = picture.composite(WHITE)
+    rendered = truth.clone()
+    rendered[:12, :12] += 0.1
+    rendered[12:] -= 0.5
+    scores = regions.scores(picture, rendered, truth)
+    assert scores.moving == pytest.approx(20.0, abs=1e-3)
+    assert scores.still == 100.0
+    assert scores.foreground == pytest.approx(20.0 + 10 * np.log10(2), abs=1e-3)
+    assert regions.moving_from == "motion masks"
+
+
+def test_a_mask_of_a_picture_holds_in_its_regions() -> None:
+    pictures = pictures_of_a_walk()
+    mask = torch.ones(SIDE, SIDE)
+    mask[12:] = 0
+    picture = replace(pictures[1], mask=mask)
+    rendered = picture.rgb_premultiplied.clone()
+    rendered[12:] = 0
+    assert regions_of(pictures).scores(picture, rendered, picture.rgb_premultiplied).still == 100.0
+    hidden = replace(picture, mask=torch.zeros(SIDE, SIDE))
+    assert regions_of(pictures).scores(hidden, rendered, picture.rgb_premultiplied).still is None
+
+
+def test_reasons_say_why_there_is_no_score() -> None:
+    pictures = pictures_of_a_walk()
+    moved = regions_of(pictures, standing=False)
+    assert moved.moving(pictures[0]) is None
+    assert (moved.reason("moving"), moved.moving_from) == (NO_MOTION_KNOWN, None)
+    still = regions_of([replace(p, time=None) for p in pictures])
+    assert still.moving(pictures[0]) is None
+    assert still.reason("still") == NO_TIMES
+    same = [replace(p, rgb_premultiplied=torch.full((SIDE, SIDE, 3), 0.4)) for p in pictures]
+    nothing = regions_of(same)
+    scores = nothing.scores(same[0], same[0].rgb_premultiplied, same[0].rgb_premultiplied)
+    assert (scores.moving, scores.still) == (None, 100.0)
+    assert nothing.reason("moving") == TOO_SMALL
+
+
+def test_pictures_without_alpha_and_mask_have_neither_region() -> None:
+    picture = pictures_of_a_walk()[0]
+    assert foreground_of(picture) is None
+    assert given_motion(picture) is None

@@ -1,0 +1,90 @@
+"""Errors of tracks against scenes that move as the truth does, not at all, or by a known amount too little."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from moving_scene import Sliding, camera, moving_scene, row_of_balls, still_scene
+
+from dyngs.camera import Cameras
+from dyngs.data.capture import View
+from dyngs.data.true_tracks import TrueTracks
+from dyngs.evaluate.tracks import NO_TRACKS, NONE_OPAQUE, NONE_SEEN, track_scores
+from dyngs.scene import Scene
+from dyngs.visibility import VisibilityMasks
+
+TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
+PX_PER_UNIT = 20 / 4
+"""Focal length over the distance of the camera."""
+
+
+def sliding_truth(missing_before: int = 0) -> TrueTracks:
+    """Points at the second and fourth ball, which go 1 along x over time."""
+    start = row_of_balls().means[[1, 3]].numpy()
+    points = np.stack([start + np.array([time, 0, 0]) for time in TIMES])
+    points[:missing_before] = np.nan
+    visible = np.ones((len(TIMES), 2), bool)
+    visible[:missing_before] = False
+    return TrueTracks(points, np.array(TIMES), np.array([f"v{k}" for k in range(len(TIMES))]), visible)
+
+
+def views() -> list[View]:
+    pose = camera().cam_from_world[0].double().numpy()
+    return [View(f"v{k}", Path("a"), pose, np.eye(3), 20, 14, time=t) for k, t in enumerate(TIMES)]
+
+
+def split() -> list[tuple[View, Cameras]]:
+    return [(view, camera()) for view in views()]
+
+
+def only_movers(scene: Scene) -> Scene:
+    """The two balls that move, so that each point is carried by them alone."""
+    return scene.select(torch.tensor([1, 3]))
+
+
+def test_true_motion_has_no_error_and_a_still_model_all_of_it() -> None:
+    right = track_scores(only_movers(moving_scene(Sliding())), sliding_truth(), split(), views())
+    assert right.error_px == pytest.approx(0.0, abs=1e-4)
+    assert right.within_5px == 1.0
+    still = track_scores(still_scene(), sliding_truth(), split(), views())
+    assert still.motion_px == right.motion_px
+    assert still.error_px == pytest.approx(still.motion_px)
+    # bound at 0.5: half a unit at the ends, a quarter next to it; the time of binding does not count
+    assert still.error_px == pytest.approx(PX_PER_UNIT * (0.5 + 0.25 + 0.25 + 0.5) / 4, rel=1e-5)
+
+
+def test_motion_that_is_too_slow_is_off_by_the_rest() -> None:
+    slow = track_scores(only_movers(moving_scene(Sliding(speed=0.2))), sliding_truth(), split(), views())
+    assert slow.error_px == pytest.approx(0.8 * (slow.motion_px or 0), rel=1e-4)
+    fast = track_scores(only_movers(moving_scene(Sliding(speed=1000.0))), sliding_truth(), split(), views())
+    assert fast.error_px == pytest.approx(np.hypot(20, 14)), "no more than the diagonal of the picture"
+    assert fast.within_5px == 0.0
+
+
+def test_points_are_bound_when_they_are_seen() -> None:
+    """Those that appear at 0.75 only are bound then, where the balls are at that time."""
+    found = track_scores(only_movers(moving_scene(Sliding(speed=0.0))), sliding_truth(3), split(), views())
+    assert found.error_px == pytest.approx(0.25 * PX_PER_UNIT, rel=1e-4)
+
+
+def test_masked_gaussians_carry_points_too() -> None:
+    scene = only_movers(moving_scene(Sliding()))
+    masks = VisibilityMasks.pack((0.0, 1.0), torch.tensor([[True, False], [True, False]]))
+    masked = track_scores(replace(scene, masks=masks), sliding_truth(), split(), views())
+    assert masked == track_scores(scene, sliding_truth(), split(), views())
+
+
+def test_reasons_say_why_there_is_no_error() -> None:
+    assert track_scores(still_scene(), None, split(), views()).reason == NO_TRACKS
+    faint = still_scene()
+    faint = faint.with_gaussians(faint.gaussians.replace(logit_opacities=torch.full((5,), -5.0)))
+    assert track_scores(faint, sliding_truth(), split(), views()).reason == NONE_OPAQUE
+    unseen = sliding_truth()
+    unseen = replace(unseen, visible=np.zeros_like(unseen.visible))
+    assert track_scores(still_scene(), unseen, split(), views()).reason == NONE_SEEN
+    other = [(replace(view, time=0.1), cameras) for view, cameras in split()]
+    assert track_scores(still_scene(), sliding_truth(), other, views()).reason == NONE_SEEN
