@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -11,12 +15,30 @@ import torch
 from moving_scene import Sliding, camera, moving_scene, row_of_balls, still_scene
 
 from dyngs.camera import Cameras
-from dyngs.data.capture import View
-from dyngs.data.true_tracks import TrueTracks
+from dyngs.config.io import load_config
+from dyngs.data.capture import View, all_views
+from dyngs.data.read import read_capture
+from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
+from dyngs.data.synthetic.scenes import SceneName
+from dyngs.data.true_tracks import TrueTracks, read_true_tracks
 from dyngs.evaluate.tracks import NO_TRACKS, NONE_OPAQUE, NONE_SEEN, track_scores
 from dyngs.scene import Scene
+from dyngs.training.views import training_cameras
 from dyngs.visibility import VisibilityMasks
 
+
+def imported(path: str) -> ModuleType:
+    """A program of the repository as a module."""
+    file = Path(__file__).parents[2] / path
+    spec = importlib.util.spec_from_file_location(f"benchmark_{file.stem}", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+MOTION = imported("benchmarks/motion.py")
 TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
 PX_PER_UNIT = 20 / 4
 """Focal length over the distance of the camera."""
@@ -88,3 +110,28 @@ def test_reasons_say_why_there_is_no_error() -> None:
     assert track_scores(still_scene(), unseen, split(), views()).reason == NONE_SEEN
     other = [(replace(view, time=0.1), cameras) for view, cameras in split()]
     assert track_scores(still_scene(), sliding_truth(), other, views()).reason == NONE_SEEN
+
+
+@pytest.mark.parametrize("name", get_args(SceneName))
+def test_the_true_motion_of_the_benchmark_follows_the_true_tracks(
+    name: SceneName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """benchmarks/motion.py: its oracle moves Gaussians as the synthetic scene moves its points, and can be trained."""
+    monkeypatch.setattr(MOTION, "DRAWN", 1000)
+    monkeypatch.setattr(MOTION, "LOOKS", 5)
+    root = write_dynamic_capture(name, tmp_path / name, DynamicOptions(12, num_times=5, num_cameras=2, samples=1))
+    options = [f"data.root={root}", "train.steps=4", "train.initial_downscale=1"]
+    trainer = MOTION.oracle(name, load_config(MOTION.PRESET, options))
+    gaussians = trainer.scene.gaussians
+    opaque = trainer.scene.with_gaussians(gaussians.replace(logit_opacities=gaussians.logit_opacities.detach() + 5))
+    capture = read_capture(trainer.config.data)
+    pairs = list(
+        zip(capture.splits["test"], training_cameras(capture.splits["test"], trainer.config.data), strict=True)
+    )
+    truth = read_true_tracks(root, capture.world_offset)
+    found = track_scores(opaque, truth, pairs, all_views(capture.splits))
+    assert found.error_px is not None
+    assert found.motion_px is not None
+    assert found.error_px < 0.1
+    assert found.motion_px > 10 * found.error_px
+    assert all(np.isfinite(trainer.step().loss) for _ in range(2))

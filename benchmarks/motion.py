@@ -1,0 +1,318 @@
+"""Gap between what is learned and what could be, if the motion were known, on the synthetic scenes that move.
+
+    python benchmarks/motion.py FOLDER [--scenes spin,wave,merge,room] [--size 200] [--views 48] [key=value ...]
+
+For each scene two models are trained for the same number of steps and measured on the test split: the preset
+(configs/dynamic.yaml with the overrides), and an oracle. The oracle's Gaussians begin on the true surfaces, with labels
+of what they belong to, and a field moves them by the scene's own description: each rigid body and the cloth. The
+rasterizer, the strategy, the learning rates and the harmonics are the preset's, the base colours of what moves may
+change over time, and pictures have their full size from the start. The gap is what it costs to find the motion; shading
+and shadows hold back both. FOLDER keeps captures and runs of the preset, which are reused.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from statistics import fmean
+from typing import get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.api.train import train
+from dyngs.build import assemble
+from dyngs.config import Config, PointsInit, RandomInit, StaticModel, TrajectoryField
+from dyngs.config.io import load_config
+from dyngs.data.capture import View, all_views
+from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.loader import PictureLoader
+from dyngs.data.read import read_capture
+from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
+from dyngs.data.synthetic.raytrace import Primitive, Sheet, is_seen
+from dyngs.data.synthetic.raytrace import Scene as TrueScene
+from dyngs.data.synthetic.scenes import SceneName, scene_at
+from dyngs.data.synthetic.tracks import is_in_picture
+from dyngs.data.true_tracks import read_true_tracks
+from dyngs.deform.field import FieldSetup, Offsets, chosen
+from dyngs.deform.random_gaussians import box_of
+from dyngs.deform.scene import DynamicScene
+from dyngs.deform.trajectory import Trajectory
+from dyngs.evaluate.regions import Regions
+from dyngs.evaluate.report import evaluate_run, score_views, split_views
+from dyngs.evaluate.tracks import TrackScores, track_scores
+from dyngs.gaussians import TopologyEdit
+from dyngs.metrics import Lpips
+from dyngs.ops.native import kernel_threads
+from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.scene import Scene
+from dyngs.static.init import StartValues, initial_gaussians
+from dyngs.static.optimizer import GaussianOptimizer
+from dyngs.static.rates import Rates
+from dyngs.static.training import FilterUpdate, StaticTraining
+from dyngs.training.trainer import Trainer
+from dyngs.training.views import surroundings, training_cameras, training_times
+
+PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"
+REST = 1.0
+"""Time at which the oracle's canonical Gaussians lie on their surfaces: everything exists then."""
+PER_MOVER, MOST_STILL = 1500, 3000
+"""Points on the surface of each thing that moves, and of each that stands, at most."""
+DRAWN, LOOKS = 20_000, 16
+"""Points that are drawn per thing, of which those that one of so many training views sees are kept."""
+GONE = -30.0
+"""Logit opacity by which what does not exist is dimmed."""
+COLOURS = TrajectoryField(polynomial=3, fourier=2, move_rotations=False, move_scales=False, move_colors=True)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A rigid or uniformly scaled motion x' = A x + b from the rest, or none where the thing does not exist."""
+
+    matrix: Tensor
+    shift: Tensor
+
+    @staticmethod
+    def between(rest: Primitive, now: Primitive) -> Motion:
+        """Return the motion of ``rest`` to ``now``, two states of one ball or box."""
+        corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+        moved = now.placed(rest.local(corners)).astype(np.float64)
+        return Motion(torch.from_numpy((moved[1:] - moved[0]).T).float(), torch.from_numpy(moved[0]).float())
+
+    @property
+    def scale(self) -> float:
+        """Factor of sizes."""
+        return max(float(torch.linalg.det(self.matrix.double())), 1e-18) ** (1 / 3)
+
+    @property
+    def quat(self) -> Tensor:
+        """(4,) unit quaternion wxyz of its rotation."""
+        from scipy.spatial.transform import Rotation
+
+        x, y, z, w = Rotation.from_matrix((self.matrix / self.scale).double().numpy()).as_quat()
+        return torch.tensor([w, x, y, z], dtype=torch.float32, device="cpu")
+
+
+class TrueMotion(Trajectory):
+    """The motion of a synthetic scene as a field of which only the base colours over time are learned.
+
+    Args:
+        name: of the scene.
+        labels: (M,) primitive that each moving Gaussian belongs to.
+        setup: as for any field.
+    """
+
+    def __init__(self, name: SceneName, labels: Tensor, setup: FieldSetup) -> None:
+        super().__init__(COLOURS, setup, torch.Generator())
+        self.labels, self.rest = labels, scene_at(name, REST).primitives
+        self.primitives_at = cache(lambda time: scene_at(name, time).primitives)
+
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
+        """See ``DeformationField.offsets``; differentiable in ``means``, as rotations turn what they learn."""
+        colors, labels, means = (
+            super().offsets(means, time, rows).colors,
+            chosen(self.labels, rows),
+            chosen(means, rows),
+        )
+        moved, quats = means.clone(), means.new_tensor([1.0, 0, 0, 0]).repeat(len(means), 1)
+        scales, opacities = means.new_zeros(len(means), 3), means.new_zeros(len(means))
+        now = self.primitives_at(time)
+        for label in self.labels.unique().tolist():
+            own, rest = torch.nonzero(labels == label)[:, 0], self.rest[label]
+            if label >= len(now):
+                opacities[own] = GONE
+            elif isinstance(rest, Sheet):
+                bent, turned = _bent(rest, now[label], means[own].detach())
+                moved = moved.index_add(0, own, bent)
+                quats[own] = turned
+            else:
+                motion = Motion.between(rest, now[label])
+                moved = moved.index_copy(0, own, means[own] @ motion.matrix.T + motion.shift)
+                quats[own], scales[own] = motion.quat, float(np.log(motion.scale))
+        return Offsets(moved - means, quats - quats.new_tensor([1.0, 0, 0, 0]), scales, opacities, colors)
+
+    def edited(self, edit: TopologyEdit) -> TrueMotion:
+        field = super().edited(edit)
+        assert isinstance(field, TrueMotion)
+        field.labels = self.labels[edit.source]
+        return field
+
+
+def _bent(rest: Sheet, now: Primitive, means: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how far a cloth has moved at ``means`` (R, 3), and the (R, 4) quaternions that turn its normals."""
+    points = means.double().numpy()
+    local = rest.local(points)
+    shift = now.placed(local) - rest.placed(local)
+    before, after = (torch.from_numpy(p.normals(points).astype(np.float32)) for p in (rest, now))
+    axis = torch.linalg.cross(before, after)
+    quats = torch.cat([1 + (before * after).sum(1, keepdim=True), axis], dim=1)
+    return torch.from_numpy(shift.astype(np.float32)), torch.nn.functional.normalize(quats, dim=1)
+
+
+class OracleTraining(StaticTraining):
+    """Training of colours and Gaussians while the motion is given."""
+
+    moves_by = ("true motion", "optim")
+
+    def __init__(self, steps: int) -> None:
+        super().__init__(FilterUpdate())
+        self._rates = Rates(steps)
+
+    def optimize(self, scene: Scene, step: int) -> int:
+        assert isinstance(scene, DynamicScene)
+        assert scene.field is not None
+        return scene.field.parameters.step(step, self._rates.progress(step))
+
+
+def oracle(name: SceneName, config: Config, seed: int = 0) -> Trainer:
+    """Return the trainer of the oracle of a scene; its capture must be that of ``config``."""
+    model = StaticModel(sh_degree=config.model.sh_degree)
+    init, sizes = RandomInit(num_random=100), config.train.model_copy(update={"initial_downscale": 1})
+    config = config.model_copy(update={"model": model, "init": init, "train": sizes})
+    trainer, capture = assemble(config), read_capture(config.data)
+    points, colours, labels = surface_points(name, capture.splits["train"], seed)
+    start = replace(surroundings(capture), points=points, points_rgb=colours)
+    generator = torch.Generator().manual_seed(seed)
+    values = StartValues.for_strategy(config.strategy)
+    gaussians = initial_gaussians(start, PointsInit(), values, model.sh_degree, generator)
+    trainer.optimizer = GaussianOptimizer(gaussians, config.optim)
+    moving = torch.nonzero(labels >= scene_at(name, REST).movers.start)[:, 0]
+    times = tuple(sorted(set(training_times(capture))))
+    setup = FieldSetup(*box_of(gaussians, trainer.extent), len(times), len(moving), trainer.extent)
+    trainer.training = OracleTraining(config.train.steps)
+    trainer.scene = DynamicScene(
+        gaussians=trainer.optimizer.parameters,
+        seen_at=times,
+        field=TrueMotion(name, labels[moving], setup),
+        moving=moving,
+        options=trainer.scene.options,
+        background=trainer.scene.background,
+    )
+    return trainer
+
+
+def surface_points(name: SceneName, views: Sequence[View], seed: int) -> tuple[np.ndarray, np.ndarray, Tensor]:
+    """Return points (P, 3) at rest that training views see, their colours (P, 3) uint8, and the primitive of each."""
+    random, rest = np.random.default_rng(seed), scene_at(name, REST)
+    looks = [views[i] for i in evenly_spaced(len(views), LOOKS)]
+    points, colours, labels = [], [], []
+    for label, primitive in enumerate(rest.primitives):
+        local = primitive.sampled(DRAWN if label not in rest.movers else 2 * PER_MOVER, random)
+        local = local[_seen(name, label, local, looks)][: PER_MOVER if label in rest.movers else MOST_STILL]
+        points.append(primitive.placed(local))
+        colours.append((255 * np.clip(0.8 * primitive.paint(local), 0, 1) ** (1 / 2.2)).astype(np.uint8))
+        labels += [label] * len(local)
+    return np.concatenate(points), np.concatenate(colours), torch.tensor(labels, device="cpu")
+
+
+def _seen(name: SceneName, label: int, local: np.ndarray, looks: Sequence[View]) -> np.ndarray:
+    """Return (R,) bool: points of a primitive that one of the views sees at its time."""
+    seen = np.zeros(len(local), bool)
+    for view in looks:
+        scene: TrueScene = scene_at(name, view.time or 0.0)
+        if label < len(scene.primitives):
+            pose = np.linalg.inv(view.cam_from_world) @ np.diag([1.0, -1.0, -1.0, 1.0])
+            points = scene.primitives[label].placed(local)
+            seen |= is_in_picture(points, pose) & is_seen(scene, points, pose)
+    return seen
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is printed of a model: PSNR in dB of whole pictures and of parts, tracks in px, and Gaussians."""
+
+    psnr: float
+    foreground: float | None
+    moving: float | None
+    still: float | None
+    tracks: float | None
+    gaussians: int = 0
+
+    def minus(self, other: Row) -> Row:
+        """Return the differences; None where one is not known."""
+        names = ("foreground", "moving", "still", "tracks")
+        pairs = {name: (getattr(self, name), getattr(other, name)) for name in names}
+        parts = {name: None if a is None or b is None else a - b for name, (a, b) in pairs.items()}
+        return Row(self.psnr - other.psnr, gaussians=0, **parts)
+
+    def line(self, scene: str, model: str) -> str:
+        """Return a row of the table."""
+        values = (self.psnr, self.foreground, self.moving, self.still, self.tracks)
+        shown = [f"{x:.2f}" if x is not None else "-" for x in values]
+        return f"| {scene} | {model} | {' | '.join(shown)} | {self.gaussians or ''} |"
+
+
+def measured(scene: Scene, config: Config) -> Row:
+    """Return the scores of a scene in memory on the test split."""
+    capture = read_capture(config.data)
+    views = split_views(capture, "test")
+    background = scene.background if scene.background is not None else torch.zeros(3, device="cpu")
+    loader = PictureLoader(views, config.data)
+    regions = Regions(views, loader, background)
+    pictures = (loader[i] for i in range(len(loader)))
+    scores, _ = score_views(scene, pictures, scene.options, background, Lpips("alex", "not measured"), regions)
+    cameras = training_cameras(views, config.data)
+    truth = read_true_tracks(capture.root, capture.world_offset)
+    pairs = list(zip(views, cameras, strict=True))
+    tracks: TrackScores = track_scores(scene, truth, pairs, all_views(capture.splits))
+    return Row(
+        psnr=fmean(score.psnr for score in scores),
+        foreground=_mean(score.psnr_foreground for score in scores),
+        moving=_mean(score.psnr_moving for score in scores),
+        still=_mean(score.psnr_still for score in scores),
+        tracks=tracks.error_px,
+        gaussians=len(scene),
+    )
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None
+
+
+def preset_row(config: Config, run: Path) -> Row:
+    """Return the scores of the preset's run, which is trained where it is not there."""
+    if not checkpoint_paths(run):
+        train(config)
+    report = evaluate_run(run)
+    parts = report.psnr_foreground, report.psnr_moving, report.psnr_still
+    return Row(report.psnr, *parts, report.track_error_px, report.num_gaussians)
+
+
+def oracle_row(name: SceneName, config: Config) -> Row:
+    """Return the scores of the oracle, trained anew."""
+    trainer = oracle(name, config)
+    with kernel_threads(config.run.threads or torch.get_num_threads()):
+        for _ in range(config.train.steps):
+            trainer.step()
+        return measured(trainer.scene, config)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("overrides", nargs="*")
+    parser.add_argument("--scenes", default=",".join(get_args(SceneName)))
+    parser.add_argument("--size", type=int, default=200)
+    parser.add_argument("--views", type=int, default=48)
+    given = parser.parse_intermixed_args(words)
+    print("| scene | model | PSNR | foreground | moves | stands | tracks, px | Gaussians |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name in get_args(SceneName):
+        if name not in given.scenes.split(","):
+            continue
+        root, run = given.folder / name, given.folder / f"{name}_run"
+        if not root.is_dir():
+            write_dynamic_capture(name, root, DynamicOptions(size=given.size, num_times=given.views))
+        config = load_config(PRESET, [*given.overrides, f"data.root={root}", f"run.dir={run}"])
+        learned, known = preset_row(config, run), oracle_row(name, config)
+        for row, model in ((learned, "preset"), (known, "oracle"), (known.minus(learned), "gap")):
+            print(row.line(name, model), flush=True)
+
+
+if __name__ == "__main__":
+    main()
