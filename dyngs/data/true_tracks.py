@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.times import SAME_TIME
 from dyngs.errors import DyngsError
 from dyngs.files.containment import inside
 from dyngs.files.numpy_files import read_npz
@@ -22,20 +21,17 @@ class TrueTracks:
 
     Attributes:
         points: (T, P, 3) world units, in the coordinates of the capture's files; NaN where a point does not exist.
-        times: (T,) ascending, in [0, 1].
+        times: (T,) ascending, as the capture's files have them.
         views: (V,) names of the views of all splits, as ``View.name``.
+        moments: (V,) row of ``times`` at which each view was taken.
         visible: (V, P) whether the view shows the point: in the picture, and nothing before it.
     """
 
     points: np.ndarray
     times: np.ndarray
     views: np.ndarray
+    moments: np.ndarray
     visible: np.ndarray
-
-    def at(self, time: float) -> np.ndarray | None:
-        """Return the (P, 3) points at ``time``; None where the file has no such time."""
-        nearest = int(np.abs(self.times - time).argmin())
-        return self.points[nearest] if abs(self.times[nearest] - time) <= SAME_TIME else None
 
 
 def write_true_tracks(root: Path, tracks: TrueTracks) -> Path:
@@ -59,16 +55,16 @@ def read_true_tracks(root: Path, world_offset: np.ndarray) -> TrueTracks | None:
     path = root / TRACKS_FILE
     if not inside(path).is_file():
         return None
-    found = read_npz(path, ("points", "times", "views", "visible"))
-    points, times, views, visible = (found[name] for name in ("points", "times", "views", "visible"))
-    numbers = points.dtype.kind == "f" and times.dtype.kind == "f" and visible.dtype.kind == "b"
-    shapes = (points.shape, times.shape, views.shape, visible.shape)
-    expected = ((*times.shape, *visible.shape[1:], 3), (times.size,), (visible.shape[0],) if visible.ndim else (), None)
-    if not numbers or views.dtype.kind != "U" or visible.ndim != 2 or shapes[:3] != expected[:3] or not times.size:
+    found = read_npz(path, ("points", "times", "views", "moments", "visible"))
+    points, times, views, moments, visible = found.values()
+    kinds = "".join(x.dtype.kind for x in found.values())
+    fits = visible.ndim == 2 and times.ndim == 1 and points.shape == (*times.shape, *visible.shape[1:], 3)
+    if kinds != "ffUib" or not fits or not views.shape == moments.shape == visible.shape[:1]:
+        shapes = ", ".join(f"{name} {x.shape} of {x.dtype}" for name, x in found.items())
         raise DyngsError(
-            f"{path}: needs points (T, P, 3), times (T,), views (V,) names and visible (V, P) bool, got "
-            f"{', '.join(str(shape) for shape in shapes)}; write it again, or remove it to do without"
+            f"{path}: needs points (T, P, 3), times (T,), views (V,) names, moments (V,) whole numbers and visible "
+            f"(V, P) bool, got {shapes}; write it again, or remove it to do without"
         )
-    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise DyngsError(f"{path}: times must be finite and ascending; write it again, or remove it to do without")
-    return TrueTracks(points - world_offset, times.astype(np.float64), views, visible)
+    if len(moments) and not (moments.min() >= 0 and moments.max() < len(times)):
+        raise DyngsError(f"{path}: moments must be rows of times; write it again, or remove it to do without")
+    return TrueTracks(points - world_offset, times, views, moments, visible)

@@ -67,14 +67,14 @@ def track_scores(
     scene = scene.unmasked()
     if not bool((_opacities(scene, None) > MIN_OPACITY).any()):
         return TrackScores(reason=NONE_OPAQUE)
-    bound = _bind(scene, tracks, views)
+    bound = _bind(scene, tracks, _times_of(tracks, views))
     rows = {name: row for row, name in enumerate(tracks.views.tolist())}
     moved: dict[float, np.ndarray] = {}
     errors, motions = [], []
     for view, cameras in split:
-        truth = None if view.time is None else tracks.at(view.time)
-        if truth is None or view.time is None or view.name not in rows:
+        if view.time is None or view.name not in rows:
             continue
+        truth = tracks.points[tracks.moments[rows[view.name]]]
         shown = tracks.visible[rows[view.name]] & (np.abs(bound.times - view.time) > SAME_TIME)
         if not shown.any():
             continue
@@ -115,8 +115,17 @@ class _Bound:
         return self.points + (self.weights[..., None] * (means[self.carriers] - self.places)).sum(axis=1)
 
 
-def _bind(scene: Scene, tracks: TrueTracks, views: Sequence[View]) -> _Bound:
-    """Return the points bound to the nearest Gaussians, each at its own time."""
+def _times_of(tracks: TrueTracks, views: Sequence[View]) -> np.ndarray:
+    """Return the (T,) times of the tracks as the capture has them, by its views; NaN of those that no view shows."""
+    times = np.full(len(tracks.points), np.nan)
+    known = {view.name: view.time for view in views if view.time is not None}
+    for name, row in zip(tracks.views.tolist(), tracks.moments.tolist(), strict=True):
+        times[row] = known.get(name, times[row])
+    return times
+
+
+def _bind(scene: Scene, tracks: TrueTracks, times: np.ndarray) -> _Bound:
+    """Return the points bound to the nearest Gaussians, each at its own one of the (T,) times."""
     from scipy.spatial import KDTree
 
     count = tracks.points.shape[1]
@@ -128,8 +137,8 @@ def _bind(scene: Scene, tracks: TrueTracks, views: Sequence[View]) -> _Bound:
         np.full((count, carriers_each), 1.0 / carriers_each),
         np.zeros((count, carriers_each, 3)),
     )
-    for row, members in _binding_times(tracks, views).items():
-        time = float(tracks.times[row])
+    for row, members in _binding_rows(tracks, times).items():
+        time = float(times[row])
         means = scene.at(time).means.detach().cpu().double().numpy()
         opacities = _opacities(scene, time)
         # A field may fade Gaussians: of those that are too faint now, the least faint fill up.
@@ -143,17 +152,15 @@ def _bind(scene: Scene, tracks: TrueTracks, views: Sequence[View]) -> _Bound:
     return bound
 
 
-def _binding_times(tracks: TrueTracks, views: Sequence[View]) -> dict[int, list[int]]:
-    """Return, by row of ``tracks.times``, the points bound then: nearest to the middle of when they are seen."""
-    times_of = {view.name: view.time for view in views}
+def _binding_rows(tracks: TrueTracks, times: np.ndarray) -> dict[int, list[int]]:
+    """Return, by row of ``times``, the points bound then: nearest to the middle of when they are seen."""
     seen = np.zeros(tracks.points.shape[:2], bool)
-    for name, visible in zip(tracks.views.tolist(), tracks.visible, strict=True):
-        time = times_of.get(name)
-        if time is not None:
-            seen[np.abs(tracks.times - time) <= SAME_TIME] |= visible
-    seen &= np.isfinite(tracks.points).all(axis=2)
-    middle = 0.5 * (tracks.times[0] + tracks.times[-1])
-    distance = np.where(seen, np.abs(tracks.times - middle)[:, None], np.inf)
+    np.logical_or.at(seen, tracks.moments, tracks.visible)
+    seen &= np.isfinite(tracks.points).all(axis=2) & np.isfinite(times)[:, None]
+    if not seen.any():
+        return {}
+    middle = 0.5 * (np.nanmin(times) + np.nanmax(times))
+    distance = np.where(seen, np.abs(times - middle)[:, None], np.inf)
     rows: defaultdict[int, list[int]] = defaultdict(list)
     for point in np.flatnonzero(seen.any(axis=0)).tolist():
         rows[int(distance[:, point].argmin())].append(point)

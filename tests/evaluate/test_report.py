@@ -238,7 +238,7 @@ def test_parts_of_a_moving_scene_are_measured(tmp_path, capsys) -> None:
     start = row_of_balls().means[[1, 3]].numpy()
     points = np.stack([start + np.array([t - 0.5, 0, 0]) for t in TEST_TIMES])
     names = np.array([f"test/r_{i:03d}" for i in range(3)])
-    write_true_tracks(root, TrueTracks(points, np.array(TEST_TIMES), names, np.ones((3, 2), bool)))
+    write_true_tracks(root, TrueTracks(points, np.array(TEST_TIMES), names, np.arange(3), np.ones((3, 2), bool)))
     report = evaluate_run(run_dir)
     assert report.psnr_foreground is not None
     assert report.psnr_foreground < report.psnr, "less white background"

@@ -51,7 +51,8 @@ def sliding_truth(missing_before: int = 0) -> TrueTracks:
     points[:missing_before] = np.nan
     visible = np.ones((len(TIMES), 2), bool)
     visible[:missing_before] = False
-    return TrueTracks(points, np.array(TIMES), np.array([f"v{k}" for k in range(len(TIMES))]), visible)
+    rows = np.arange(len(TIMES))
+    return TrueTracks(points, 7 * np.array(TIMES), np.array([f"v{k}" for k in rows]), rows, visible)
 
 
 def views() -> list[View]:
@@ -108,8 +109,9 @@ def test_reasons_say_why_there_is_no_error() -> None:
     unseen = sliding_truth()
     unseen = replace(unseen, visible=np.zeros_like(unseen.visible))
     assert track_scores(still_scene(), unseen, split(), views()).reason == NONE_SEEN
-    other = [(replace(view, time=0.1), cameras) for view, cameras in split()]
+    other = [(replace(view, name="other"), cameras) for view, cameras in split()]
     assert track_scores(still_scene(), sliding_truth(), other, views()).reason == NONE_SEEN
+    assert track_scores(still_scene(), sliding_truth(), split(), []).reason == NONE_SEEN
 
 
 @pytest.mark.parametrize("name", get_args(SceneName))

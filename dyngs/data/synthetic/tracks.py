@@ -33,6 +33,7 @@ def true_tracks(
         np.stack([points[time] for time in times]),
         np.array(times, np.float64),
         np.array([name for name, _, _ in shots]),
+        np.array([times.index(time) for _, time, _ in shots], np.int64),
         np.stack(visible),
     )
 

@@ -35,6 +35,7 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
     assert tracks.points.shape == (5, POINTS_PER_THING * things, 3)
     assert tracks.views.tolist() == ["v0", "v1", "v2", "v3", "v4"]
     np.testing.assert_array_equal(tracks.times, times)
+    np.testing.assert_array_equal(tracks.moments, range(5))
     for k, (_, time, pose) in enumerate(shots):
         seen = tracks.visible[k]
         assert seen.mean() > 0.1
