@@ -18,6 +18,7 @@ from dyngs.build import restored_scene
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, SceneModel, StaticModel
 from dyngs.config.io import RESOLVED_NAME, save_config
+from dyngs.data.true_tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.export.avatar import _KIND as AVATAR_KIND
 from dyngs.export.ply import write_ply
@@ -68,6 +69,13 @@ def write_tracks(root: Path) -> None:
     """Write two tracks in three pictures."""
     names = np.array(["0", "1", "2"])
     np.savez(root / "a.npz", xy=np.ones((3, 2, 2), np.float32), visible=np.ones((3, 2), bool), names=names)
+
+
+def write_known_tracks(root: Path) -> None:
+    """Write true tracks of two points at two times, each shown by one view."""
+    points = np.array([[[0, 0, 2], [1, 0, 2]], [[0, 1, 2], [np.nan, 0, 2]]], np.float32)
+    views, seen = np.array(["a", "b"]), np.array([[True, True], [True, False]])
+    write_true_tracks(root, TrueTracks(points, np.array([0.0, 1.0]), views, np.array([0, 1]), seen))
 
 
 def write_exr(root: Path) -> None:
