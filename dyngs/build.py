@@ -5,6 +5,7 @@ Here, and nowhere else, it is decided what each kind of model, colour and strate
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -25,6 +26,7 @@ from dyngs.config import (
     McmcStrategy,
     NetworkColour,
     PointsInit,
+    RandomInit,
     SceneModel,
     ShColour,
     StaticModel,
@@ -32,8 +34,10 @@ from dyngs.config import (
 from dyngs.config.kinds import field_of, stored_sh_degree, uses_absgrad
 from dyngs.data.capture import Capture
 from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.geometry.frusta import outside_of_cube
+from dyngs.data.inspection.scene_problems import before_training
 from dyngs.data.loader import PictureLoader
-from dyngs.data.prepare.triangulate import triangulated_points, views_of_a_moment
+from dyngs.data.prepare.first_points import with_first_points
 from dyngs.data.read import read_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors, cameras_in_place, still_errors, views_to_compare
@@ -74,7 +78,6 @@ from dyngs.training.schedule import (
 from dyngs.training.state import OTHER_CONFIG, Checkpoint
 from dyngs.training.trainer import Trainer
 from dyngs.training.views import (
-    AROUND_ORIGIN,
     held_out_views,
     resolved_background,
     surroundings,
@@ -188,19 +191,22 @@ def _restored(model: SceneModel, gaussians: Gaussians, own: dict[str, torch.Tens
 
 
 def with_points(capture: Capture, config: Config) -> Capture:
-    """Return ``capture``, with triangulated points if it has none and enough cameras show one moment.
+    """Return ``capture`` with the points that the scene begins with, see ``with_first_points``; people need none.
 
-    Not where it is published custom to begin with random points: the still scenes of Blender, around the origin; nor
-    for people, who begin on a template.
+    What is suspicious about the capture, and where the points are from, is printed to stderr.
     """
-    views = capture.splits["train"]
-    custom = capture.format in AROUND_ORIGIN and all(view.time is None for view in views)
+    lines: list[str] = []
     match config.init, config.model:
-        case PointsInit(), StaticModel() | DynamicModel() if capture.points is None and not custom:
-            moment = views_of_a_moment(views, config.init.triangulate)
-            return capture.replace(points=triangulated_points(moment, config.data))
+        case PointsInit() as init, StaticModel() | DynamicModel():
+            capture, lines = with_first_points(capture, config.data, init.triangulate, init.half_extent)
+        case RandomInit() as init, StaticModel() | DynamicModel():
+            why = outside_of_cube(capture.splits["train"], init.half_extent)
+            lines = [] if why is None else [f"init.kind=random draws points around the origin, but {why}: give auto"]
         case _:
-            return capture
+            pass
+    for line in [*lines, *before_training(capture)]:
+        print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)
+    return capture
 
 
 @dataclass(frozen=True)

@@ -203,7 +203,7 @@ def test_no_points_are_triangulated_for_what_is_restored(tmp_path: Path, monkeyp
     def refuse(*_: object) -> None:
         raise AssertionError("triangulated again")
 
-    monkeypatch.setattr("dyngs.build.triangulated_points", refuse)
+    monkeypatch.setattr("dyngs.build.with_first_points", refuse)
     again = assemble(config, restored=True)
     again.restore(trainer.checkpoint())
     assert again.step().loss == trainer.step().loss

@@ -156,6 +156,7 @@ class Capture:
         format: name of the reader, as ``data.format`` has it.
         splits: split name to views, each tuple sorted by name; train is never empty.
         points: sparse points or None.
+        points_file: the .ply that the points are from, which is not known to fit the cameras; None for other points.
         world_offset: (3,) float64, added to recentred coordinates gives those of the files; zero unless the scene lies
             far from its origin.
         has_alpha: pictures carry straight alpha that means "transparent here".
@@ -171,6 +172,7 @@ class Capture:
     format: str
     splits: Splits
     points: PointCloud | None = None
+    points_file: Path | None = None
     world_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     has_alpha: bool = False
     body: dict[Split, BodyFrames] | None = None

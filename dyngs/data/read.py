@@ -144,6 +144,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         splits=splits,
         points=points,
         tracks_path=tracks,
+        points_file=capture.points_file if points is not None else None,
         has_alpha=_first_has_alpha(splits["train"]),
         span=span,
         seconds=seconds,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,8 @@ from torch import Tensor
 
 from dyngs.config import DefaultStrategy, FixedStrategy, McmcStrategy, PointsInit, RandomInit, Strategy
 from dyngs.conventions import SH_C0, num_sh_terms
+from dyngs.data.capture import View
+from dyngs.data.geometry.frusta import MIN_VIEWS, outside_of_cube, points_in_frusta
 from dyngs.gaussians import Gaussians
 
 START_OPACITY = 0.1
@@ -18,8 +21,8 @@ MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1
 """Opacity, and scale in distances to neighbours, that 3DGS-MCMC begins with."""
 MIN_SQUARED_DISTANCE = 1e-7
 EXTENT_MARGIN = 1.1
-CUBE_PER_EXTENT = 3.0
-"""Half the side of the cube of random points per camera extent, for captures without a convention of their own."""
+CANDIDATES = 4
+"""Random points that are drawn per one that is taken, where what the cameras see decides."""
 
 
 @dataclass(frozen=True)
@@ -53,16 +56,22 @@ class Surroundings:
     """Cameras and extent of a scene before training, in world units.
 
     Attributes:
-        camera_centers: (V, 3) of the training cameras.
+        views: the training cameras, one or more.
         points: (P, 3) sparse points, or None.
         points_rgb: (P, 3) their colours, uint8; None without points.
-        around_origin: the scene lies around the origin by convention (Blender scenes).
+        around_origin: by convention the scene lies around the origin (Blender scenes), where the cameras look there.
     """
 
-    camera_centers: np.ndarray
+    views: Sequence[View]
     points: np.ndarray | None = None
     points_rgb: np.ndarray | None = None
     around_origin: bool = False
+
+    @property
+    def camera_centers(self) -> np.ndarray:
+        """(V, 3) centres of the training cameras."""
+        poses = np.stack([view.cam_from_world for view in self.views])
+        return -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
 
     @property
     def extent(self) -> float:
@@ -70,7 +79,8 @@ class Surroundings:
 
         Learning rates and size thresholds are relative to it. Where all cameras share one centre it is 1.
         """
-        offsets = self.camera_centers - self.camera_centers.mean(axis=0)
+        centers = self.camera_centers
+        offsets = centers - centers.mean(axis=0)
         extent = EXTENT_MARGIN * float(np.linalg.norm(offsets, axis=1).max())
         return extent if extent > 1e-6 else 1.0
 
@@ -85,7 +95,7 @@ def initial_gaussians(
     """Return the first Gaussians of a run: isotropic, as large as the distance to the three nearest neighbours.
 
     ``RandomInit`` draws a cube around the origin. ``PointsInit`` takes the finite ones of the scene's points; where
-    there are none it draws a cube, around the origin or else around the cameras' mean and as large as their extent.
+    there are none it draws that cube if the scene may lie in it by convention, else what the cameras see together.
 
     Args:
         generator: a CPU generator; the only source of randomness.
@@ -106,15 +116,28 @@ def initial_gaussians(
 def _random_points(
     scene: Surroundings, options: PointsInit | RandomInit, max_points: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Positions (N, 3) float64 uniform in a cube, and base colour coefficients (N, 3) just above mid grey (3DGS)."""
+    """Positions (N, 3) float64, and base colour coefficients (N, 3) just above mid grey (3DGS)."""
     count = min(options.num_random, max_points)
-    center, half_extent = torch.zeros(3, dtype=torch.float64, device="cpu"), options.half_extent
-    if options.kind != "random" and not scene.around_origin:
-        center = torch.from_numpy(scene.camera_centers.mean(axis=0))
-        half_extent = CUBE_PER_EXTENT * scene.extent
-    unit = torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") * 2 - 1
-    base = torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") / 255
-    return unit * half_extent + center, base
+    half_extent = options.half_extent
+    if options.kind == "random" or (scene.around_origin and outside_of_cube(scene.views, half_extent) is None):
+        xyz = (torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") * 2 - 1) * half_extent
+    else:
+        xyz = _seen_together(scene.views, count, generator)
+    return xyz, torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") / 255
+
+
+def _seen_together(views: Sequence[View], count: int, generator: torch.Generator) -> Tensor:
+    """Return ``count`` random points (N, 3) float64 in what the cameras see together, see ``points_in_frusta``.
+
+    A candidate is taken with a chance proportional to the number of views that see it; those that fewer than
+    ``MIN_VIEWS`` see come last. So most points lie where most cameras look, some wherever depth can be told.
+    """
+    unit = torch.rand((CANDIDATES * count, 5), generator=generator, dtype=torch.float64, device="cpu").numpy()
+    xyz, seen = points_in_frusta(views, unit[:, :4])
+    # The largest of u^(1 / weight) are a weighted sample without replacement (Efraimidis and Spirakis 2006).
+    order = np.log(np.maximum(unit[:, 4], 1e-300)) / np.maximum(seen, 1)
+    order[seen < min(MIN_VIEWS, len(views))] -= 1e6
+    return torch.from_numpy(xyz[np.sort(np.argsort(-order, kind="stable")[:count])])
 
 
 def _isotropic(xyz: Tensor, base: Tensor, start: StartValues, sh_degree: int) -> Gaussians:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 
 from dyngs.camera import Cameras
@@ -12,19 +11,15 @@ from dyngs.config import Config, DataConfig
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry.intrinsics import scaled_intrinsics
 from dyngs.data.pictures.images import target_size
+from dyngs.data.prepare.first_points import AROUND_ORIGIN
 from dyngs.static.init import Surroundings
-
-AROUND_ORIGIN = ("blender", "body_json")
-"""Formats whose scenes lie around the origin by convention."""
 
 
 def surroundings(capture: Capture) -> Surroundings:
     """Return the properties of a capture that initialisation needs."""
-    poses = np.stack([view.cam_from_world for view in capture.splits["train"]])
-    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
     points = capture.points
     return Surroundings(
-        camera_centers=centers,
+        views=capture.splits["train"],
         points=None if points is None else points.xyz,
         points_rgb=None if points is None else points.rgb,
         around_origin=capture.format in AROUND_ORIGIN,

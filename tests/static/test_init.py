@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +12,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.config import DefaultStrategy, McmcStrategy, PointsInit, RandomInit
+from dyngs.data.capture import View
+from dyngs.data.geometry.intrinsics import pinhole_matrix
+from dyngs.data.geometry.projection import times_seen
 from dyngs.static.init import StartValues, Surroundings, initial_gaussians, mean_squared_neighbour_distance
 
 CENTERS = np.array([[4.0, 0.0, 1.0], [0.0, 4.0, 1.0], [-4.0, 0.0, 1.0], [0.0, -4.0, 1.0]])
+"""Of cameras that look at the origin, or where ``offset`` shifts it."""
+
+
+def _views(offset: tuple[float, float, float] = (0.0, 0.0, 0.0), centers: np.ndarray = CENTERS) -> list[View]:
+    views = []
+    for i, center in enumerate(centers):
+        backward = center / np.linalg.norm(center)
+        right = np.cross([0.0, 0.0, 1.0], backward)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, -np.cross(backward, right), -backward])
+        pose[:3, 3] = -pose[:3, :3] @ (center + offset)
+        views.append(View(str(i), Path(f"{i}.png"), pose, pinhole_matrix(20.0, 20.0, 10.0, 10.0), 20, 20))
+    return views
 
 
 def _generator(seed: int = 0) -> torch.Generator:
@@ -21,12 +39,12 @@ def _generator(seed: int = 0) -> torch.Generator:
 
 
 def _with_points(xyz: np.ndarray) -> Surroundings:
-    return Surroundings(CENTERS, xyz, np.full((len(xyz), 3), 255, np.uint8))
+    return Surroundings(_views(), xyz, np.full((len(xyz), 3), 255, np.uint8))
 
 
 def test_extent_is_the_published_one() -> None:
-    assert Surroundings(CENTERS).extent == pytest.approx(1.1 * 4.0)
-    assert Surroundings(CENTERS[:1]).extent == 1.0
+    assert Surroundings(_views()).extent == pytest.approx(1.1 * 4.0)
+    assert Surroundings(_views()[:1]).extent == 1.0
 
 
 def test_points_give_their_published_start() -> None:
@@ -68,21 +86,30 @@ def test_points_that_are_not_finite_are_left_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scene", "options", "center", "half"),
+    ("scene", "options", "half"),
     [
-        (_with_points(np.ones((9, 3))), RandomInit(num_random=4000, half_extent=2.0), [0.0, 0.0, 0.0], 2.0),
-        (Surroundings(CENTERS, around_origin=True), PointsInit(num_random=4000), [0.0, 0.0, 0.0], 1.3),
-        (Surroundings(CENTERS), PointsInit(num_random=4000), [0.0, 0.0, 1.0], 3 * 4.4),
+        (_with_points(np.ones((9, 3))), RandomInit(num_random=4000, half_extent=2.0), 2.0),
+        (Surroundings(_views(), around_origin=True), PointsInit(num_random=4000), 1.3),
     ],
 )
-def test_random_points_fill_their_cube(
-    scene: Surroundings, options: PointsInit | RandomInit, center: list[float], half: float
-) -> None:
+def test_random_points_fill_their_cube(scene: Surroundings, options: PointsInit | RandomInit, half: float) -> None:
     gaussians = initial_gaussians(scene, options, StartValues(), 1, _generator())
-    offset = gaussians.means - torch.tensor(center)
     assert len(gaussians) == 4000
-    assert half * 0.99 < float(offset.abs().max()) <= half * 1.000001
-    assert float(offset.mean(0).abs().max()) < 0.05 * half
+    assert half * 0.99 < float(gaussians.means.abs().max()) <= half * 1.000001
+    assert float(gaussians.means.mean(0).abs().max()) < 0.05 * half
+    assert float((gaussians.base_rgb - 0.5).abs().max()) < 0.28209479177387814 / 255 + 1e-6
+
+
+@pytest.mark.parametrize(("offset", "by_convention"), [((7.0, -3.0, 11.0), True), ((0.0, 0.0, 0.0), False)])
+def test_other_random_points_lie_where_cameras_look(offset: tuple[float, float, float], by_convention: bool) -> None:
+    """Wherever the scene lies: all in three pictures or more, most of them near what all cameras look at."""
+    scene = Surroundings(_views(offset), around_origin=by_convention)
+    gaussians = initial_gaussians(scene, PointsInit(num_random=2000), StartValues(), 1, _generator())
+    xyz = gaussians.means.double().numpy()
+    assert len(xyz) == 2000
+    assert times_seen(xyz, scene.views).min() >= 3
+    distances = np.linalg.norm(xyz - offset, axis=1)
+    assert np.median(distances) < 2.0
     assert float((gaussians.base_rgb - 0.5).abs().max()) < 0.28209479177387814 / 255 + 1e-6
 
 
@@ -102,7 +129,7 @@ def test_mcmc_starts_smaller_and_more_opaque_and_keeps_its_cap() -> None:
 def test_the_seed_decides() -> None:
     def draw(seed: int) -> torch.Tensor:
         return initial_gaussians(
-            Surroundings(CENTERS), PointsInit(num_random=10), StartValues(), 0, _generator(seed)
+            Surroundings(_views()), PointsInit(num_random=10), StartValues(), 0, _generator(seed)
         ).means
 
     assert torch.equal(draw(1), draw(1))

@@ -32,7 +32,7 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         ("alpha", "transparent background" if capture.has_alpha else "none"),
         ("masks", str(sum(view.mask_path is not None for view in views))),
         *_time_facts(capture),
-        ("points", str(len(capture.points.xyz)) if capture.points is not None else "none"),
+        ("points", _points(capture)),
     ]
     if len(centers):
         spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
@@ -46,6 +46,12 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         )
         facts.append(("body", f"{next(iter(capture.body.values())).kind}, frames: {frames}"))
     return tuple(facts)
+
+
+def _points(capture: Capture) -> str:
+    if capture.points is None:
+        return "none"
+    return str(len(capture.points.xyz)) + ("" if capture.points_file is None else f" ({capture.points_file.name})")
 
 
 def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:

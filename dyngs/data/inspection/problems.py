@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dyngs.data.capture import Capture, View, all_views
-from dyngs.data.geometry.focus import focus_point, share_in_front
-from dyngs.data.geometry.poses import inverse_rigid, matrix_fault, pose_fault
+from dyngs.data.capture import Capture, all_views
+from dyngs.data.geometry.poses import matrix_fault, pose_fault
 from dyngs.data.inspection.facts import counted
+from dyngs.data.inspection.scene_problems import listed, scene_problems, time_problems
 from dyngs.data.pictures.images import SUFFIXES, read_header, read_picture
-from dyngs.data.times import distinct_times
 from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.containment import staying_within
 from dyngs.files.json_files import read_json_object
-
-MAX_LINES_PER_KIND = 5
-"""Problems of one kind that are listed; the others are counted."""
 
 
 def problems_of(capture: Capture, deep: bool) -> list[str]:
@@ -30,13 +26,9 @@ def problems_of(capture: Capture, deep: bool) -> list[str]:
         deep: decode every picture instead of reading its header only.
     """
     problems = []
-    for check in (_split_problems, _name_problems, _pose_problems, _intrinsics_problems, _time_problems):
+    for check in (_split_problems, _name_problems, _pose_problems, _intrinsics_problems):
         problems += check(capture)
-    problems += _picture_problems(capture, deep)
-    rigid = [view for view in all_views(capture.splits) if pose_fault(view) is None]
-    if rigid:
-        problems += _scene_problems(capture, np.stack([inverse_rigid(view.cam_from_world) for view in rigid]), rigid)
-    return problems
+    return [*problems, *_picture_problems(capture, deep), *time_problems(capture), *scene_problems(capture)]
 
 
 def _split_problems(capture: Capture) -> list[str]:
@@ -91,31 +83,6 @@ def _intrinsics_problems(capture: Capture) -> list[str]:
     return listed(faults(), str)
 
 
-def _time_problems(capture: Capture) -> list[str]:
-    views = all_views(capture.splits)
-    timed = [view for view in views if view.time is not None]
-    problems = listed(
-        (view for view in timed if not 0 <= (view.time or 0.0) <= 1),
-        lambda view: f"'{view.name}': the time {view.time} is outside [0, 1]",
-    )
-    if timed and len(timed) < len(views):
-        problems.append(f"{len(views) - len(timed)} of {len(views)} views have no time")
-    if _is_still_monocular(capture):
-        count = len(set(distinct_times(timed).values()))
-        problems.append(
-            f"one camera that does not move saw all {count} times: a moving scene cannot be reconstructed in 3D from "
-            "that; move the camera or use several"
-        )
-    return problems
-
-
-def _is_still_monocular(capture: Capture) -> bool:
-    """Whether a single camera that does not move took all training views, at several times."""
-    views = [view for view in capture.splits.get("train", ()) if view.time is not None]
-    poses = {view.cam_from_world.round(9).tobytes() for view in views}
-    return capture.body is None and len(poses) == 1 and len(set(distinct_times(views).values())) > 1
-
-
 def _picture_problems(capture: Capture, deep: bool) -> list[str]:
     """Pictures and masks that are missing, unreadable, or of another size than their camera's."""
     unreadable, sizes, channels = [], [], Counter[int]()
@@ -138,54 +105,6 @@ def _picture_problems(capture: Capture, deep: bool) -> list[str]:
     problems = listed(unreadable, str) + listed(sizes, str)
     if len(channels) > 1:
         problems.append("pictures have different numbers of channels: " + counted(channels))
-    return problems
-
-
-def _scene_problems(capture: Capture, poses: np.ndarray, views: list[View]) -> list[str]:
-    """Problems of poses and points together: cameras that look away from the scene, points that no camera sees."""
-    problems = []
-    centers = poses[:, :3, 3]
-    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    if len(poses) > 1 and spread < 1e-9 and capture.body is None and not _is_still_monocular(capture):
-        problems.append("all cameras are at one place, so no depth can be found")
-    xyz = capture.points.xyz if capture.points is not None else np.zeros((0, 3))
-    finite = np.isfinite(xyz).all(axis=1)
-    if not finite.all():
-        problems.append(f"{int((~finite).sum())} of {len(xyz)} points hold NaN or infinity")
-    xyz = xyz[finite]
-    focus = np.median(xyz, axis=0) if len(xyz) else focus_point(poses)
-    if focus is not None and share_in_front(poses, focus) < 0.5:
-        what = "the sparse points" if len(xyz) else "each other's scene"
-        problems.append(
-            f"{1 - share_in_front(poses, focus):.0%} of the cameras look away from {what}: are the poses in the axes "
-            "that the format wants (OpenGL camera-to-world for JSON files)?"
-        )
-    if len(xyz):
-        problems += _point_problems(xyz, poses, views)
-    return problems
-
-
-def _point_problems(xyz: np.ndarray, poses: np.ndarray, views: list[View]) -> list[str]:
-    """Points outside every picture and points much farther away than most, from a sample of points and views."""
-    rng = np.random.default_rng(0)
-    sample = xyz[rng.permutation(len(xyz))[:2000]]
-    seen = np.zeros(len(sample), bool)
-    for index in rng.permutation(len(views))[:300]:
-        view, world_from_cam = views[index], poses[index]
-        local = (sample - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]
-        depth = np.where(local[:, 2] > 0, local[:, 2], np.inf)
-        x, y = (local[:, :2] / depth[:, None]).T
-        k, margin = view.intrinsics, 0.1
-        u, v = (k[0, 0] * x + k[0, 2]) / view.width, (k[1, 1] * y + k[1, 2]) / view.height
-        inside = (u > -margin) & (u < 1 + margin) & (v > -margin) & (v < 1 + margin)
-        seen |= np.isfinite(depth) & inside
-    problems = []
-    if seen.mean() < 0.9:
-        problems.append(f"{1 - seen.mean():.0%} of the points are in no camera's view")
-    distance = np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)
-    far = distance > 50 * max(float(np.median(distance)), 1e-12)
-    if far.any():
-        problems.append(f"{int(far.sum())} of {len(xyz)} points lie more than 50 times farther off than the median one")
     return problems
 
 
@@ -217,11 +136,3 @@ def transforms_file_problems(root: Path, known: str) -> list[str]:
         problems += listed((fault for fault in faults if fault is not None), str)
         problems += listed(doubled, lambda item: f"the name '{item[0]}' occurs {item[1]} times")
     return [line for line in problems if line not in known]
-
-
-def listed(items: Iterable[Any], line: Callable[[Any], str]) -> list[str]:
-    """Return one line per item, and a count of those beyond ``MAX_LINES_PER_KIND``."""
-    lines = [line(item) for item in items]
-    if len(lines) <= MAX_LINES_PER_KIND:
-        return lines
-    return [*lines[:MAX_LINES_PER_KIND], f"... and {len(lines) - MAX_LINES_PER_KIND} more like the last one"]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.inspection.facts import facts_of
-from dyngs.data.inspection.problems import listed, problems_of, transforms_file_problems
+from dyngs.data.inspection.problems import problems_of, transforms_file_problems
+from dyngs.data.inspection.scene_problems import listed
+from dyngs.data.prepare.first_points import checked_points
 from dyngs.errors import DyngsError, printable, reading
 from dyngs.files.containment import leaving_links, pictures_up_to
 
@@ -59,7 +62,11 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
 
 def report_on(capture: Capture, deep: bool = False) -> InspectReport:
     """Return the report on a capture that has been read; see ``inspect_capture``."""
-    problems = dict.fromkeys([*capture.warnings, *problems_of(capture, deep)])
+    checked, line = capture, None
+    with suppress(DyngsError):  # pictures that cannot be read, which is a problem of its own
+        checked, line = checked_points(capture, DataConfig(root=capture.root))
+    noise = [line] if line is not None and checked.points is None else []
+    problems = dict.fromkeys([*capture.warnings, *noise, *problems_of(checked, deep)])
     return InspectReport(capture.root, capture, facts_of(capture), tuple(problems))
 
 

@@ -1,7 +1,11 @@
-"""Sparse points for a capture that has poses but no points, by pycolmap's triangulation on the CPU."""
+"""Sparse points for a capture that has poses but no points, by pycolmap's triangulation on the CPU.
+
+From the pictures of one moment, or of one moving camera over the whole clip: there, what moves violates the poses.
+"""
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections import Counter
 from collections.abc import Sequence
@@ -14,6 +18,8 @@ import torch
 from dyngs.config import DataConfig
 from dyngs.data.capture import PointCloud, View
 from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.geometry.frusta import points_in_frusta
+from dyngs.data.geometry.projection import projected
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
@@ -28,8 +34,20 @@ MIN_POINTS = 30
 LONGEST_SIDE = 1000
 MAX_FEATURES = 2048
 """SIFT features per picture."""
+CLIP_PICTURES = 50
+"""Pictures of a clip, evenly spaced in time, that points are triangulated from."""
+TIME_STEPS = (1, 2, 4, 8)
+"""Each picture of a clip is matched with those so many pictures before and after it,"""
+OVERLAPPING = 4
+"""and with so many others that share most of what they see."""
+MAX_TURN = 45.0
+"""Degrees between the optical axes beyond which pictures are not matched for their overlap: SIFT does not."""
+MAX_ERROR = 2.0
+"""Mean reprojection error of a track over a clip, px of pictures of at most ``LONGEST_SIDE``; what moves has more."""
 GREY = 0.5
 """Background of pictures with alpha."""
+_PROBES = 4000
+"""Random points by which the overlap of pictures is judged."""
 
 
 def views_of_a_moment(views: Sequence[View], limit: int) -> list[View]:
@@ -57,6 +75,49 @@ def triangulated_points(views: Sequence[View], options: DataConfig) -> PointClou
     Raises:
         DyngsError: pictures that cannot be read.
     """
+    return _points_of(views, options, None)
+
+
+def points_over_clip(views: Sequence[View], options: DataConfig) -> PointCloud | None:
+    """Return points of what stands, from one moving camera; None where there are hardly any.
+
+    As ``triangulated_points``, of at most ``CLIP_PICTURES`` pictures and matched between the pairs of ``clip_pairs``;
+    tracks over three pictures or more that do not agree with the poses, as those of what moves, are left out.
+
+    Args:
+        views: with times and poses.
+        options: of the capture; its picture sizes do not matter here.
+
+    Raises:
+        DyngsError: pictures that cannot be read.
+    """
+    in_order = sorted(views, key=lambda view: (view.time or 0.0, view.name))
+    chosen = [in_order[i] for i in evenly_spaced(len(in_order), CLIP_PICTURES)]
+    return _points_of(chosen, options, clip_pairs(chosen))
+
+
+def clip_pairs(views: Sequence[View]) -> list[tuple[int, int]]:
+    """Return the pairs (i, j), i < j, of views in order of time that are matched; a bounded number for each view.
+
+    Those that are near each other in time (``TIME_STEPS``), and of the others the ``OVERLAPPING`` whose pictures show
+    most of the same space, judged by random points in what the cameras see.
+    """
+    count = len(views)
+    pairs = {(i, i + step) for step in TIME_STEPS for i in range(count - step)}
+    points, _ = points_in_frusta(views, np.random.default_rng(0).random((_PROBES, 4)))
+    seen = np.stack([projected(points, view)[1] for view in views]).astype(float)
+    axes = np.stack([view.cam_from_world[2, :3] for view in views])
+    overlap = np.where(axes @ axes.T > np.cos(np.radians(MAX_TURN)), seen @ seen.T, 0.0)
+    for i, row in enumerate(overlap):
+        others = [int(j) for j in np.argsort(-row, kind="stable") if row[j] > 0 and i != j]
+        new = [(min(i, j), max(i, j)) for j in others]
+        pairs.update([pair for pair in new if pair not in pairs][:OVERLAPPING])
+    return sorted(pairs)
+
+
+def _points_of(
+    views: Sequence[View], options: DataConfig, pairs: Sequence[tuple[int, int]] | None
+) -> PointCloud | None:
     if len({view.cam_from_world.tobytes() for view in views}) < MIN_PICTURES:
         return None
     import pycolmap
@@ -67,7 +128,7 @@ def triangulated_points(views: Sequence[View], options: DataConfig) -> PointClou
     pycolmap.set_random_seed(0)
     try:
         with tempfile.TemporaryDirectory(prefix="dyngs_points.") as folder:
-            return _triangulated(Path(folder), [pictures[i] for i in range(len(pictures))])
+            return _triangulated(Path(folder), [pictures[i] for i in range(len(pictures))], pairs)
     except (RuntimeError, ValueError, OSError) as error:
         if isinstance(error, DyngsError):
             raise
@@ -76,7 +137,10 @@ def triangulated_points(views: Sequence[View], options: DataConfig) -> PointClou
         pycolmap.logging.minloglevel = level
 
 
-def _triangulated(folder: Path, pictures: Sequence[Picture]) -> PointCloud | None:
+def _triangulated(
+    folder: Path, pictures: Sequence[Picture], pairs: Sequence[tuple[int, int]] | None
+) -> PointCloud | None:
+    """Return the points of tracks over enough pictures, matched between all pairs or the given ones."""
     import pycolmap
 
     images, database, model = folder / "images", folder / "database.db", folder / "model"
@@ -87,10 +151,12 @@ def _triangulated(folder: Path, pictures: Sequence[Picture]) -> PointCloud | Non
         grey = picture.rgb_premultiplied.new_full((3,), GREY)
         rgb = (picture.composite(grey).clamp(0, 1) * 255).round().to(torch.uint8)
         write_image(images / name, rgb.numpy())
-    _find_and_match(database, images, names)
+    _find_and_match(database, images, names, pairs)
     posed = _posed(database, dict(zip(names, pictures, strict=True)))
     found = pycolmap.triangulate_points(posed, database, images, model, clear_points=True)
-    points = [point for point in found.points3D.values() if point.track.length() >= MIN_PICTURES]
+    largest = math.inf if pairs is None else MAX_ERROR
+    tracks = (point for point in found.points3D.values() if point.track.length() >= MIN_PICTURES)
+    points = [point for point in tracks if point.error <= largest]
     if len(points) < MIN_POINTS:
         return None
     xyz = np.array([point.xyz for point in points], dtype=np.float64)
@@ -99,8 +165,8 @@ def _triangulated(folder: Path, pictures: Sequence[Picture]) -> PointCloud | Non
     return PointCloud(xyz[order], rgb[order])
 
 
-def _find_and_match(database: Path, images: Path, names: list[str]) -> None:
-    """Write features of all pictures and matches of all pairs to ``database``."""
+def _find_and_match(database: Path, images: Path, names: list[str], pairs: Sequence[tuple[int, int]] | None) -> None:
+    """Write features of all pictures, and matches of all pairs or the given ones, to ``database``."""
     import pycolmap
 
     extraction = pycolmap.FeatureExtractionOptions()
@@ -116,7 +182,13 @@ def _find_and_match(database: Path, images: Path, names: list[str]) -> None:
     matching.use_gpu, matching.num_threads = False, 1
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
-    pycolmap.match_exhaustive(database, matching, verification_options=verification, device=device)
+    if pairs is None:
+        pycolmap.match_exhaustive(database, matching, verification_options=verification, device=device)
+        return
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = database.with_name("pairs.txt")
+    pairing.match_list_path.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs))
+    pycolmap.match_image_pairs(database, matching, pairing, verification, device)
 
 
 def _posed(path: Path, pictures: dict[str, Picture]) -> pycolmap.Reconstruction:

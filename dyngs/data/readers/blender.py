@@ -6,6 +6,7 @@ from pathlib import Path
 
 from dyngs.data.capture import Capture, Split, Splits
 from dyngs.data.readers.shared.capture_format import CaptureFormat
+from dyngs.data.readers.shared.point_files import FoundPoints, find_points
 from dyngs.data.readers.shared.transforms import read_frame_file, read_views, tracks_path_of
 
 
@@ -18,13 +19,14 @@ def read_blender(root: Path) -> Capture:
     """Read ``transforms_{train,val,test}.json`` with OpenGL camera-to-world poses; val and test are optional.
 
     Intrinsics: ``camera_angle_x``, or ``w, h, fl_x, fl_y, cx, cy`` of the file or the frame.
+    Points: see ``find_points``.
 
     Raises:
         DyngsError: see ``dyngs.data.readers.shared.transforms.read_views``.
     """
     splits: Splits = {}
     warnings: list[str] = []
-    fps = tracks = None
+    fps, found, tracks = None, FoundPoints(), None
     names: tuple[Split, ...] = ("train", "val", "test")
     for name in names:
         path = root / f"transforms_{name}.json"
@@ -33,12 +35,16 @@ def read_blender(root: Path) -> Capture:
         file = read_frame_file(path)
         views, notes = read_views(file)
         if name == "train":
-            fps, tracks = file.fps, tracks_path_of(file)
+            fps, found, tracks = file.fps, find_points(file), tracks_path_of(file)
         splits[name] = tuple(views.values())
         warnings += [f"{path.name}: {note}" for note in notes]
         if not views:
             warnings.append(f"{path.name}: lists no frames")
-    return Capture(root, "blender", splits, fps=fps, tracks_path=tracks, warnings=tuple(warnings))
+    warnings += found.warnings
+    place, lines = found.path, tuple(warnings)
+    return Capture(
+        root, "blender", splits, found.points, fps=fps, points_file=place, tracks_path=tracks, warnings=lines
+    )
 
 
 FORMAT = CaptureFormat("blender", "transforms_train.json", is_blender, read_blender)

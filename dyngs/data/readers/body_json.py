@@ -38,7 +38,7 @@ def read_body_json(root: Path) -> Capture:
 
 
 def _read(root: Path) -> Capture:
-    capture = read_blender(root)
+    capture = read_blender(root)  # whose points are of no use: people begin on a template
     splits, warnings = dict(capture.splits), capture.warnings
     path = root / "transforms_pose.json"
     if path.is_file():
@@ -48,7 +48,12 @@ def _read(root: Path) -> Capture:
     train = _read_body(root / _TRAIN)
     body: dict[Split, BodyFrames] = {name: _body_of(root, name, views, train) for name, views in splits.items()}
     return capture.replace(
-        format="body_json", splits=splits, body={"val": train, "test": train, **body}, warnings=warnings
+        format="body_json",
+        splits=splits,
+        points=None,
+        points_file=None,
+        body={"val": train, "test": train, **body},
+        warnings=warnings,
     )
 
 

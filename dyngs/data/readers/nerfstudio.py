@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from dyngs.data.capture import Capture, PointCloud, Split, Splits, View
+from dyngs.data.capture import Capture, Split, Splits, View
 from dyngs.data.readers.shared.capture_format import CaptureFormat
+from dyngs.data.readers.shared.point_files import find_points
 from dyngs.data.readers.shared.transforms import FrameFile, read_frame_file, read_views, tracks_path_of
-from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import inside
+from dyngs.errors import DyngsError
 
 
 def is_nerfstudio(root: Path) -> bool:
@@ -20,7 +17,7 @@ def is_nerfstudio(root: Path) -> bool:
 
 
 def read_nerfstudio(root: Path) -> Capture:
-    """Read ``transforms.json`` with OpenGL camera-to-world poses and, if named there, a ``.ply`` file of points.
+    """Read ``transforms.json`` with OpenGL camera-to-world poses and, if there, a ``.ply`` file of points.
 
     The lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` decide the splits; a val list without a test
     list is used for testing. Points and poses are read as they stand: ``applied_transform``
@@ -32,32 +29,17 @@ def read_nerfstudio(root: Path) -> Capture:
     file = read_frame_file(root / "transforms.json")
     views, warnings = read_views(file)
     splits, notes = _splits(file, views)
-    written = file.fields.get("ply_file_path")
-    points = read_points(inside(root / written)) if isinstance(written, str) and written else None
-    tracks, notes = tracks_path_of(file), [*warnings, *notes]
-    return Capture(root, "nerfstudio", splits, points, fps=file.fps, tracks_path=tracks, warnings=tuple(notes))
-
-
-def read_points(path: Path) -> PointCloud:
-    """Read the points of a ``.ply`` file (through trimesh), grey where it has no colours.
-
-    Raises:
-        DyngsError: missing or unreadable.
-    """
-    import trimesh
-
-    if not path.is_file():
-        raise DyngsError(f"{path}: no such point file; restore it or remove ply_file_path")
-    # From an open file: given a path, trimesh would look for textures beside it.
-    with reading(path, "it must be a .ply file of points; export it again"), path.open("rb") as file:
-        loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
-        xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        own = isinstance(loaded, trimesh.PointCloud)
-        colours = loaded.colors if own else getattr(loaded.visual, "vertex_colors", None)
-        rgb = np.full((len(xyz), 3), 128, np.uint8)
-        if colours is not None and len(colours) == len(xyz):
-            rgb = np.ascontiguousarray(np.asarray(colours)[:, :3].astype(np.uint8))
-    return PointCloud(xyz, rgb)
+    found = find_points(file)
+    return Capture(
+        root,
+        "nerfstudio",
+        splits,
+        found.points,
+        fps=file.fps,
+        points_file=found.path,
+        tracks_path=tracks_path_of(file),
+        warnings=(*warnings, *notes, *found.warnings),
+    )
 
 
 def _splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits, list[str]]:

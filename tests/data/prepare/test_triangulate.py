@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from room_surfaces import distances_to_surface
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import View
 from dyngs.data.prepare.triangulate import triangulated_points, views_of_a_moment
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.data.synthetic.scenes import scene_at
 from dyngs.errors import DyngsError
 
 
@@ -27,19 +27,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> DataConfig:
 
 def train_views(options: DataConfig) -> list[View]:
     return list(read_capture(options).splits["train"])
-
-
-def distances_to_surface(points: np.ndarray, views: list[View], time: float) -> np.ndarray:
-    """Along the rays of the camera that sees each point best."""
-    best = np.full(len(points), np.inf)
-    for view in views:
-        center = -view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3]
-        offset = points - center
-        far = np.linalg.norm(offset, axis=1)
-        origins, rays = np.tile(center.astype(np.float32), (len(points), 1)), (offset / far[:, None]).astype(np.float32)
-        hits = np.min([thing.intersect(origins, rays) for thing in scene_at("room", time).primitives], axis=0)
-        best = np.minimum(best, np.abs(hits - far))
-    return best
 
 
 def test_points_lie_on_the_surfaces(room: DataConfig) -> None:

@@ -7,7 +7,7 @@ import pytest
 from tiny_captures import edit_json
 
 from dyngs.data.capture import Lens
-from dyngs.data.readers.nerfstudio import read_nerfstudio, read_points
+from dyngs.data.readers.nerfstudio import read_nerfstudio
 from dyngs.errors import DyngsError
 
 
@@ -116,50 +116,9 @@ def test_points_of_a_ply_in_double(nerfstudio_root: Path) -> None:
     np.testing.assert_array_equal(points.rgb, [[255, 0, 7], [1, 2, 3]])
 
 
-@pytest.mark.parametrize(
-    "content", [None, b"", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", b"\x00" * 99]
-)
-def test_bad_point_files_are_named(tmp_path: Path, content: bytes | None) -> None:
-    path = tmp_path / "points.ply"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(DyngsError, match=r"points\.ply"):
-        read_points(path)
-
-
 def test_fox(shared: Path) -> None:
     capture = read_nerfstudio(shared / "fox")
     views = capture.splits["train"]
     assert len(views) == 50
     assert views[0].lens == Lens("opencv", (0.0578421, -0.0805099, -0.000980296, 0.00015575))
     assert views[0].intrinsics[0, 0] == 343.88
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"",
-        b"ply\nformat binary_little_endian 1.0\nelement vertex 1099511627776\nproperty float x\nend_header\n",
-        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float q\nend_header\n0\n",
-        b"PK\x03\x04 an archive",
-        b"# an .obj\nmtllib ../../own.mtl\nv 0 0 0\n",
-    ],
-    ids=["empty", "huge", "no xyz", "zip", "obj"],
-)
-def test_points_that_are_no_ply_are_one_line(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "points.ply"
-    path.write_bytes(content)
-    with pytest.raises(DyngsError, match=r"points\.ply: cannot be read \(.*it must be a \.ply file of points"):
-        read_points(path)
-
-
-def test_textures_that_points_name_are_not_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = ["ply", "format ascii 1.0", "comment TextureFile ../own.png", "element vertex 3"]
-    lines += [f"property float {name}" for name in ("x", "y", "z", "s", "t")]
-    lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
-    lines += ["0 0 0 0 0", "1 0 0 0 0", "0 1 0 0 0", "3 0 1 2"]
-    (tmp_path / "capture").mkdir()
-    (tmp_path / "own.png").write_bytes(b"no picture")
-    (tmp_path / "capture" / "points.ply").write_text("\n".join(lines) + "\n")
-    monkeypatch.setattr("PIL.Image.open", lambda *_: pytest.fail("a texture is opened"))
-    assert read_points(tmp_path / "capture" / "points.ply").xyz.shape == (3, 3)
