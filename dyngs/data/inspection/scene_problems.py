@@ -108,7 +108,7 @@ def _point_problems(xyz: np.ndarray, views: list[View]) -> list[str]:
         problems.append(f"{1 - seen.mean():.0%} of the points are in no camera's view")
     if blind and seen.mean() >= 0.5:
         problems.append(
-            f"{len(blind)} of {min(len(views), MAX_VIEWS)} cameras see none of the points, one '{min(blind)}'"
+            f"{len(blind)} of {min(len(views), MAX_VIEWS)} cameras see none of the points, first '{min(blind)}'"
         )
     distance = np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)
     far = distance > 50 * max(float(np.median(distance)), 1e-12)

@@ -42,8 +42,8 @@ OVERLAPPING = 4
 """and with so many others that share most of what they see."""
 MAX_TURN = 45.0
 """Degrees between the optical axes beyond which pictures are not matched for their overlap: SIFT does not."""
-MAX_ERROR = 2.0
-"""Mean reprojection error of a track over a clip, px of pictures of at most ``LONGEST_SIDE``; what moves has more."""
+MAX_ERROR, PRECISION = 0.002, 1.0
+"""Mean reprojection error of a track over a clip: in longer sides of the picture, and in px, which SIFT needs."""
 GREY = 0.5
 """Background of pictures with alpha."""
 _PROBES = 4000
@@ -154,7 +154,8 @@ def _triangulated(
     _find_and_match(database, images, names, pairs)
     posed = _posed(database, dict(zip(names, pictures, strict=True)))
     found = pycolmap.triangulate_points(posed, database, images, model, clear_points=True)
-    largest = math.inf if pairs is None else MAX_ERROR
+    side = max(max(picture.cameras.width, picture.cameras.height) for picture in pictures)
+    largest = math.inf if pairs is None else max(MAX_ERROR * side, PRECISION)
     tracks = (point for point in found.points3D.values() if point.track.length() >= MIN_PICTURES)
     points = [point for point in tracks if point.error <= largest]
     if len(points) < MIN_POINTS:

@@ -7,14 +7,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from room_surfaces import distances_to_surface
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import View
-from dyngs.data.prepare.triangulate import triangulated_points, views_of_a_moment
+from dyngs.data.geometry.projection import projected
+from dyngs.data.loader import PictureLoader
+from dyngs.data.prepare.triangulate import (
+    OVERLAPPING,
+    TIME_STEPS,
+    clip_pairs,
+    points_over_clip,
+    triangulated_points,
+    views_of_a_moment,
+)
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.errors import DyngsError
+from dyngs.files.write import write_image
 
 
 @pytest.fixture(scope="module")
@@ -89,3 +100,41 @@ def test_the_moment_is_the_middle_one_of_those_with_most_views(room: DataConfig)
 def test_without_times_the_views_are_evenly_chosen(room: DataConfig) -> None:
     views = [replace(view, time=None, name=str(i)) for i, view in enumerate((train_views(room) * 2)[:12])]
     assert [view.name for view in views_of_a_moment(views, 4)] == ["0", "3", "6", "9"]
+
+
+def test_over_a_clip_what_stands_has_points_and_what_moves_has_none(room: DataConfig, tmp_path: Path) -> None:
+    """One camera, at another place at each time; a patch that moves about violates the poses."""
+    patch = np.kron(np.random.default_rng(0).random((12, 12, 3)), np.ones((4, 4, 1)))
+    corners = [(8, 100), (90, 20), (40, 60), (100, 110), (20, 30), (70, 90), (55, 10), (30, 70)]
+    views = []
+    for i, view in enumerate(train_views(room)):
+        pixels = PictureLoader([view])[0].composite(torch.zeros(3)).numpy().copy()
+        x, y = corners[i]
+        pixels[y : y + 48, x : x + 48] = patch
+        path = tmp_path / f"{i}.png"
+        write_image(path, (255 * pixels).round().astype(np.uint8))
+        views.append(replace(view, name=str(i), image_path=path, time=i / 7))
+    found = points_over_clip(views[::-1], room)
+    assert found is not None
+    distances = distances_to_surface(found.xyz, views, 0.0)
+    assert np.median(distances) < 0.05
+    assert np.mean(distances < 0.1) > 0.7
+    on_patch = np.zeros(len(found.xyz))
+    for view, corner in zip(views, corners, strict=False):
+        places, inside = projected(found.xyz, view)
+        offset = 160 * places - corner
+        on_patch += inside & (offset > 4).all(axis=1) & (offset < 44).all(axis=1)
+    assert (on_patch >= len(views) - 2).mean() < 0.05
+    again = points_over_clip(views, room)
+    assert again is not None
+    np.testing.assert_array_equal(again.xyz, found.xyz)
+
+
+def test_pairs_of_a_clip_are_bounded(room: DataConfig) -> None:
+    """Near in time, or of overlapping pictures; and none twice."""
+    views = train_views(room)
+    few = [replace(views[i % len(views)], time=i / 5) for i in range(6)]
+    assert {(0, 1), (0, 2), (0, 4), (1, 5)} <= set(clip_pairs(few)) <= {(i, j) for j in range(6) for i in range(j)}
+    many = [replace(views[i % len(views)], time=i / 39) for i in range(40)]
+    pairs = clip_pairs(many)
+    assert len(set(pairs)) == len(pairs) <= 40 * (len(TIME_STEPS) + OVERLAPPING)
