@@ -39,9 +39,10 @@ from dyngs.data.inspection.scene_problems import before_training
 from dyngs.data.loader import PictureLoader
 from dyngs.data.prepare.first_points import with_first_points
 from dyngs.data.read import read_capture
+from dyngs.deform.given_masks import moving_share_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors, cameras_in_place, still_errors, views_to_compare
-from dyngs.deform.training import DynamicTraining, TrainingViews
+from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import texel_gaussians
@@ -65,6 +66,8 @@ from dyngs.training.background import background_colour, evaluation_background
 from dyngs.training.limits import within_cap
 from dyngs.training.loop import Trainable
 from dyngs.training.prediction import assemble_network
+from dyngs.training.priors.find import used_priors
+from dyngs.training.priors.used import UsedPriors
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.schedule import (
     deform_schedule,
@@ -130,7 +133,10 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
     start = StartValues.for_strategy(config.strategy)  # a run may begin with more Gaussians than it may end with
     config = within_cap(config, len(set(training_times(capture))))
     generator = torch.Generator().manual_seed(config.run.seed)
-    pictures = PictureLoader(capture.splits["train"], config.data)
+    pictures = PictureLoader(capture.splits["train"], config.data, with_maps=True)
+    priors = _priors(config, capture, pictures)
+    if not priors.masks:
+        pictures = pictures.without_motion_masks()
     first = _first(config, start, capture, pictures, generator)
     background, extent = resolved_background(config, capture), surroundings(capture).extent
     optimizer = GaussianOptimizer(first.scene.gaussians, config.optim)
@@ -157,7 +163,19 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         has_test_views=bool(capture.splits.get("test")),
         generator=generator,
         held_out=held_out_views(capture.splits["train"], config.train.hold_out_every),
+        priors=priors,
     )
+
+
+def _priors(config: Config, capture: Capture, pictures: PictureLoader) -> UsedPriors:
+    """Return the priors of the capture that are used; none for people, whose poses say how they move."""
+    match config.model:
+        case StaticModel():
+            return used_priors(config, capture, pictures, moves=False)
+        case DynamicModel():
+            return used_priors(config, capture, pictures, moves=len(set(training_times(capture))) > 1)
+        case _:
+            return UsedPriors()
 
 
 def restored_scene(checkpoint: Checkpoint, model: SceneModel) -> Scene:
@@ -292,6 +310,10 @@ def _training_views(
 
     def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
         shown = [pictures[i].shrunk(divisor) for i in looked_at]
+        if any(picture.moves is not None for picture in shown):
+            return moving_share_of(
+                gaussians_at, shown, _training_options(config), SURELY_MOVING * model.motion_threshold
+            )
         network = colours.network
         shader = (lambda time: None) if network is None else network.shader
         return still_errors(gaussians_at, shown, _training_options(config), background, shader)

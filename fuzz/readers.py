@@ -87,7 +87,9 @@ def read_whole_capture(root: Path) -> object:
     if capture.tracks_path is not None:
         found.append(read_tracks(capture.tracks_path))
     loader = PictureLoader(views, options, with_maps=True)
-    found += [loader[i] for i in range(min(len(loader), 2))]
+    pictures = [loader[i] for i in range(min(len(loader), 2))]
+    # NaN in flow means unknown.
+    found += [p if p.flow is None else replace(p, flow=p.flow.nan_to_num(0.0)) for p in pictures]
     return found
 
 

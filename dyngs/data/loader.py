@@ -193,6 +193,13 @@ class PictureLoader:
             flow=decoded.flow,
         )
 
+    def without_motion_masks(self) -> PictureLoader:
+        """Return a loader of the same pictures that reads no motion masks."""
+        if all(view.motion_mask_path is None for view in self._views):
+            return self
+        views = [replace(view, motion_mask_path=None) for view in self._views]
+        return PictureLoader(views, self._options, with_maps=self._with_maps)
+
     @property
     def cached_bytes(self) -> int:
         """Bytes of memory that cached pictures take."""

@@ -29,7 +29,7 @@ class StepReport:
         loss: regularizers included.
         picture: what was trained on.
         rendered, truth: (H, W, 3) on the same background.
-        finding: a line about what was found out after the step, or None.
+        finding: lines about what was found out after the step, or None.
     """
 
     step: int

@@ -105,8 +105,8 @@ class Loop:
         self.tell(Started(self.trainer.done, self.total))
         while self.trainer.done < self.total and not is_stopped():
             report = self._step()
-            if report.finding is not None:
-                self.tell(Message(f"step {report.step}: {report.finding}"))
+            for line in (report.finding or "").splitlines():
+                self.tell(Message(f"step {report.step}: {line}"))
             self.tell(StepDone(report, self))
 
     def _step(self) -> StepReport:

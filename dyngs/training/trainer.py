@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -27,6 +27,7 @@ from dyngs.static.fixed import FixedDensifier
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.training.background import background_colour
 from dyngs.training.events import StepReport
+from dyngs.training.priors.used import StepView, UsedPriors
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.schedule import active_sh_degree, hold_out_until, means_rate, picture_divisor, rates_of
 from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
@@ -43,6 +44,7 @@ class Trainer:
         options: how training pictures are drawn.
         background: "white", "black" or "random" (a new colour in each step, behind render and truth alike).
         generator: the only source of randomness, on the CPU.
+        priors: what the user knows about the capture.
         done: steps done.
         bad_gradients: how often a Gaussian was left out of a step because its gradient was not finite.
         held_out: indices of the views that are not trained on up to ``train.hold_out_until``.
@@ -62,6 +64,7 @@ class Trainer:
     world_offset: tuple[float, float, float]
     has_test_views: bool
     generator: torch.Generator
+    priors: UsedPriors = field(default_factory=UsedPriors)
     done: int = 0
     bad_gradients: int = 0
     held_out: frozenset[int] = frozenset()
@@ -93,14 +96,15 @@ class Trainer:
         )
         if scene.num_moving:
             _require_finite(moment.gaussians, step, picture, self.training.moves_by)
-        rendering = scene.render(
-            picture.cameras, moment, options=self._options(step), background=background, probe=probe
-        )
+        options = self.priors.options(self._options(step), picture)
+        rendering = scene.render(picture.cameras, moment, options=options, background=background, probe=probe)
         rendered, truth = rendering.rgb[0], picture.composite(background)
         terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
         if config.train.alpha_weight > 0 and picture.alpha is not None:
             terms["alpha"] = config.train.alpha_weight * (rendering.alpha[0] - picture.alpha).abs().mean()
         terms |= moment.penalties
+        view = StepView(index, lambda time: self.training.trains_on(time, step), options)
+        terms |= self.priors.terms(scene, picture, rendering, view, self.generator)
         terms |= self.densifier.regularizers(scene.gaussians) | self.colours.penalties(scene.gaussians)
         loss = _finite_sum(terms, step, picture)
         sum(terms.values(), torch.zeros((), device=scene.gaussians.means.device)).backward()
@@ -184,7 +188,7 @@ class Trainer:
         self.done = step
         finding = self._drop_harmonics(step)
         self.scene.changed()
-        return finding
+        return self.priors.told(finding)
 
     def _apply(self, result: EditResult) -> None:
         """Change the set of Gaussians, and everything that is stored per Gaussian with it."""

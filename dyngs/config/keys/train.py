@@ -28,6 +28,20 @@ class TrainConfig(Section):
     alpha_weight: float = Field(
         default=0.0, ge=0, description="weight of the mean error of alpha, where pictures have alpha"
     )
+    depth_weight: float = Field(
+        default=0.1, ge=0, description="weight of the error against depth maps, where the capture has any; 0: not used"
+    )
+    flow_weight: float = Field(
+        default=1.0,
+        ge=0,
+        description="weight of the error against optical flow, where there is any; 0: not used",
+    )
+    tracks_weight: float = Field(
+        default=1.0, ge=0, description="weight of the error against 2D tracks, where the capture has any; 0: not used"
+    )
+    motion_masks: bool = Field(
+        default=True, description="let motion masks say what moves, where the capture has any and they fit its pictures"
+    )
     sh_every: int = Field(
         default=1000,
         ge=1,

@@ -1,0 +1,178 @@
+"""From a capture and its pictures to the priors that are used: each is compared with the pictures first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from dyngs.config import Config
+from dyngs.data.capture import Capture, View, all_views
+from dyngs.data.loader import PictureLoader
+from dyngs.data.pictures.lens import undistorted_points
+from dyngs.data.tracks import Tracks, read_tracks
+from dyngs.training.priors.agreement import (
+    Agreement,
+    depth_agreement,
+    distance_to_scene,
+    flow_agreement,
+    mask_agreement,
+    spread_pairs,
+    track_agreement,
+)
+from dyngs.training.priors.depth_maps import Kind
+from dyngs.training.priors.point_motion import Glance
+from dyngs.training.priors.used import MIN_POINTS, PointTracks, UsedPriors
+from dyngs.training.views import training_cameras
+
+_NEAR_TIME = 0.1
+"""Depth is judged by pictures whose times differ by less; the less, the less has moved."""
+_BASELINE = 0.1
+"""Best distance between the cameras of two pictures for that, as a share of their distance from the scene."""
+
+
+def used_priors(config: Config, capture: Capture, pictures: PictureLoader, *, moves: bool) -> UsedPriors:
+    """Return the priors of a capture that agree with its pictures; nothing is read where it has none.
+
+    Args:
+        config: whose weights of 0 leave a prior out.
+        capture: of the run.
+        pictures: of its training views, with maps.
+        moves: whether anything may move in the model: without that, depth alone is of use.
+
+    Raises:
+        DyngsError: a file that is damaged.
+    """
+    options, views, lines = config.train, pictures.views, list[str]()
+    weights = {"depth": options.depth_weight, "flow": options.flow_weight, "tracks": options.tracks_weight}
+    kind: Kind | None = None
+    flow_to: dict[int, Glance] = {}
+    tracks: PointTracks | None = None
+    if options.depth_weight > 0 and any(view.depth_path for view in views):
+        kind, agreement = _judged_depth(config, pictures)
+        lines.append(_line(f"depth maps (aligned in {_NAMES[kind]})", agreement, "one depth for a whole picture"))
+        kind = kind if agreement.holds else None
+    if moves and options.flow_weight > 0 and any(view.flow_path for view in views):
+        flow_to, agreement = _judged_flow(config, capture, pictures)
+        lines.append(_line("optical flow", agreement, "no motion, its reverse or flow of other places"))
+        flow_to = flow_to if agreement.holds else {}
+    if moves and options.tracks_weight > 0 and capture.tracks_path is not None:
+        tracks, agreement = _judged_tracks(config, read_tracks(capture.tracks_path), pictures)
+        lines.append(_line("tracks", agreement, "tracks at random"))
+        tracks = tracks if agreement.holds else None
+    masks = moves and options.motion_masks and any(view.motion_mask_path for view in views)
+    if masks:
+        agreement = _judged_masks(config, pictures)
+        lines.append(_line("motion masks", agreement, "the same masks the other way round"))
+        masks = agreement.holds
+    return UsedPriors(kind, flow_to, tracks, masks, weights, lines)
+
+
+_NAMES: dict[Kind, str] = {"depth": "depth", "inverse": "inverse depth"}
+
+
+def _line(what: str, found: Agreement, substitute: str) -> str:
+    if not found.pairs:
+        return f"{what}: ignored, no two training pictures can be compared by them"
+    verdict = "used" if found.holds else "ignored, they disagree with the pictures"
+    errors = f"error {found.error:.4f} in {found.pairs} pairs of pictures, {found.without:.4f} by {substitute}"
+    return f"{what}: {verdict} ({errors})"
+
+
+def _judged_depth(config: Config, pictures: PictureLoader) -> tuple[Kind, Agreement]:
+    views = pictures.views
+    cameras = training_cameras(views, config.data)
+    distance = distance_to_scene(cameras)
+    if distance is None:
+        return "depth", Agreement(0.0, 0.0, 0)
+    centers = torch.cat([c.centers for c in cameras])
+    times = torch.tensor([view.time or 0.0 for view in views], device="cpu")
+    triples = []
+    for i in spread_pairs([i for i, view in enumerate(views) if view.depth_path]):
+        apart = (centers - centers[i]).norm(dim=1) / distance
+        usable = (apart > 0.2 * _BASELINE) & (apart < 5 * _BASELINE) & ((times - times[i]).abs() < _NEAR_TIME)
+        cost = (apart / _BASELINE).log().abs() + (times - times[i]).abs() / _NEAR_TIME
+        nearest = [int(j) for j in cost.argsort() if usable[j]][:2]
+        if len(nearest) == 2:
+            triples.append(tuple(pictures[j] for j in (i, *nearest)))
+    return depth_agreement(triples, distance)
+
+
+def _judged_masks(config: Config, pictures: PictureLoader) -> Agreement:
+    """Compare each of some pictures with the one from the nearest camera at another, not the next, time."""
+    views = pictures.views
+    cameras = training_cameras(views, config.data)
+    centers = torch.cat([c.centers for c in cameras])
+    times = torch.tensor([view.time or 0.0 for view in views], device="cpu")
+    distance = distance_to_scene(cameras) or float((centers - centers.mean(0)).norm(dim=1).max())
+    pairs = []
+    for i in spread_pairs([i for i, view in enumerate(views) if view.motion_mask_path]):
+        apart = (times - times[i]).abs()
+        cost = (centers - centers[i]).norm(dim=1) / max(distance, 1e-9) + (apart - _NEAR_TIME).abs()
+        other = int(torch.where(apart > 0, cost, torch.inf).argmin())
+        if other != i:
+            pairs.append((pictures[i], pictures[other]))
+    return mask_agreement(pairs, distance)
+
+
+def _judged_flow(config: Config, capture: Capture, pictures: PictureLoader) -> tuple[dict[int, Glance], Agreement]:
+    named = {view.name: view for view in all_views(capture.splits)}
+    place = {view.name: i for i, view in enumerate(pictures.views)}
+    flow_to = {
+        i: _glance(named[view.flow_to], config)
+        for i, view in enumerate(pictures.views)
+        if view.flow_path is not None and view.flow_to in named and view.time is not None
+    }
+    seen = [i for i in flow_to if pictures.views[i].flow_to in place]
+    pairs = [(pictures[i], pictures[place[pictures.views[i].flow_to or ""]]) for i in spread_pairs(seen)]
+    return flow_to, flow_agreement(pairs)
+
+
+def _judged_tracks(config: Config, tracks: Tracks, pictures: PictureLoader) -> tuple[PointTracks, Agreement]:
+    points = _point_tracks(config, tracks, pictures.views)
+    pairs = []
+    order = sorted(range(len(pictures)), key=lambda i: (points.glances[i].time, i))
+    seen = [i for i in order if bool(points.visible[i].any())]
+    for i, j in _shared_pairs(points, seen):
+        both = points.visible[i] & points.visible[j]
+        pairs.append((pictures[i], pictures[j], points.xy[i][both], points.xy[j][both]))
+    return points, track_agreement(pairs)
+
+
+def _shared_pairs(points: PointTracks, seen: Sequence[int]) -> list[tuple[int, int]]:
+    """Return views, evenly chosen, each with the next one of another time that shares points with it."""
+    pairs = []
+    for at in spread_pairs(range(len(seen))):
+        i = seen[at]
+        for j in seen[at + 1 :]:
+            later = points.glances[j].time > points.glances[i].time
+            if later and int((points.visible[i] & points.visible[j]).sum()) >= MIN_POINTS:
+                pairs.append((i, j))
+                break
+    return pairs
+
+
+def _point_tracks(config: Config, tracks: Tracks, views: Sequence[View]) -> PointTracks:
+    """Return tracks in the px of training pictures, undistorted; what cannot be undistorted is not visible."""
+    rows, (_, count) = tracks.rows_of(views), tracks.visible.shape
+    xy = torch.zeros(len(views), count, 2, device="cpu")
+    visible = torch.zeros(len(views), count, dtype=torch.bool, device="cpu")
+    glances = [_glance(view, config) for view in views]
+    for i, view in enumerate(views):
+        row = rows.get(view.name)
+        if row is None or view.time is None:
+            continue
+        stored = torch.from_numpy(np.ascontiguousarray(tracks.xy[row]))
+        cameras = glances[i].cameras
+        size = stored.new_tensor([cameras.width / view.width, cameras.height / view.height])
+        places = undistorted_points(view.lens, view.intrinsics, stored) * size
+        good = places.isfinite().all(1) & (places >= 0).all(1)
+        good &= (places[:, 0] <= cameras.width) & (places[:, 1] <= cameras.height)
+        xy[i] = torch.where(good[:, None], places, 0.0)
+        visible[i] = torch.from_numpy(np.ascontiguousarray(tracks.visible[row])) & good
+    return PointTracks(xy, visible, glances)
+
+
+def _glance(view: View, config: Config) -> Glance:
+    return Glance(training_cameras([view], config.data)[0], view.time or 0.0)

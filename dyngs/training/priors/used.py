@@ -1,0 +1,162 @@
+"""The priors that a run uses: what they need to be drawn, and their losses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.data.loader import Picture
+from dyngs.rendering import Rendering, RenderOptions
+from dyngs.scene import Scene
+from dyngs.training.priors.depth_maps import Kind, depth_error
+from dyngs.training.priors.point_motion import Glance, displacements, flow_error, track_error
+
+MIN_POINTS = 4
+"""Fewest points that two pictures must share for their tracks to be compared."""
+_NEAREST = 8
+"""The other picture of tracks is one of so many nearest in time."""
+
+
+@dataclass(frozen=True)
+class PointTracks:
+    """2D tracks in the training pictures.
+
+    Attributes:
+        xy: (V, P, 2) px of the full training pictures.
+        visible: (V, P) bool; a view without tracks has none.
+        glances: camera and time of the V views.
+    """
+
+    xy: Tensor
+    visible: Tensor
+    glances: Sequence[Glance]
+
+    def pair(
+        self, index: int, may_use: Callable[[float], bool], generator: torch.Generator
+    ) -> tuple[Glance, Tensor, Tensor] | None:
+        """Return another view at random among the nearest in time, and P' points here and there; None: there is none.
+
+        Args:
+            index: of this view.
+            may_use: whether a time may be looked at.
+            generator: chooses.
+        """
+        now = self.glances[index].time
+        shared = (self.visible & self.visible[index]).sum(1)
+        others = [
+            i
+            for i, glance in enumerate(self.glances)
+            if i != index and glance.time != now and int(shared[i]) >= MIN_POINTS and may_use(glance.time)
+        ]
+        if not others:
+            return None
+        nearest = sorted(others, key=lambda i: (abs(self.glances[i].time - now), i))[:_NEAREST]
+        other = nearest[int(torch.randint(len(nearest), (), generator=generator, device="cpu"))]
+        both = self.visible[index] & self.visible[other]
+        return self.glances[other], self.xy[index][both], self.xy[other][both]
+
+
+@dataclass(frozen=True)
+class UsedPriors:
+    """Priors that agree with the pictures, with their weights.
+
+    Attributes:
+        depth: what the depth maps are affine in; None: none are used.
+        flow_to: by training view, the camera and time that its flow leads to; empty: no flow is used.
+        tracks: None: none are used.
+        masks: whether motion masks say what may move.
+        weights: of the loss terms "depth", "flow" and "tracks".
+        lines: what was found, for people, told once; whoever tells them removes them.
+    """
+
+    depth: Kind | None = None
+    flow_to: Mapping[int, Glance] = field(default_factory=dict)
+    tracks: PointTracks | None = None
+    masks: bool = False
+    weights: Mapping[str, float] = field(default_factory=dict)
+    lines: list[str] = field(default_factory=list)
+
+    def options(self, options: RenderOptions, picture: Picture) -> RenderOptions:
+        """Return how a picture is drawn: with depth where it has a map that is used."""
+        return options if self.depth is None or picture.depth is None else replace(options, depth="expected")
+
+    def told(self, finding: str | None) -> str | None:
+        """Return the lines that have not been told yet, then ``finding``, and forget them; None: there are none."""
+        lines = [*self.lines, *([] if finding is None else [finding])]
+        self.lines.clear()
+        return "\n".join(lines) or None
+
+    def terms(
+        self, scene: Scene, picture: Picture, rendering: Rendering, view: StepView, generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """Return the weighted losses by name.
+
+        Args:
+            scene: what is trained.
+            picture: a training picture, perhaps shrunk.
+            rendering: of the scene, with ``options``.
+            view: which view that is, and what may be looked at.
+            generator: chooses the other picture of tracks.
+        """
+        found: dict[str, Tensor | None] = {}
+        if self.depth is not None and picture.depth is not None and rendering.depth is not None:
+            drawn, alpha = rendering.depth[0], rendering.alpha[0]
+            found["depth"] = depth_error(drawn, alpha, picture.depth, self.depth, picture.mask)
+        if not scene.is_still and picture.time is not None:
+            found |= self._motion(scene, picture, view, generator)
+        return {name: self.weights[name] * x for name, x in found.items() if x is not None}
+
+    def _motion(
+        self, scene: Scene, picture: Picture, view: StepView, generator: torch.Generator
+    ) -> dict[str, Tensor | None]:
+        target = self.flow_to.get(view.index)
+        by_flow = target is not None and picture.flow is not None and view.may_use(target.time)
+        pair = None if self.tracks is None else self.tracks.pair(view.index, view.may_use, generator)
+        if not by_flow and pair is None:
+            return {}
+        canonical = scene.with_gaussians(scene.gaussians.detach())
+        start, here = canonical.moment(picture.time).gaussians, picture.cameras
+
+        def drawn(glance: Glance) -> Tensor:
+            there = _sized_as(here, glance.cameras)
+            return displacements(start, canonical.moment(glance.time).gaussians, here, there, view.options)
+
+        found: dict[str, Tensor | None] = {}
+        if by_flow and target is not None:
+            found["flow"] = flow_error(drawn(target), picture)
+        if pair is not None and self.tracks is not None:
+            glance, begin, end = pair
+            own = self.tracks.glances[view.index].cameras
+            begin, end = (x * _scale(cameras, here) for x, cameras in ((begin, own), (end, glance.cameras)))
+            found["tracks"] = track_error(drawn(glance), begin, end)
+        return found
+
+
+@dataclass(frozen=True)
+class StepView:
+    """A training view in a step.
+
+    Attributes:
+        index: among the training views.
+        may_use: whether a time may be looked at in this step.
+        options: how pictures are drawn.
+    """
+
+    index: int
+    may_use: Callable[[float], bool]
+    options: RenderOptions
+
+
+def _scale(cameras: Cameras, here: Cameras) -> Tensor:
+    """Return the (2,) factors from px of one camera's pictures to those of another."""
+    return here.intrinsics.new_tensor([here.width / cameras.width, here.height / cameras.height])
+
+
+def _sized_as(here: Cameras, cameras: Cameras) -> Cameras:
+    """Return ``cameras`` for pictures as large as those of ``here``."""
+    scale = torch.cat([_scale(cameras, here), here.intrinsics.new_ones(1)])
+    return Cameras(cameras.cam_from_world, scale[:, None] * cameras.intrinsics, here.width, here.height)
