@@ -8,6 +8,7 @@ import torch
 from tiny_captures import edit_json, random_pixels, write_frames, write_picture
 
 from dyngs.config import DataConfig
+from dyngs.data.inspection.report import format_report, inspect_capture
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
@@ -111,3 +112,8 @@ def test_instance_masks_mean_that_everything_labelled_moves(tmp_path: Path) -> N
     moves = loaded(tmp_path)[0].moves
     assert moves is not None
     assert int(moves.sum()) == 95
+
+
+def test_inspection_counts_them(tmp_path: Path) -> None:
+    report = format_report(inspect_capture(DataConfig(root=with_priors(tmp_path), test_every=0)))
+    assert "3 depth maps, 3 motion masks, 3 flow fields, 1 file of tracks" in report

@@ -31,6 +31,7 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         ("lens", counted(lenses)),
         ("alpha", "transparent background" if capture.has_alpha else "none"),
         ("masks", str(sum(view.mask_path is not None for view in views))),
+        *_prior_facts(capture),
         *_time_facts(capture),
         ("points", _points(capture)),
     ]
@@ -52,6 +53,20 @@ def _points(capture: Capture) -> str:
     if capture.points is None:
         return "none"
     return str(len(capture.points.xyz)) + ("" if capture.points_file is None else f" ({capture.points_file.name})")
+
+
+def _prior_facts(capture: Capture) -> Iterator[tuple[str, str]]:
+    """Yield how many views have which priors; nothing where there are none."""
+    views = all_views(capture.splits)
+    counts = {
+        "depth maps": sum(view.depth_path is not None for view in views),
+        "motion masks": sum(view.motion_mask_path is not None for view in views),
+        "flow fields": sum(view.flow_path is not None for view in views),
+        "file of tracks": int(capture.tracks_path is not None),
+    }
+    found = [f"{count} {what}" for what, count in counts.items() if count]
+    if found:
+        yield "priors", ", ".join(found)
 
 
 def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
