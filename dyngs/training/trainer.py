@@ -103,7 +103,8 @@ class Trainer:
         if config.train.alpha_weight > 0 and picture.alpha is not None:
             terms["alpha"] = config.train.alpha_weight * (rendering.alpha[0] - picture.alpha).abs().mean()
         terms |= moment.penalties
-        view = StepView(index, lambda time: self.training.trains_on(time, step), options)
+        first, last = self.training.window(step)
+        view = StepView(index, lambda time: first <= time <= last, options)
         terms |= self.priors.terms(scene, picture, rendering, view, self.generator)
         terms |= self.densifier.regularizers(scene.gaussians) | self.colours.penalties(scene.gaussians)
         loss = _finite_sum(terms, step, picture)
