@@ -62,8 +62,8 @@ JOBS = {
     "static": f"{STATIC} run.dir=OUT",
     "dynamic": f"{DYNAMIC} run.dir=OUT",
     "small file": f"{STATIC} run.dir=OUT train.steps=4 budget.max_mb=0.02",
-    "prune": "prune whole --out OUT --prune 0.5 --max-loss 100 --steps 6 --threads 1 train.save_every=2",
-    "prune dynamic": "prune whole_moving --out OUT --prune 0.5 --max-loss 100 --masks 3 --steps 4 --threads 1",
+    "prune": "prune whole --out OUT --prune 0.5 --steps 6 --threads 1 train.save_every=2",
+    "prune dynamic": "prune whole_moving --out OUT --prune 0.5 --masks 3 --steps 4 --threads 1",
     "export": "export whole --format dyngs --out OUT",
 }
 SOURCES = {

@@ -75,6 +75,7 @@ from dyngs.training.schedule import (
     filter_steps,
     grad_threshold,
     growth_per_change,
+    hold_out_until,
     picture_divisor,
     rates_of,
 )
@@ -163,6 +164,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         has_test_views=bool(capture.splits.get("test")),
         generator=generator,
         held_out=held_out_views(capture.splits["train"], config.train.hold_out_every),
+        held_out_until=hold_out_until(config.train),
         priors=priors,
     )
 

@@ -47,7 +47,7 @@ NOT_RUN = {
     "bench": "takes half a minute; tests/bench runs it on less",
     "data sfm": "needs photos with something to match; tests/data/prepare/test_sfm.py has some",
     "predict": "needs a trained network; tests/cli/test_predict.py has one",
-    "prune": "fine-tunes 2,000 steps; tests/cli/test_prune.py does it with fewer",
+    "prune": "fine-tunes a dozen candidates; tests/cli/test_prune.py does it with fewer steps",
     "tradeoff": "measures dozens of variants; tests/cli/test_tradeoff.py does it with fewer",
 }
 """Commands that are only parsed, with the reason."""

@@ -1,55 +1,64 @@
-"""Pruning of a finished run into a smaller one, and a comparison of the two."""
+"""Pruning of a finished run into a smaller one: by a share that is given, or as far as a loss allows."""
 
 from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean, median
-
-import torch
 
 from dyngs.api.train import num_cores, train
-from dyngs.config import PruneConfig
+from dyngs.build import assemble
+from dyngs.config import Config, PruneConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.config.kinds import network_of
-from dyngs.data.capture import Capture
-from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import Picture, PictureLoader
-from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.evaluate.report import parameter_megabytes, render_options, scene_of_split, split_views
-from dyngs.evaluate.temporal import Drawing
-from dyngs.metrics import psnr
+from dyngs.export.scene_file import write_scene_file
+from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
-from dyngs.runs.checkpoint import TIMING_NAME, Checkpoint, LoadedRun, latest_checkpoint, load_run, save_checkpoint
-from dyngs.runs.folder import new_folder, require_empty
+from dyngs.prune.search import Limit, Search, Stored
+from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, latest_checkpoint, save_checkpoint, seconds_at
+from dyngs.runs.folder import EXPORT_FOLDER, new_folder, require_empty
 from dyngs.runs.log import LOG_NAME
-from dyngs.training.background import evaluation_background
+from dyngs.storage.file import write_scene
+from dyngs.training.state import Checkpoint
 
-COMPARED_VIEWS = 20
-"""Number of views compared per split; enough for before and after, not for a benchmark."""
-ROUNDS = 3
+SEARCH_STEPS = 1000
+"""Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise."""
 
 
 @dataclass(frozen=True)
-class Cost:
-    """Quality, size and speed of a run.
+class Promise:
+    """Result of pruning for a given loss.
 
     Attributes:
-        num_gaussians: N.
-        psnr_train, psnr_test: means over at most 20 views, dB; None without such a split.
-        fps: one over the median time of drawing a view, deformation included.
-        megabytes: float32 parameters, the field and masks, in 1e6 bytes.
+        folder: of the new run; its file is in ``EXPORT_FOLDER`` there.
+        asked: largest loss on the views held out, dB.
+        before: mean PSNR on the views held out of the run as it is, fine-tuned as long as what is compared with it.
+        after: that of the file.
+        cut: what was taken away, for people; "nothing" where nothing could be.
+        limits: why no more was.
+        num_held_out, trials: number of views held out, and of candidates that were fine-tuned.
     """
 
-    num_gaussians: int
-    psnr_train: float | None
-    psnr_test: float | None
-    fps: float
-    megabytes: float
+    folder: Path
+    asked: float
+    before: float
+    after: float
+    cut: str
+    limits: tuple[Limit, ...]
+    num_held_out: int
+    trials: int
+
+    def __str__(self) -> str:
+        views = f"{self.num_held_out} training views held out" if self.num_held_out else "its only training view"
+        kept = f"{self.after - self.before:+.2f} dB on {views}, drawn from the file ({self.asked:g} dB may be lost)"
+        if self.cut == "nothing":
+            told = f"nothing can be taken away for {self.asked:g} dB: the run is as it was; {kept}"
+        else:
+            told = f"taken away: {self.cut}; {kept}; {self.trials} trials"
+        return "\n".join([told, *(f"limit: {limit}" for limit in self.limits)])
 
 
 def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
@@ -66,66 +75,91 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
     """
     require_empty(out)
     start = latest_checkpoint(run_dir)
-    step = start.info.step
-    defaults = [f"prune.{key}={value}" for key, value in PruneConfig().model_dump().items()]
-    done = [f"train.steps={step}", "budget.max_minutes=null", f"run.dir={out}"]
-    config = load_resolved(run_dir, [*done, *defaults, *overrides])
-    if network_of(config) is not None:
-        raise DyngsError(f"{run_dir}: a network, not a scene; prune what it predicts")
+    config = _config_from(run_dir, start, out, overrides)
     if not config.prune.is_wanted:
         raise DyngsError("nothing to do: give a share to --prune, or key times to --masks")
     with new_folder(out) as started:
-        _copy_start(run_dir, start, started)
+        _copy_start(run_dir, started)
+        save_checkpoint(started, start, 0.0)
         save_config(config, started / RESOLVED_NAME)
-    return train(config, resume_from=out)
+    train(config, resume_from=out)
+    write_scene_file(out, file_of(out))
+    return out
 
 
-def _copy_start(run_dir: Path, checkpoint: Checkpoint, folder: Path) -> None:
-    """Copy the last checkpoint, the training time and the log of a run."""
-    save_checkpoint(folder, checkpoint, 0.0)
+def file_of(folder: Path) -> Path:
+    """Return the folder in a pruned run that holds its file and a configuration to draw it with."""
+    return folder / EXPORT_FOLDER
+
+
+def prune_within(
+    run_dir: Path, out: Path, max_loss: float, overrides: Sequence[str], tell: Callable[[str], None] = print
+) -> Promise:
+    """Take as much from the run in ``run_dir`` as ``max_loss`` allows, and write the rest to ``out``: a run and a file.
+
+    Nothing is written before the end: an interruption leaves nothing behind, and the next call begins anew.
+
+    Args:
+        run_dir: a run with at least one checkpoint; an interrupted one counts as finished there.
+        out: must not exist, or be empty.
+        max_loss: of PSNR on training views held out, after fine-tuning, drawn from the file, dB.
+        overrides: ``prune.steps=N``, ``prune.score``, ``prune.rewind``, ``data.*`` and ``run.threads=N``.
+        tell: is told what is tried and found.
+
+    Raises:
+        DyngsError: no such run, a folder that is taken, a wrong value, a choice that leaves nothing to search.
+    """
+    require_empty(out)
+    start, begun = latest_checkpoint(run_dir), time.perf_counter()
+    config = _config_from(run_dir, start, out, [f"prune.steps={SEARCH_STEPS}", *overrides])
+    if config.prune.is_wanted:
+        raise DyngsError("prune.share and prune.mask_times are chosen with --prune R, which removes just that share")
+    if config.model != load_resolved(run_dir).model:
+        raise DyngsError("model.*: losses are counted from RUN as it is; choose that with --prune R")
+    keep_freed_memory()
+    with kernel_threads(config.run.threads or num_cores()):
+        trainer = assemble(config, restored=True)
+        trainer.restore(start)
+        search = Search(trainer, start, tell)
+        found = search.run(max_loss)
+        stored = search.stored(found, max_loss)
+    with new_folder(out) as started:
+        _copy_start(run_dir, started)
+        _write(started, stored, seconds_at(run_dir, start.info.step) + time.perf_counter() - begun)
+    chosen = stored.candidate
+    return Promise(
+        folder=out,
+        asked=max_loss,
+        before=chosen.psnr + chosen.loss,
+        after=stored.file.quality,
+        cut=str(chosen.cut),
+        limits=(*found.limits, stored.limit),
+        num_held_out=len(found.held_out),
+        trials=found.trials,
+    )
+
+
+def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequence[str]) -> Config:
+    """Return the configuration of a run that goes on from ``start`` in the folder ``out``."""
+    defaults = [f"prune.{key}={value}" for key, value in PruneConfig().model_dump().items()]
+    done = [f"train.steps={start.info.step}", "budget.max_minutes=null", f"run.dir={out}"]
+    config = load_resolved(run_dir, [*done, *defaults, *overrides])
+    if network_of(config) is not None:
+        raise DyngsError(f"{run_dir}: a network, not a scene; prune what it predicts")
+    return config
+
+
+def _copy_start(run_dir: Path, folder: Path) -> None:
+    """Copy the training time and the log of a run."""
     for name in (TIMING_NAME, LOG_NAME):
         if (run_dir / name).is_file():
             shutil.copyfile(run_dir / name, folder / name)
 
 
-def compared(before: Path, after: Path, threads: int = 0) -> tuple[Cost, Cost]:
-    """Return the costs of two runs on one capture; pictures are drawn in turn, so that machine load affects both."""
-    runs = [load_run(folder) for folder in (before, after)]
-    capture = read_capture(runs[0].config.data)
-    with kernel_threads(threads or num_cores()), torch.no_grad():
-        train_psnr = _psnr(runs, capture, "train")
-        test_psnr = _psnr(runs, capture, "test") if capture.splits.get("test") else (None, None)
-        fps = _fps(runs, capture, "test" if capture.splits.get("test") else "train")
-    first, second = (
-        Cost(len(run.scene), train_psnr[i], test_psnr[i], fps[i], parameter_megabytes(run.scene))
-        for i, run in enumerate(runs)
-    )
-    return first, second
-
-
-def _psnr(runs: Sequence[LoadedRun], capture: Capture, split: str) -> tuple[float, float]:
-    values: tuple[list[float], list[float]] = ([], [])
-    for picture, drawings in _views(runs, capture, split):
-        for found, drawing in zip(values, drawings, strict=True):
-            drawn = drawing.picture(picture.cameras, picture.time)
-            found.append(psnr(drawn, picture.composite(drawing.background), picture.mask))
-    return fmean(values[0]), fmean(values[1])
-
-
-def _fps(runs: Sequence[LoadedRun], capture: Capture, split: str) -> tuple[float, float]:
-    seconds: tuple[list[float], list[float]] = ([], [])
-    for picture, drawings in [view for _ in range(ROUNDS) for view in _views(runs, capture, split)]:
-        for found, drawing in zip(seconds, drawings, strict=True):
-            start = time.perf_counter()
-            drawing.picture(picture.cameras, picture.time)
-            found.append(time.perf_counter() - start)
-    return 1 / median(seconds[0]), 1 / median(seconds[1])
-
-
-def _views(runs: Sequence[LoadedRun], capture: Capture, split: str) -> list[tuple[Picture, list[Drawing]]]:
-    """Return some pictures of a split, each with one drawing per run."""
-    config = runs[0].config
-    loader = PictureLoader(split_views(capture, split), config.data)
-    _, colour = evaluation_background(config.data.background, capture.has_alpha)
-    drawings = [Drawing(scene_of_split(r, capture, split), render_options(r.config.model), colour) for r in runs]
-    return [(loader[i], drawings) for i in evenly_spaced(len(loader), COMPARED_VIEWS)]
+def _write(folder: Path, stored: Stored, seconds: float) -> None:
+    """Write the chosen candidate as a run, with its file in a folder of its own."""
+    config = stored.candidate.config
+    save_checkpoint(folder, stored.candidate.checkpoint, seconds)
+    save_config(config, folder / RESOLVED_NAME)
+    write_scene(folder / EXPORT_FOLDER / SCENE_FILE, stored.file.data)
+    save_config(config, folder / EXPORT_FOLDER / RESOLVED_NAME)

@@ -1,4 +1,4 @@
-"""``dyngs prune``: remove the least important Gaussians of a run and fine-tune the rest."""
+"""``dyngs prune``: take from a run as much as a given loss allows, and write a run and its file."""
 
 from __future__ import annotations
 
@@ -7,18 +7,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import threads
+from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dyngs.api.prune import Cost
+    from dyngs.api.prune import Promise
+    from dyngs.evaluate.comparison import Cost
 
+MAX_LOSS = 0.2
 _EPILOG = """\
 examples:
-  dyngs prune runs/dance --out runs/dance_pruned                 the recommended settings
-  dyngs prune runs/dance --out runs/tiny --prune 0.95 --max-loss 20 --steps 5000
-  dyngs prune runs/dance model.alpha_min=0.02 --out runs/fast    fine-tuned for a higher opacity cut-off
-  dyngs train --resume runs/tiny                                 continue an interrupted fine-tuning
+  dyngs prune runs/dance --out runs/dance_pruned                 the most that costs 0.2 dB
+  dyngs prune runs/dance --out runs/tiny --max-loss 1 --steps 2000
+  dyngs prune runs/dance --out runs/fifth --prune 0.8            just this share of the Gaussians, whatever it costs
+  dyngs prune runs/dance model.alpha_min=0.02 --out runs/fast --prune 0.8
+  dyngs train --resume runs/fifth                                continue an interrupted fine-tuning
 
 As a stage of training: dyngs train CONFIG ... prune.share=0.8. All options are explained in docs/prune.md.
 """
@@ -28,67 +32,106 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``prune`` to the commands."""
     parser = commands.add_parser(
         "prune",
-        help="remove the least important Gaussians of a run and fine-tune the rest",
-        description="Remove the Gaussians of a run that contribute least to its pictures and fine-tune the others. "
-        "Writes a new run folder and prints quality, speed and size before and after.",
+        help="take from a run as much as a loss of 0.2 dB allows: a smaller, faster run and its file",
+        description="Remove Gaussians, faint blending, control nodes, pieces of splines, harmonics and precision as "
+        "far as training views that were held out lose no more than --max-loss. Every trial is fine-tuned. Writes a "
+        "new run folder with its file and prints quality, speed and size before and after.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("run_dir", type=Path, metavar="RUN", help="run folder written by `dyngs train`")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN2", help="folder of the new run")
-    parser.add_argument("--prune", default="0.8", metavar="R", help="share to remove, in [0, 1) (default 0.8)")
+    parser.add_argument(
+        "--max-loss",
+        type=_decibels,
+        metavar="DB",
+        help=f"largest loss of PSNR on held-out training views, drawn from the file (default {MAX_LOSS})",
+    )
+    parser.add_argument(
+        "--prune", metavar="R", help="no search: remove just this share of the Gaussians, in [0, 1), and nothing else"
+    )
     parser.add_argument(
         "--score",
         choices=("variation", "sensitivity", "contribution", "temporal"),
         help="importance score of a Gaussian (default sensitivity)",
     )
     parser.add_argument(
-        "--max-loss",
-        metavar="DB",
-        help="remove fewer if PSNR falls by more than this before fine-tuning (default 10)",
+        "--masks", metavar="K", help="no search: number of key times of visibility masks (default: no masks)"
     )
-    parser.add_argument("--masks", metavar="K", help="number of key times of visibility masks (default: no masks)")
-    parser.add_argument("--steps", metavar="N", help="fine-tuning steps (default 2000)")
+    parser.add_argument("--steps", metavar="N", help="fine-tuning steps: of each trial 1000, with --prune 2000")
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="other config keys of the run (docs/cli.md)")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Prune, fine-tune, compare with the run before, and print a table."""
+    """Prune, compare with the run before, and print a table."""
     from rich.console import Console
 
-    from dyngs.api.prune import compared, prune_run
+    from dyngs.api.prune import file_of
+    from dyngs.api.train import num_cores
+    from dyngs.evaluate.comparison import compared
     from dyngs.runs.checkpoint import load_run
 
-    keys = {"prune": "share", "score": "score", "max_loss": "max_loss", "masks": "mask_times", "steps": "steps"}
+    keys = {"prune": "share", "score": "score", "masks": "mask_times", "steps": "steps"}
     asked = {key: getattr(arguments, option) for option, key in keys.items()}
     overrides = [f"prune.{key}={value}" for key, value in asked.items() if value is not None]
     overrides += [f"run.threads={arguments.threads}", *arguments.overrides]
-    folder = prune_run(arguments.run_dir, arguments.out, overrides)
-    before, after = compared(arguments.run_dir, folder, arguments.threads)
-    Console().print(cost_table(before, after))
+    folder, promise = _pruned(arguments, overrides)
+    before, after = compared([arguments.run_dir, file_of(folder)], arguments.threads or num_cores())
+    Console().print(cost_table(before, after, promise))
     pruned = load_run(folder)
     if pruned.config.prune.mask_times > 1 and pruned.scene.masks is None:
         print("note: --masks was ignored; they are for scenes in which a deformation field moves something")
-    print(f"written: {folder}\nnext:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/pictures")
+    print(
+        f"written: {folder}, and the file in {file_of(folder)}\n"
+        f"next:    dyngs eval {folder}\n         dyngs render {file_of(folder)} --out {folder}/pictures"
+    )
     return 0
 
 
-def cost_table(before: Cost, after: Cost) -> Table:
-    """Return a table that compares two runs."""
+def _pruned(arguments: argparse.Namespace, overrides: list[str]) -> tuple[Path, Promise | None]:
+    """Prune as asked for; return the new folder, and what is promised of it where the share was searched for."""
+    from dyngs.api.prune import prune_run, prune_within
+
+    chosen = any(text.startswith(("prune.share=", "prune.mask_times=")) for text in overrides)
+    if chosen and arguments.max_loss is not None:
+        raise DyngsError("--max-loss finds what can go; leave out --prune and --masks, which say it")
+    if chosen:
+        return prune_run(arguments.run_dir, arguments.out, overrides), None
+    most = MAX_LOSS if arguments.max_loss is None else arguments.max_loss
+    promise = prune_within(arguments.run_dir, arguments.out, most, overrides)
+    print(promise)
+    return promise.folder, promise
+
+
+def _decibels(text: str) -> float:
+    value = float(text)
+    if not 0 <= value <= 100:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a number from 0 to 100, dB")
+    return value
+
+
+def cost_table(before: Cost, after: Cost, promise: Promise | None = None) -> Table:
+    """Return a table that compares a run with the file of a pruned one."""
     from rich.table import Table
 
-    table = Table("", "before", "after", "")
+    table = Table("", "before", "after, from the file", "")
     ratio = before.num_gaussians / after.num_gaussians
     table.add_row("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", f"{ratio:.1f} times fewer")
-    for label, old, new in (
+    rows = [
         ("PSNR, training views", before.psnr_train, after.psnr_train),
         ("PSNR, held-out views", before.psnr_test, after.psnr_test),
-    ):
+    ]
+    if promise is not None:
+        rows.insert(1, ("PSNR, training views held out", promise.before, promise.after))
+    for label, old, new in rows:
         if old is not None and new is not None:
             table.add_row(label, f"{old:.2f} dB", f"{new:.2f} dB", f"{new - old:+.2f} dB")
     faster, smaller = after.fps / before.fps, before.megabytes / after.megabytes
     table.add_row("rendering", f"{before.fps:.1f} fps", f"{after.fps:.1f} fps", f"{faster:.1f} times as fast")
     table.add_row("model", f"{before.megabytes:.2f} MB", f"{after.megabytes:.2f} MB", f"{smaller:.1f} times smaller")
+    if after.stored is not None:
+        smaller = before.megabytes / after.stored
+        table.add_row("file", f"{before.megabytes:.2f} MB", f"{after.stored:.3f} MB", f"{smaller:.1f} times smaller")
     return table

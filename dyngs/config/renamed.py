@@ -68,6 +68,11 @@ CONSTANTS: dict[str, dict[str, float]] = {
 }
 """Keys that there are no more, with the value that is always taken by the kind of their section ("": it has none)."""
 
+REMOVED = {
+    "prune.max_loss": "the stage removes just prune.share; `dyngs prune RUN --out RUN2 --max-loss DB` finds the share",
+}
+"""Keys that there are no more, whatever their value was, and what to do instead. Runs that have them are read."""
+
 PRESETS = {"human_net": "human_predictor"}
 """Former name of a packaged preset to the present one."""
 
@@ -89,7 +94,7 @@ class _Change:
 
 
 def present(leaves: Iterable[Leaf]) -> list[Leaf]:
-    """Return the values of a resolved configuration under their present names, without those that are constants now.
+    """Return the values of a resolved configuration under their present names, without those that are no more.
 
     Raises:
         DyngsError: a key is there under its former and its present name, or a constant now had another value.
@@ -98,6 +103,8 @@ def present(leaves: Iterable[Leaf]) -> list[Leaf]:
     leaves = [_present(leaf).leaf for leaf in leaves]
     kinds = {leaf.keys[:-1]: str(leaf.value) for leaf in leaves if leaf.keys[-1] == "kind"}
     for now in leaves:
+        if ".".join(now.keys) in REMOVED:
+            continue
         constant = CONSTANTS.get(".".join(now.keys), {}).get(kinds.get(now.keys[:-1], ""))
         if constant is not None:
             _require_constant(now, constant)
@@ -114,6 +121,9 @@ def require_present(leaf: Leaf) -> None:
     if ".".join(leaf.keys) in CONSTANTS:
         raise DyngsError(f"{leaf.origin}: {'.'.join(leaf.keys)} can no longer be chosen; leave it out")
     change = _present(leaf)
+    removed = REMOVED.get(".".join(change.leaf.keys))
+    if removed is not None:
+        raise DyngsError(f"{leaf.origin}: {'.'.join(leaf.keys)} can no longer be chosen; {removed}")
     if change.told:
         raise DyngsError(f"{leaf.origin}: {change.told}")
 

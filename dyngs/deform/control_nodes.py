@@ -21,14 +21,15 @@ from dyngs.config import ControlNodesField
 from dyngs.deform.decoder import head_sizes
 from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, NetworkField, Offsets
 from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, spread_out, turned
+from dyngs.deform.spline_fit import SPAN, refitted
 from dyngs.gaussians import TopologyEdit
 from dyngs.parameters import Parameters
 from dyngs.state import Role, State, StateTensor, moved_to, part_of, prefixed
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
 NOTHING = torch.zeros(0, 3, device="cpu")
-SPAN = 4
-"""Control points that a pose depends on: the splines are cubic."""
+COMPARED_TIMES = 16
+"""Times at which the paths of nodes are compared where some of them are to go."""
 LR = {"quats": 6e-3, "log_scales": 1e-3, "logit_opacities": 1e-2, "colors": 2e-3}
 """Learning rates of the nodes' attributes other than positions."""
 LR_DECAY = 0.2
@@ -95,6 +96,35 @@ class ControlNodes(NetworkField):
         field = super().to(device)
         field.buffers = moved_to(self.buffers, device)
         return field
+
+    @torch.no_grad()
+    def reduced(self, nodes: int, pieces: int, means: Tensor) -> ControlNodes:
+        """Return a field of at most ``nodes`` of these nodes with ``pieces`` pieces each, for all of ``means`` (M, 3).
+
+        Splines are fitted to the present ones. The nodes that stay are the farthest from each other in the root mean
+        square of their distances over time: what moves alike keeps fewer. With other pieces Adam's moments begin anew.
+        """
+        self._nodes(means)
+        old, times = self.buffers["positions"], torch.linspace(0, 1, COMPARED_TIMES, device="cpu").tolist()
+        paths = torch.cat([old + self._at(time).means.detach() for time in times], dim=1)
+        kept = (
+            spread_out(paths, nodes, paths[:0]).sort().values
+            if nodes < len(old)
+            else torch.arange(len(old), device=old.device)
+        )
+        options = self.options.model_copy(update={"nodes": nodes, "pieces": pieces})
+        field = ControlNodes(options, self.setup, torch.Generator())
+        splines = {name: refitted(x.detach()[kept], pieces) for name, x in self._splines().items()}
+        is_new = torch.full((len(kept),), pieces != self.num_pieces, device=kept.device)
+        like = field.parameters if pieces != self.num_pieces else self.parameters
+        field.parameters = like.rearranged(splines, kept, is_new)
+        field._assign(old[kept], means)
+        return field
+
+    @property
+    def num_nodes(self) -> int:
+        """Number of nodes that are placed."""
+        return len(self.buffers["positions"])
 
     @property
     def num_points(self) -> int:
@@ -172,7 +202,11 @@ class ControlNodes(NetworkField):
         own = self._splines()
         values = {name: torch.cat([x.detach()[kept], started[name]]) for name, x in own.items()}
         self.parameters = self.parameters.rearranged(values, source, is_new)
-        nodes = nodes_at(torch.cat([old[kept], added]), means)
+        self._assign(torch.cat([old[kept], added]), means)
+
+    def _assign(self, positions: Tensor, means: Tensor) -> None:
+        """Let ``means`` (M, 3) follow the nodes nearest to them of those at ``positions`` (S, 3)."""
+        nodes = nodes_at(positions, means)
         around = nodes_at(nodes.positions, nodes.positions).followed[:, 1:]
         self.buffers = {
             "positions": nodes.positions,

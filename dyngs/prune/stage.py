@@ -1,5 +1,7 @@
 """The last stage of a run: few of its Gaussians are kept, masks say when they are seen, and training goes on with them.
 
+The share that goes is given here; ``dyngs.prune.search`` finds it, and what else can go, with the same functions.
+
 It begins where training ends, from that checkpoint, and lasts ``prune.steps``: a finished run that is pruned ends
 with the same bytes as one that had the stage in its configuration.
 """
@@ -20,7 +22,7 @@ from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture
 from dyngs.metrics import psnr
 from dyngs.prune.score import Importance, ScoringViews, importance
-from dyngs.prune.selection import Pruning, prune
+from dyngs.prune.selection import highest
 from dyngs.scene import Scene
 from dyngs.static.fixed import FixedDensifier
 from dyngs.training.background import background_colour
@@ -43,23 +45,19 @@ class Pruned:
 
     Attributes:
         before, after: numbers of Gaussians.
-        asked, share: what was to be removed, and what was.
         loss: dB on training pictures, before anything is trained again.
         active: mean share of the kept that masks let through; 1 without masks.
     """
 
     before: int
     after: int
-    asked: float
-    share: float
     loss: float
     active: float
 
     def __str__(self) -> str:
-        backed_off = f" (not {self.asked:.0%}: that would cost too much)" if self.share < self.asked else ""
         masks = "" if self.active == 1 else f"; masks let {self.active:.0%} of them through"
         return (
-            f"pruned: {self.before:,} -> {self.after:,} Gaussians, {self.share:.1%} removed{backed_off}, "
+            f"pruned: {self.before:,} -> {self.after:,} Gaussians, {1 - self.after / max(self.before, 1):.1%} removed, "
             f"{-self.loss:+.2f} dB before it is trained again{masks}"
         )
 
@@ -86,34 +84,37 @@ class PruneStage:
 
 @torch.no_grad()
 def prune_(trainer: Trainer) -> Pruned:
-    """Prune and mask the Gaussians of ``trainer``, which from here on leaves their number alone."""
-    options = trainer.config.prune
+    """Prune and mask the Gaussians of ``trainer`` as its configuration says; from here on their number stays."""
     trainer.scene = trainer.scene.unmasked()
-    pruning = Pruning(torch.ones(len(trainer.scene), dtype=torch.bool, device="cpu"), 0.0, 0.0)
-    whole = trainer.scene
-    if options.share > 0:
-        pruning = _pruning(trainer)
-        trainer.keep(pruning.kept)
-    trainer.densifier = FixedDensifier()
-    active = 1.0
-    if options.mask_times > 1 and field_of(trainer.config) is not None and not whole.is_still:
-        masks = _masks(trainer, whole, pruning.kept)
-        trainer.scene = replace(trainer.scene, masks=masks)
+    before, whole = len(trainer.scene), training_quality(trainer, trainer.scene)
+    remove_(trainer, chosen_scores(trainer) if trainer.config.prune.share > 0 else None)
+    scene, active = trainer.scene, 1.0
+    loss = whole - training_quality(trainer, scene.unmasked())
+    if scene.masks is not None:
+        masks = scene.masks
         active = fmean(len(masks.active(k)) / max(masks.count, 1) for k in range(len(masks.times) - 1))
-    after = int(pruning.kept.sum())
-    return Pruned(len(pruning.kept), after, options.share, pruning.share, pruning.loss, active)
+    return Pruned(before, len(scene), loss, active)
 
 
-def _pruning(trainer: Trainer) -> Pruning:
-    """Return which Gaussians may go."""
-    options, scene = trainer.config.prune, trainer.scene
-    scores = scores_of(importance(scoring_views(trainer, scene), slopes=options.score == "sensitivity"), options)
-    whole = training_quality(trainer, scene)
+@torch.no_grad()
+def remove_(trainer: Trainer, scores: Tensor | None) -> None:
+    """Leave all but the share ``prune.share`` with the lowest ``scores`` (N,), and mask them if that is asked for."""
+    options = trainer.config.prune
+    whole = trainer.scene = trainer.scene.unmasked()
+    kept = torch.ones(len(whole), dtype=torch.bool, device=whole.gaussians.means.device)
+    if scores is not None:
+        kept = highest(scores, options.share)
+        trainer.keep(kept)
+    trainer.densifier = FixedDensifier()
+    if options.mask_times > 1 and field_of(trainer.config) is not None and not whole.is_still:
+        trainer.scene = replace(trainer.scene, masks=_masks(trainer, whole, kept))
 
-    def loss_of(kept: Tensor) -> float:
-        return whole - training_quality(trainer, scene.select(kept))
 
-    return prune(scores, options.share, loss_of, options.max_loss)
+@torch.no_grad()
+def chosen_scores(trainer: Trainer) -> Tensor:
+    """Return (N,) the score that the configuration asks for."""
+    options, scene = trainer.config.prune, trainer.scene.unmasked()
+    return scores_of(importance(scoring_views(trainer, scene), slopes=options.score == "sensitivity"), options)
 
 
 def scores_of(found: Importance, options: PruneConfig) -> Tensor:

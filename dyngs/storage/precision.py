@@ -90,15 +90,10 @@ def measured_precision(
     Raises:
         DyngsError: a value is not finite.
     """
-    coarseness = checked_coarseness(exact[COARSENESS], len(exact["gaussians.means"])) if COARSENESS in exact else None
 
     def change(steps: Mapping[str, float], names: Iterable[str] = exact) -> float:
         """Return the mean square over all values, with the tensors of these names quantised."""
-        rounded = dict(exact)
-        for name in names:
-            coding = coding_of(name, exact[name], steps, by_coarseness=coarseness is not None)
-            rounded[name] = restored(exact[name], coding, coarseness)
-        return mean_square_change(wanted, draw(completed(rounded)))
+        return mean_square_change(wanted, draw(completed(rounded(exact, steps, names))))
 
     allowed = (max_change / GREY_LEVELS) ** 2
     groups = _groups(exact)
@@ -117,6 +112,24 @@ def measured_precision(
         kept = dict.fromkeys((*groups, *exact), 0.0)
         found = change(kept)
     return Precision(kept, math.sqrt(found) * GREY_LEVELS, max_change)
+
+
+def rounded(
+    exact: Mapping[str, Tensor], steps: Mapping[str, float], names: Iterable[str] | None = None
+) -> dict[str, Tensor]:
+    """Return the tensors with those of ``names`` (None: all) as a file with these steps holds them.
+
+    Args:
+        exact: from ``drawable``, and the coarseness of the Gaussians if they have any.
+        steps: of groups of tensors.
+        names: of the tensors that are rounded.
+    """
+    coarseness = checked_coarseness(exact[COARSENESS], len(exact["gaussians.means"])) if COARSENESS in exact else None
+    found = dict(exact)
+    for name in exact if names is None else names:
+        coding = coding_of(name, exact[name], steps, by_coarseness=coarseness is not None)
+        found[name] = restored(exact[name], coding, coarseness)
+    return found
 
 
 def mean_square_change(before: Sequence[Tensor], after: Sequence[Tensor]) -> float:

@@ -16,7 +16,6 @@ from dyngs.config.schema import section_class
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import num_bytes_exact, write_scene_file
-from dyngs.metrics import MAX_PSNR
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.stage import prune_
 from dyngs.runs.checkpoint import (
@@ -175,7 +174,7 @@ def write_chosen(models: VariantRuns, variant: Variant) -> Path:
 def _pruning_overrides(wanted: Variant, own: PruneConfig) -> Sequence[str]:
     """Return overrides of the pruning stage; masks are those of the run where the variant has none."""
     masks = (f"prune.mask_times={wanted.mask_times or own.mask_times}", f"prune.mask_below={own.mask_below}")
-    return (f"prune.share={wanted.prune}", f"prune.max_loss={MAX_PSNR}", *masks)
+    return (f"prune.share={wanted.prune}", *masks)
 
 
 def field_changes(config: Config, wanted: Variant) -> Iterator[str]:

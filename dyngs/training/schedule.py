@@ -57,8 +57,7 @@ def hold_out_until(options: TrainConfig) -> int:
 
 def rates_of(config: Config) -> Rates:
     """Return the course of the learning rates of a run."""
-    stage = config.prune
-    return Rates(config.train.steps, stage.steps, stage.rewind) if stage.is_wanted else Rates(config.train.steps)
+    return Rates(config.train.steps, config.prune.steps, config.prune.rewind)
 
 
 def means_rate(options: OptimConfig, progress: float, extent: float) -> float:

@@ -29,7 +29,7 @@ from dyngs.training.background import background_colour
 from dyngs.training.events import StepReport
 from dyngs.training.priors.used import StepView, UsedPriors
 from dyngs.training.sampler import ViewSampler
-from dyngs.training.schedule import active_sh_degree, hold_out_until, means_rate, picture_divisor, rates_of
+from dyngs.training.schedule import active_sh_degree, means_rate, picture_divisor, rates_of
 from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
 
 
@@ -47,7 +47,8 @@ class Trainer:
         priors: what the user knows about the capture.
         done: steps done.
         bad_gradients: how often a Gaussian was left out of a step because its gradient was not finite.
-        held_out: indices of the views that are not trained on up to ``train.hold_out_until``.
+        held_out: indices of the training views that are not trained on up to ``held_out_until``.
+        held_out_until: the last step without them.
     """
 
     config: Config
@@ -68,6 +69,7 @@ class Trainer:
     done: int = 0
     bad_gradients: int = 0
     held_out: frozenset[int] = frozenset()
+    held_out_until: float = math.inf
 
     @property
     def num_gaussians(self) -> int:
@@ -118,7 +120,7 @@ class Trainer:
 
     def holds_out(self, index: int, step: int) -> bool:
         """Return whether the view ``index`` is held out in ``step``."""
-        return index in self.held_out and step <= hold_out_until(self.config.train)
+        return index in self.held_out and step <= self.held_out_until
 
     def keep(self, kept: Tensor) -> None:
         """Leave only the Gaussians where ``kept`` (N,) is true."""

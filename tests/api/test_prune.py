@@ -1,4 +1,4 @@
-"""From run to smaller run: the same bytes as with the stage in the configuration, and honest numbers."""
+"""From run to smaller run: the same bytes as with the stage in the configuration, and a promise that is kept."""
 
 from __future__ import annotations
 
@@ -8,16 +8,24 @@ import pytest
 from moving_scene import write_moving_run
 from tiny_fields import busy_config, write_tiny_capture
 
-from dyngs.api.prune import compared, prune_run
+from dyngs.api.prune import file_of, prune_run, prune_within
 from dyngs.api.train import train
+from dyngs.build import assemble
 from dyngs.config import PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
-from dyngs.evaluate.report import evaluate_run
-from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.evaluate.comparison import compared
+from dyngs.prune.search import held_out_views
+from dyngs.prune.stage import quality_of
+from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, latest_checkpoint, load_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-ASKED = ("prune.share=0.5", "prune.max_loss=100", "prune.steps=6", "prune.mask_times=3", "run.threads=1")
+ASKED = ("prune.share=0.5", "prune.steps=6", "prune.mask_times=3", "run.threads=1")
+BRIEFLY = ("prune.steps=4", "run.threads=1")
+
+
+def silent(text: str) -> None:
+    """What is tried does not matter here."""
 
 
 @pytest.fixture(scope="module")
@@ -29,36 +37,65 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -> None:
     small = prune_run(run_dir, tmp_path / "small", ASKED)
     config = busy_config(load_resolved(run_dir).data.root, tmp_path / "whole", "control_nodes")
-    stage = PruneConfig(share=0.5, max_loss=100, steps=6, mask_times=3)
+    stage = PruneConfig(share=0.5, steps=6, mask_times=3)
     whole = train(config.model_copy(update={"prune": stage}))
     assert checkpoint_paths(small)[-1].read_bytes() == checkpoint_paths(whole)[-1].read_bytes()
     assert load_run(run_dir).step == 24, "the first run is as it was"
     assert (small / "log.jsonl").read_text().count("\n") >= 30
+    assert len(load_run(file_of(small)).scene) == len(load_run(small).scene)
 
 
-def test_a_compacted_run_can_be_compacted(run_dir: Path, tmp_path: Path) -> None:
+def test_a_pruned_run_can_be_pruned(run_dir: Path, tmp_path: Path) -> None:
     once = prune_run(run_dir, tmp_path / "once", ASKED)
-    twice = prune_run(once, tmp_path / "twice", ("prune.share=0.5", "prune.max_loss=100", "prune.steps=2"))
-    sizes = [len(load_run(folder).scene) for folder in (run_dir, once, twice)]
-    assert sizes[0] > sizes[1] > sizes[2]
+    twice = prune_run(once, tmp_path / "twice", ("prune.share=0.5", "prune.steps=2"))
+    thrice = prune_within(twice, tmp_path / "thrice", 50.0, BRIEFLY, silent).folder
+    sizes = [len(load_run(folder).scene) for folder in (run_dir, once, twice, thrice)]
+    assert sizes[0] > sizes[1] > sizes[2] > sizes[3]
     assert load_run(twice).step == 32
+    assert load_run(thrice).step == 36
 
 
-def test_compared_numbers_are_those_of_eval(run_dir: Path, tmp_path: Path) -> None:
-    small = prune_run(run_dir, tmp_path / "small", ASKED)
-    costs = compared(run_dir, small, 1)
-    for folder, cost in zip((run_dir, small), costs, strict=True):
-        report = evaluate_run(folder, "test", threads=1)
-        assert cost.num_gaussians == report.num_gaussians
-        assert cost.psnr_test == pytest.approx(report.psnr, abs=0.5)  # eval does not clamp what it draws
-        assert cost.megabytes == report.model_mb
-        assert cost.fps > 0
-    assert costs[1].num_gaussians < costs[0].num_gaussians
+def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
+    """On views that fine-tuning has not seen; and it is the same each time."""
+    told: list[str] = []
+    first, again = (prune_within(run_dir, tmp_path / name, 1.0, BRIEFLY, told.append) for name in ("a", "b"))
+    assert told[: len(told) // 2] == told[len(told) // 2 :]
+    for path in (checkpoint_paths(first.folder)[-1], file_of(first.folder) / SCENE_FILE):
+        assert path.read_bytes() == (again.folder / path.relative_to(first.folder)).read_bytes()
+    assert first.before - first.after <= 1.0
+    config = load_resolved(first.folder)
+    trainer = assemble(config, restored=True)
+    trainer.restore(latest_checkpoint(first.folder))
+    shown = [trainer.pictures[i] for i in held_out_views(len(trainer.pictures))]
+    assert quality_of(trainer, load_run(file_of(first.folder)).scene, shown) == pytest.approx(first.after, abs=1e-4)
+    before, after = compared([run_dir, file_of(first.folder)], 1)
+    assert after.num_gaussians < before.num_gaussians
+    assert after.stored is not None
+    assert after.stored < before.megabytes
+    assert str(first).count("limit:") == len(first.limits) >= 4
 
 
-def test_an_interruption_at_the_start_leaves_nothing(
+def test_where_nothing_can_go_the_run_stays_as_it_is(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Every candidate is worse by 5 dB than what was there."""
+    monkeypatch.setattr("dyngs.prune.search.apply_cut", _spoil)
+    promise = prune_within(run_dir, tmp_path / "same", 0.2, BRIEFLY, silent)
+    assert checkpoint_paths(promise.folder)[-1].read_bytes() == checkpoint_paths(run_dir)[-1].read_bytes()
+    assert str(promise).startswith("nothing can be taken away for 0.2 dB: the run is as it was")
+    assert all(limit.refused is not None and limit.refused[1] > 0.2 for limit in promise.limits[:-1])
+    assert promise.before - promise.after <= 0.2
+
+
+def _spoil(trainer: object, cut: object, scores: object) -> None:
+    from dyngs.prune.cut import Cut, apply_cut
+
+    apply_cut(trainer, cut, scores)  # pyright: ignore[reportArgumentType]
+    if cut != Cut():
+        trainer.scene.gaussians.sh.data[:, 0] += 0.8  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_an_interruption_leaves_nothing(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -66,6 +103,8 @@ def test_an_interruption_at_the_start_leaves_nothing(
         patch.setattr("dyngs.api.prune.save_config", interrupted)
         with pytest.raises(KeyboardInterrupt):
             prune_run(run_dir, tmp_path / "small", ASKED)
+        with pytest.raises(KeyboardInterrupt):
+            prune_within(run_dir, tmp_path / "small", 50.0, BRIEFLY, silent)
     assert not list(tmp_path.iterdir())
     assert checkpoint_paths(prune_run(run_dir, tmp_path / "small", ASKED))
 
@@ -83,10 +122,18 @@ def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:
         (tmp_path / "new", ["prune.share=-0.1"], "prune.share"),
         (tmp_path / "new", ["prune.share=0"], "nothing to do"),
         (tmp_path / "new", ["prune.score=beauty"], "prune.score"),
+        (tmp_path / "new", ["prune.share=0.5", "prune.max_loss=1"], "dyngs prune RUN --out RUN2 --max-loss"),
     ):
         with pytest.raises(DyngsError, match=message):
             prune_run(run_dir, out, overrides)
     with pytest.raises(DyngsError, match="no checkpoints there"):
         prune_run(tmp_path / "nowhere", tmp_path / "new", ["prune.share=0.5"])
+    for out, overrides, message in (
+        (taken, [], "exists already; give another --out"),
+        (tmp_path / "new", ["prune.share=0.5"], "are chosen with --prune R"),
+        (tmp_path / "new", ["model.alpha_min=0.1"], "losses are counted from RUN as it is"),
+    ):
+        with pytest.raises(DyngsError, match=message):
+            prune_within(run_dir, out, 0.2, overrides)
     assert not (tmp_path / "new").exists()
     assert (taken / "file").read_text() == "mine"

@@ -117,7 +117,10 @@ def test_an_override_with_a_former_key_is_told_the_new_one(former: str) -> None:
     ("text", "parts"),
     [
         ("model:\n  kind: dynamic\n  seeds: 5\n", (":3: model.seeds is called model.num_random_moving now",)),
-        ("compact:\n  max_loss: 5\n", (":2: compact.max_loss is called prune.max_loss now",)),
+        (
+            "compact:\n  max_loss: 5\n",
+            (":2: compact.max_loss can no longer be chosen; the stage removes just prune.share",),
+        ),
         ("colour:\n  kind: dcac\n", (":2: colour.kind=dcac is called network now",)),
         ("compact:\n", (":1: compact is called prune now",)),
     ],

@@ -1,16 +1,13 @@
-"""The best stay, and more of them where pictures would suffer."""
+"""The best stay."""
 
 from __future__ import annotations
-
-import math
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
-from dyngs.prune.selection import BACK_OFFS, highest, prune
+from dyngs.prune.selection import highest
 
 SCORES = torch.tensor([3.0, 0.5, 2.0, 0.5, 9.0])
 
@@ -30,29 +27,3 @@ def test_no_more_go_than_asked_and_none_above_one_that_stays(values: list[float]
     assert (~kept).sum() <= share * len(scores) + 1e-6
     if not bool(kept.all()):
         assert scores[~kept].max() <= scores[kept].min()
-
-
-def lost(kept: Tensor) -> float:
-    """10 dB, were all removed."""
-    return 10 * float((~kept).float().mean())
-
-
-def test_all_go_that_may() -> None:
-    found = prune(torch.arange(1000.0), 0.8, lost, max_loss=8.01)
-    assert (int(found.kept.sum()), found.share) == (200, 0.8)
-    assert found.loss == pytest.approx(8.0)
-
-
-def test_it_backs_off_to_what_pictures_can_bear() -> None:
-    """By bisection: within 0.8 / 2^5 of the share that costs exactly as much."""
-    found = prune(torch.arange(1000.0), 0.8, lost, max_loss=3.0)
-    assert found.loss <= 3.0
-    assert 0.3 - 0.8 / 2**BACK_OFFS <= found.share <= 0.3
-    assert found.loss == pytest.approx(lost(found.kept))
-    assert torch.equal(found.kept, highest(torch.arange(1000.0), found.share))
-
-
-def test_where_nothing_can_be_borne_nothing_goes() -> None:
-    found = prune(torch.arange(10.0), 0.5, lambda kept: math.inf, max_loss=1.0)
-    assert found.kept.all()
-    assert (found.share, found.loss) == (0.0, 0.0)

@@ -16,12 +16,6 @@ class PruneConfig(Section):
     score: Literal["variation", "sensitivity", "contribution", "temporal"] = Field(
         default="sensitivity", description="importance of a Gaussian (docs/prune.md); the lowest are removed"
     )
-    max_loss: float = Field(
-        default=10.0,
-        ge=0,
-        description="largest loss of PSNR on training pictures before fine-tuning, dB; fewer are removed where it is "
-        "exceeded",
-    )
     mask_times: int = Field(
         default=0, ge=0, description="key times of visibility masks over time (4DGS-1K); 0 or 1: no masks"
     )

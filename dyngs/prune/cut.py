@@ -1,0 +1,137 @@
+"""What is taken from a trained scene: Gaussians, faint blending, control nodes and pieces of splines, harmonics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyngs.colour.training import HELD_OUT_EVERY, AutoTraining
+from dyngs.colour.view_dependence import MeasuredView, find_view_dependent
+from dyngs.config import AutoColour, Config, ControlNodesField, DynamicModel
+from dyngs.conventions import SH_C0
+from dyngs.deform.control_nodes import ControlNodes
+from dyngs.deform.scene import DynamicScene
+from dyngs.prune.stage import remove_
+from dyngs.scene import Scene, render_options
+from dyngs.training.background import background_colour
+from dyngs.training.trainer import Trainer
+
+
+@dataclass(frozen=True)
+class FieldSize:
+    """Size of a field of control nodes."""
+
+    nodes: int
+    pieces: int
+
+
+@dataclass(frozen=True)
+class Cut:
+    """What is taken away; the defaults take nothing.
+
+    Attributes:
+        share: of the Gaussians that is removed.
+        alpha_min: pixels skip Gaussians with a lower alpha; None: as the run has it.
+        field: size of the field of control nodes; None: as it is.
+        harmonics: PSNR that view dependence may cost on training views before fine-tuning, dB; 0: all harmonics stay.
+    """
+
+    share: float = 0.0
+    alpha_min: float | None = None
+    field: FieldSize | None = None
+    harmonics: float = 0.0
+
+    def __str__(self) -> str:
+        words = [f"{self.share:.1%} of the Gaussians"] if self.share else []
+        words += [f"alphas below {self.alpha_min:.3g}"] if self.alpha_min else []
+        words += [f"all but {self.field.nodes} nodes of {self.field.pieces} pieces"] if self.field else []
+        words += [f"harmonics worth {self.harmonics:g} dB"] if self.harmonics else []
+        return ", ".join(words) or "nothing"
+
+
+def field_size(scene: Scene) -> FieldSize | None:
+    """Return the size of the field of ``scene``; None where no control nodes move anything."""
+    match scene:
+        case DynamicScene(field=ControlNodes() as field, is_still=False) if field.num_nodes:
+            return FieldSize(field.num_nodes, field.num_pieces)
+        case _:
+            return None
+
+
+def with_field(scene: Scene, size: FieldSize) -> Scene:
+    """Return ``scene`` with so many of its nodes and pieces; as it is where no control nodes move anything."""
+    match scene:
+        case DynamicScene(field=ControlNodes() as field, is_still=False):
+            means = scene.gaussians.means.detach()[scene.moving]
+            return replace(scene, field=field.reduced(size.nodes, size.pieces, means))
+        case _:
+            return scene
+
+
+def cut_config(config: Config, cut: Cut) -> Config:
+    """Return the configuration of what ``apply_cut`` leaves."""
+    model = config.model
+    match model:
+        case DynamicModel(deform=ControlNodesField() as deform) if cut.field is not None:
+            size = {"nodes": cut.field.nodes, "pieces": cut.field.pieces}
+            model = model.model_copy(update={"deform": deform.model_copy(update=size)})
+        case _:
+            pass
+    if cut.alpha_min is not None:
+        model = model.model_copy(update={"alpha_min": cut.alpha_min})
+    colour = config.colour
+    if cut.harmonics:
+        colour = AutoColour(opacity_entropy=colour.opacity_entropy)
+    prune = config.prune.model_copy(update={"share": cut.share})
+    return config.model_copy(update={"model": model, "colour": colour, "prune": prune})
+
+
+def apply_cut(trainer: Trainer, cut: Cut, scores: Tensor) -> None:
+    """Take away what ``cut`` says from the scene of ``trainer``, which is at the end of its run.
+
+    Args:
+        trainer: its configuration becomes that of ``cut_config``; nothing is added to its scene from here on.
+        cut: what goes.
+        scores: (N,) importance of its Gaussians.
+    """
+    trainer.config = cut_config(trainer.config, cut)
+    options = render_options(trainer.config.model)
+    trainer.options = replace(trainer.options, alpha_min=options.alpha_min)
+    trainer.scene = replace(trainer.scene, options=options)
+    remove_(trainer, scores if cut.share else None)
+    if cut.field is not None:
+        trainer.scene = with_field(trainer.scene, cut.field)
+    if cut.harmonics:
+        _drop_harmonics(trainer, cut.harmonics)
+    trainer.scene.changed()
+
+
+def _drop_harmonics(trainer: Trainer, tolerance: float) -> None:
+    """Drop the harmonics of the Gaussians that need none, and keep them zero."""
+    usable = [i for i in range(len(trainer.pictures)) if i not in trainer.held_out]
+    judged = usable[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or usable[:1]
+    seen = [i for i in usable if i not in judged] or judged
+    background = background_colour(trainer.background)
+    looks = list(_looks(trainer, judged, background))
+    found = find_view_dependent(_looks(trainer, seen, background), looks, trainer.options, background, tolerance)
+    base = trainer.scene.gaussians.sh.detach()[:, 0] + found.offsets / SH_C0
+    trainer.optimizer.drop_rest(base, ~found.keeps)
+    trainer.scene = trainer.scene.with_gaussians(trainer.optimizer.parameters)
+    colours = AutoTraining(
+        AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy),
+        trainer.config.train.steps,
+        len(trainer.pictures),
+    )
+    colours.freeze(~found.keeps)
+    trainer.colours = colours
+
+
+def _looks(trainer: Trainer, indices: Sequence[int], background: Tensor) -> Iterator[MeasuredView]:
+    """Yield training views as they are drawn now."""
+    for picture in (trainer.pictures[i] for i in indices):
+        with torch.no_grad():
+            now = trainer.training.moment(trainer.scene, picture, trainer.done).gaussians.detach()
+        yield MeasuredView(now, picture.cameras, picture.composite(background), picture.mask)

@@ -1,0 +1,279 @@
+"""The most that can be taken from a run for a given loss, found by bisection.
+
+Some training views are held out. The run as it is and every candidate are fine-tuned equally long on the others, from
+the same checkpoint, with the same views in the same order; the loss of a candidate is the difference of their mean
+PSNR on the views held out. One kind of thing after the other is taken away, as listed in ``ALLOWED``: of each the most,
+by bisection, that keeps the loss below a share of what is allowed, with what was found for those before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from dyngs.config import Config
+from dyngs.errors import DyngsError
+from dyngs.prune.cut import Cut, FieldSize, apply_cut, field_size, with_field
+from dyngs.prune.stage import chosen_scores, probe_pictures, quality_of
+from dyngs.scene import Scene
+from dyngs.storage.coarsest import CoarseFile, coarsest_file
+from dyngs.training.state import Checkpoint
+from dyngs.training.trainer import Trainer
+
+HELD_OUT_SHARE, MOST_HELD_OUT = 1 / 8, 32
+"""Share and number of the training views that are held out."""
+LEFT_GAUSSIANS = tuple(2 ** (-step / 2) for step in range(1, 13))
+"""Shares of the Gaussians that are left, tried by bisection."""
+CUT_OFFS = (0.01, 0.02, 0.03)
+FIELD_LOSSES = (0.03, 0.1, 0.3, 1.0, 3.0)
+"""Losses of training pictures, dB, before fine-tuning, by fewer pieces and by fewer nodes each."""
+HARMONIC_LOSSES = (0.01, 0.03, 0.1)
+"""Losses of training pictures, dB, before fine-tuning, by dropping harmonics."""
+ALLOWED = {"Gaussians": 0.6, "cut-off": 0.7, "field": 0.8, "harmonics": 0.85}
+"""Share of the allowed loss up to which each kind is taken, those before it included; the rest is for rounding."""
+FEWEST_NODES = 8
+
+SMALLEST_FILE_LOSS = 0.01
+"""Least loss of rounding that is allowed, dB: with 0 no file would be good enough."""
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A run after a cut and fine-tuning.
+
+    Attributes:
+        cut: what was taken away.
+        config: of what is left.
+        checkpoint: at its end.
+        num_gaussians: left.
+        psnr: mean on the views held out, dB.
+        loss: that of the run as it is, fine-tuned equally long, minus ``psnr``.
+    """
+
+    cut: Cut
+    config: Config
+    checkpoint: Checkpoint
+    num_gaussians: int
+    psnr: float
+    loss: float
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Why no more of one kind of thing was taken.
+
+    Attributes:
+        kind: of thing, a key of ``ALLOWED``.
+        taken: what goes, of this kind.
+        refused: the next step, and its loss in dB; None where there is no next step.
+    """
+
+    kind: str
+    taken: str
+    refused: tuple[str, float] | None = None
+
+    def __str__(self) -> str:
+        if self.refused is None:
+            return f"{self.kind}: {self.taken}; there was no more to try"
+        step, loss = self.refused
+        return f"{self.kind}: {self.taken}; {step} would cost {loss:.2f} dB"
+
+
+@dataclass(frozen=True)
+class Found:
+    """Result of a search.
+
+    Attributes:
+        accepted: candidates that keep the promise, each smaller than the one before; the first is the run as it is.
+        limits: why no more was taken, by kind of thing.
+        held_out: indices of the training views held out.
+        trials: number of fine-tuned candidates, the run as it is included.
+    """
+
+    accepted: tuple[Candidate, ...]
+    limits: tuple[Limit, ...]
+    held_out: tuple[int, ...]
+    trials: int
+
+
+@dataclass(frozen=True)
+class Stored:
+    """The candidate that is chosen, its file, and why that is not rounded more coarsely."""
+
+    candidate: Candidate
+    file: CoarseFile
+    limit: Limit
+
+
+def held_out_views(count: int) -> tuple[int, ...]:
+    """Return the indices of those of ``count`` training views that are held out, evenly spread; none of one view."""
+    chosen = min(max(1, round(HELD_OUT_SHARE * count)), MOST_HELD_OUT) if count > 1 else 0
+    return tuple((2 * i + 1) * count // (2 * chosen) for i in range(chosen))
+
+
+class Search:
+    """Candidates of a finished run.
+
+    Args:
+        trainer: of the run, restored from ``start``; it is changed.
+        start: checkpoint at the end of the run.
+        tell: is told what is tried and found.
+    """
+
+    def __init__(self, trainer: Trainer, start: Checkpoint, tell: Tell) -> None:
+        self.trainer, self.start, self.tell = trainer, start, tell
+        self.held_out = held_out_views(len(trainer.pictures))
+        self.trials = 0
+        self._begin = trainer.config, trainer.options, trainer.colours
+        trainer.held_out, trainer.held_out_until = frozenset(self.held_out), math.inf
+        self._scores = chosen_scores(trainer)
+        self._truths = [trainer.pictures[i] for i in self.held_out] or probe_pictures(trainer)
+        self._unpruned = 0.0
+
+    def run(self, max_loss: float) -> Found:
+        """Return what can be taken away for ``max_loss``, dB."""
+        self._restart()
+        config, exact = self._begin[0], quality_of(self.trainer, self.trainer.scene, self._truths)
+        accepted, limits = [Candidate(Cut(), config, self.start, self.trainer.num_gaussians, exact, 0.0)], []
+        self._unpruned = self._tried(Cut()).psnr
+        self.tell(
+            f"as it is, {len(self._scores):,} Gaussians, fine-tuned on the other training views: "
+            f"{self._unpruned:.2f} dB on {len(self._truths)} held out"
+        )
+        for kind, knob in self._knobs().items():
+            levels = knob(accepted[-1].cut)
+            if not levels:
+                continue
+            found, limit = self._bisected(kind, levels, ALLOWED[kind] * max_loss)
+            limits.append(limit)
+            accepted += [] if found is None else [found]
+        return Found(tuple(accepted), tuple(limits), self.held_out, self.trials)
+
+    def stored(self, found: Found, max_loss: float) -> Stored:
+        """Return the smallest accepted candidate whose file keeps the promise, and that file, rounded as far as it may.
+
+        The last resort is the run as it is, whose file is compared with itself.
+
+        Raises:
+            DyngsError: not even the file of that does.
+        """
+        for candidate in reversed(found.accepted):
+            least = candidate.psnr + candidate.loss - max(max_loss, SMALLEST_FILE_LOSS)
+            file = coarsest_file(candidate.config, candidate.checkpoint, self._quality, least)
+            if file is None:
+                self.tell(f"without {candidate.cut}: the file loses more than {max_loss:g} dB")
+                continue
+            loss = None if file.refused is None else candidate.psnr + candidate.loss - file.refused
+            refused = None if loss is None else ("the next step", loss)
+            return Stored(candidate, file, Limit("precision", f"steps {file.factor:.2g} times the usual", refused))
+        raise DyngsError(f"no file of it loses less than {max(max_loss, SMALLEST_FILE_LOSS):g} dB; allow more")
+
+    def _quality(self, scene: Scene) -> float:
+        """Return the mean PSNR of the views held out drawn of ``scene`` as it wants to be drawn, dB."""
+        self.trainer.options = replace(self.trainer.options, alpha_min=scene.options.alpha_min)
+        return quality_of(self.trainer, scene, self._truths)
+
+    def _knobs(self) -> dict[str, Callable[[Cut], Sequence[tuple[str, Cut]]]]:
+        """Return for each kind of thing the steps of taking it away, beyond a cut, the mildest first."""
+        return {
+            "Gaussians": self._fewer_gaussians,
+            "cut-off": self._higher_cut_offs,
+            "field": self._smaller_fields,
+            "harmonics": self._fewer_harmonics,
+        }
+
+    def _bisected(self, kind: str, levels: Sequence[tuple[str, Cut]], allowed: float) -> tuple[Candidate | None, Limit]:
+        """Return the last of ``levels`` that loses at most ``allowed``, as if all before it did; and why no more."""
+        found, refused, low, high = None, None, 0, len(levels)
+        while low < high:
+            middle = (low + high) // 2
+            name, cut = levels[middle]
+            tried = self._tried(cut)
+            keeps = tried.loss <= allowed
+            self.tell(
+                f"trial {self.trials}: without {cut}: {tried.num_gaussians:,} Gaussians, {-tried.loss:+.2f} dB, "
+                f"{'kept' if keeps else f'more than {allowed:.2f} dB lost'}"
+            )
+            if keeps:
+                found, low = tried, middle + 1
+            else:
+                refused, high = (name, tried.loss), middle
+        return found, Limit(kind, levels[low - 1][0] if low else "nothing", refused)
+
+    def _tried(self, cut: Cut) -> Candidate:
+        """Return the run after a cut and fine-tuning."""
+        self.trials += 1
+        trainer = self.trainer
+        self._restart()
+        apply_cut(trainer, cut, self._scores)
+        end = trainer.config.train.steps + trainer.config.prune.steps
+        while trainer.done < end:
+            trainer.step()
+        psnr = quality_of(trainer, trainer.scene, self._truths)
+        return Candidate(cut, trainer.config, trainer.checkpoint(), len(trainer.scene), psnr, self._unpruned - psnr)
+
+    def _restart(self) -> None:
+        trainer = self.trainer
+        trainer.config, trainer.options, trainer.colours = self._begin
+        trainer.restore(self.start)
+        trainer.scene = trainer.scene.unmasked()
+
+    def _fewer_gaussians(self, so_far: Cut) -> Sequence[tuple[str, Cut]]:
+        count = len(self._scores)
+        return [(f"{1 - left:.1%}", replace(so_far, share=1 - left)) for left in LEFT_GAUSSIANS if left * count >= 1]
+
+    def _higher_cut_offs(self, so_far: Cut) -> Sequence[tuple[str, Cut]]:
+        own = self._begin[0].model
+        values = [x for x in CUT_OFFS if x > own.alpha_min]
+        return [(f"alphas below {x:g}", replace(so_far, alpha_min=x)) for x in values]
+
+    @torch.no_grad()
+    def _smaller_fields(self, so_far: Cut) -> Sequence[tuple[str, Cut]]:
+        """Return sizes at which fewer pieces, and fewer nodes, cost as much each before fine-tuning."""
+        self._restart()
+        trainer = self.trainer
+        whole = field_size(trainer.scene)
+        if whole is None:
+            return []
+        pictures = [trainer.pictures[i] for i in range(len(trainer.pictures)) if i not in self.held_out]
+        pictures = pictures[:: max(1, len(pictures) // 16)][:16]
+        at_most: list[FieldSize] = []
+        exact = quality_of(trainer, trainer.scene, pictures)
+
+        def loss(size: FieldSize) -> float:
+            return exact - quality_of(trainer, with_field(trainer.scene, size), pictures)
+
+        pieces = {n: loss(FieldSize(whole.nodes, n)) for n in _halved(whole.pieces, 1)}
+        nodes = {n: loss(FieldSize(n, whole.pieces)) for n in _halved(whole.nodes, FEWEST_NODES)}
+        for most in FIELD_LOSSES:
+            size = FieldSize(_fewest(nodes, most, whole.nodes), _fewest(pieces, most, whole.pieces))
+            if size not in [*at_most, whole]:
+                at_most.append(size)
+        return [(f"all but {x.nodes} nodes of {x.pieces} pieces", replace(so_far, field=x)) for x in at_most]
+
+    def _fewer_harmonics(self, so_far: Cut) -> Sequence[tuple[str, Cut]]:
+        if not bool(self.start.tensors["gaussians.sh"][:, 1:].any()):
+            return []
+        return [(f"harmonics worth {x:g} dB", replace(so_far, harmonics=x)) for x in HARMONIC_LOSSES]
+
+
+def _halved(count: int, least: int) -> list[int]:
+    """Return smaller numbers, each over the root of two of the one before, down to ``least``."""
+    found = []
+    while (count := round(count / 2**0.5)) >= least and count not in found:
+        found.append(count)
+    return found
+
+
+def _fewest(losses: dict[int, float], most: float, whole: int) -> int:
+    """Return the smallest number up to which, from the largest on, no loss exceeds ``most``; else ``whole``."""
+    for count, loss in losses.items():
+        if loss > most:
+            break
+        whole = count
+    return whole
