@@ -41,6 +41,7 @@ from dyngs.data.prepare.first_points import with_first_points
 from dyngs.data.read import read_capture
 from dyngs.deform.given_masks import moving_share_of
 from dyngs.deform.scene import DynamicScene
+from dyngs.deform.standing.changes import Footage, footage_of
 from dyngs.deform.still_error import StillErrors, cameras_in_place, still_errors, views_to_compare
 from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
 from dyngs.errors import DyngsError, reading
@@ -89,6 +90,8 @@ from dyngs.training.views import (
     training_times,
 )
 
+MAX_STANDING = 12
+"""Cameras that stand still from which tracks are found, at most."""
 FIRST_VIEWS = 50
 """Number of pictures from which a person's first colours are taken."""
 
@@ -321,8 +324,15 @@ def _training_views(
         return still_errors(gaussians_at, shown, _training_options(config), background, shader)
 
     cameras, extent = training_cameras(views, config.data), surroundings(capture).extent
-    stay = bool(cameras_in_place(views))
-    return TrainingViews(training_times(capture), cameras, extent, errors_of, cameras_stay=stay)
+    in_place = cameras_in_place(views)
+
+    def standing() -> list[Footage]:
+        used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
+        return [footage_of((pictures[i] for i in seen), background, sum(map(len, used))) for seen in used]
+
+    return TrainingViews(
+        training_times(capture), cameras, extent, errors_of, cameras_stay=bool(in_place), standing=standing
+    )
 
 
 def _colours(config: Config, capture: Capture, gaussians: Gaussians, generator: torch.Generator) -> ColourTraining:

@@ -146,8 +146,10 @@ class EditResult:
         edit: how rows move; None where all stay in place.
         changes: field name to its new values (N_new, ...), for the fields that are not just rows moved.
         zero_moments: fields whose optimizer moments start anew in every row.
+        finding: a line for people about why, or None.
     """
 
     edit: TopologyEdit | None
     changes: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
     zero_moments: frozenset[str] = frozenset()
+    finding: str | None = None

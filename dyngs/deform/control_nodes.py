@@ -49,19 +49,18 @@ class ControlNodes(NetworkField):
         self.options, self.setup = options, setup
         self.num_pieces = options.pieces or min(max(1, round(PIECES_PER_TIME * setup.num_times)), MAX_KEY_TIMES)
         self.buffers = {"positions": NOTHING}
-        sizes = head_sizes(options)
-        tensors = {name: torch.zeros(0, self.num_points, size, device="cpu") for name, size in sizes.items()}
-        rates = {
-            "means": options.lr_means * setup.extent,
-        } | LR
-        self.parameters = Parameters(tensors, {name: rates[name] for name in sizes}, LR_DECAY)
+        self.parameters = self._untrained(0)
 
     def restored(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
         buffers = part_of(tensors, "buffers")
         count, moving = len(buffers["positions"]), self.setup.num_moving
         require_tensor("positions", buffers["positions"], (count, 3))
         learned = part_of(tensors, "learned")
-        field = self.with_parameters(self.parameters.restored(learned, dict.fromkeys(head_sizes(self.options), count)))
+        field = copy.copy(self)
+        if not self.options.pieces:  # as many as the motion needed, see ``started``
+            num_points = learned["means"].shape[1] if learned["means"].ndim == 3 else 0
+            field.num_pieces = min(max(1, num_points - SPAN + 1), MAX_KEY_TIMES)
+        field.parameters = field._untrained(0).restored(learned, dict.fromkeys(head_sizes(self.options), count))
         if count:
             require_positive("radii", require_tensor("radii", buffers["radii"], (count,)))
         for name, length in (("followed", moving), ("neighbours", count)):
@@ -70,6 +69,25 @@ class ControlNodes(NetworkField):
         if "followed" in buffers and not 1 <= buffers["followed"].shape[1] <= FOLLOWED:
             raise ValueError(f"'followed' names {buffers['followed'].shape[1]} nodes for each Gaussian")
         field.buffers = buffers
+        return field
+
+    def started(self, positions: Tensor, splines: Mapping[str, Tensor]) -> ControlNodes:
+        """Return an untrained field whose nodes lie at ``positions`` and already move along ``splines``.
+
+        Nodes are still placed where Gaussians are far from any, and begin with the motion of those around them: where
+        nothing should move at first, nodes that stand still must be among the given ones.
+
+        Args:
+            positions: (S, 3) canonical, no two alike.
+            splines: by head, the control points (S, P, size); heads that are not given stay 0. P is the number of
+                pieces, from now on that of all splines, plus 3.
+        """
+        field, count = copy.copy(self), len(positions)
+        field.num_pieces = splines["means"].shape[1] - SPAN + 1
+        field.parameters = field._untrained(count)
+        for name, points in splines.items():
+            field.parameters[name].data.copy_(points)
+        field.buffers = {"positions": positions.detach().clone()}
         return field
 
     def state(self) -> State:
@@ -178,6 +196,13 @@ class ControlNodes(NetworkField):
         if "logit_opacities" in parts:
             parts["logit_opacities"] = parts["logit_opacities"][:, 0]
         return Offsets(**parts)
+
+    def _untrained(self, count: int) -> Parameters:
+        """Return the parameters of ``count`` nodes that stand still."""
+        sizes = head_sizes(self.options)
+        tensors = {name: torch.zeros(count, self.num_points, size, device="cpu") for name, size in sizes.items()}
+        rates = {"means": self.options.lr_means * self.setup.extent} | LR
+        return Parameters(tensors, {name: rates[name] for name in sizes}, LR_DECAY)
 
     def _splines(self) -> dict[str, Tensor]:
         """Return the control points (S, P, size) by head."""

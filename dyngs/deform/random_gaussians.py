@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -23,29 +24,24 @@ def with_random_gaussians(gaussians: Gaussians, count: int, extent: float, gener
     center, half_size = box_of(gaussians, extent)
     places = center + half_size * (2 * torch.rand((count, 3), generator=generator, device="cpu") - 1)
     spacing = float((2 * half_size).prod() / max(count, 1)) ** (1 / 3)
-    source = torch.cat(
-        [
-            torch.arange(len(gaussians), device=gaussians.means.device),
-            torch.zeros(count, dtype=torch.long, device=gaussians.means.device),
-        ]
+    added = Gaussians(
+        means=places,
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=gaussians.means.device).expand(count, 4),
+        log_scales=torch.full((count, 3), math.log(SCALE * spacing), device=gaussians.means.device),
+        logit_opacities=torch.full((count,), LOGIT, device=gaussians.means.device),
+        sh=torch.zeros(count, *gaussians.sh.shape[1:], device=gaussians.means.device),
     )
-    is_new = torch.arange(len(source), device=gaussians.means.device) >= len(gaussians)
-    changes = {
-        "means": torch.cat([gaussians.means, places]),
-        "quats": torch.cat(
-            [gaussians.quats, torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=gaussians.means.device).expand(count, 4)]
-        ),
-        "log_scales": torch.cat(
-            [
-                gaussians.log_scales,
-                torch.full((count, 3), math.log(SCALE * spacing), device=gaussians.means.device),
-            ]
-        ),
-        "logit_opacities": torch.cat(
-            [gaussians.logit_opacities, torch.full((count,), LOGIT, device=gaussians.means.device)]
-        ),
-        "sh": torch.cat([gaussians.sh, torch.zeros(count, *gaussians.sh.shape[1:], device=gaussians.means.device)]),
-    }
+    return with_gaussians(gaussians, [added])
+
+
+def with_gaussians(gaussians: Gaussians, added: Sequence[Gaussians]) -> EditResult:
+    """Return the edit that adds ``added``, all of the same degree, after ``gaussians``."""
+    device, count = gaussians.means.device, sum(map(len, added))
+    old, new = (torch.arange(len(gaussians), device=device), torch.zeros(count, dtype=torch.long, device=device))
+    source = torch.cat([old, new])
+    is_new = torch.arange(len(source), device=device) >= len(gaussians)
+    parts = [part.tensors() for part in (gaussians, *added)]
+    changes = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     return EditResult(TopologyEdit(source, is_new), changes)
 
 

@@ -17,15 +17,17 @@ from dyngs.camera import Cameras
 from dyngs.config import DynamicModel
 from dyngs.data.loader import Picture
 from dyngs.deform.field import FieldSetup, Offsets, deformed
-from dyngs.deform.fields import new_field
+from dyngs.deform.fields import can_begin_on_its_way, field_on_its_way, new_field
 from dyngs.deform.motion import bake_, measure_motion
-from dyngs.deform.random_gaussians import box_of, with_random_gaussians
+from dyngs.deform.random_gaussians import box_of, with_gaussians, with_random_gaussians
 from dyngs.deform.scene import DynamicScene
+from dyngs.deform.standing.changes import Footage
+from dyngs.deform.standing.start import FirstMotion, first_motion
 from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.scene import Moment, Scene
-from dyngs.state import State
+from dyngs.state import Role, State, with_role
 from dyngs.static.filters import FILTER_VARIANCE, filter_std
 from dyngs.static.rates import Rates
 from dyngs.static.training import FilterUpdate
@@ -68,6 +70,7 @@ class TrainingViews:
         extent: of the scene, world units.
         still_errors: how far its pictures disagree with what is still, where N Gaussians are seen.
         cameras_stay: in place, so that pictures show what is still exactly alike.
+        standing: returns what those cameras show.
     """
 
     times: tuple[float, ...]
@@ -75,6 +78,7 @@ class TrainingViews:
     extent: float
     still_errors: Callable[[Callable[[float], Gaussians]], StillErrors]
     cameras_stay: bool = False
+    standing: Callable[[], Sequence[Footage]] = tuple
 
 
 class DynamicTraining:
@@ -96,8 +100,7 @@ class DynamicTraining:
     ) -> None:
         self.options, self.schedule, self.capture = options, schedule, capture
         self.times = tuple(sorted(set(capture.times)))
-        phases = schedule.fine, schedule.opens, schedule.full
-        self._window = TimeWindow.around_middle(capture.times, options.time_window, *phases)
+        self._window = self._window_from(options.time_window)
         self._update, self._generator = update, generator
 
     def first_scene(self, gaussians: Gaussians) -> DynamicScene:
@@ -152,14 +155,21 @@ class DynamicTraining:
             return None
         threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(found.usual > threshold)[:, 0]
-        num_added = self.options.num_random_moving
-        result = with_random_gaussians(now.detach(), num_added, self.capture.extent, self._generator)
-        added = torch.arange(len(now), len(now) + num_added, device=rows.device)
-        moving = torch.cat([rows, added])
+        first = self._first_motion(now.detach())
+        if first.seeds:
+            result = replace(with_gaussians(now.detach(), first.gaussians), finding=first.finding)
+        else:
+            num_added = self.options.num_random_moving
+            result = with_random_gaussians(now.detach(), num_added, self.capture.extent, self._generator)
+        gaussians = Gaussians(**result.changes)
+        moving = torch.cat([rows, torch.arange(len(now), len(gaussians), device=rows.device)])
         center, half_size = box_of(now, self.capture.extent)
         setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
-        field = new_field(self.options.deform, setup, self._generator)
-        gaussians = Gaussians(**result.changes)
+        if first.seeds:
+            field = field_on_its_way(self.options.deform, setup, first, now.means.detach()[rows])
+            self._window = self._window_from(1.0)  # what is on its way need not be followed outwards
+        else:
+            field = new_field(self.options.deform, setup, self._generator)
         std = self._update.of(gaussians)
         return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
 
@@ -176,10 +186,24 @@ class DynamicTraining:
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> DynamicScene:
         scene = DynamicScene.restored(self.options, gaussians, tensors)
+        self._window = self._window_from(1.0 if "tracked" in tensors else self.options.time_window)
         return replace(scene, colour=like.colour, options=like.options, background=like.background)
 
     def state(self) -> State:
-        return {}
+        """Return whether tracks are known, so that all times are trained on."""
+        if self._window.first == self.options.time_window:
+            return {}
+        return with_role({"tracked": torch.ones(1, device="cpu")}, Role.TRAINING)
+
+    def _window_from(self, first: float) -> TimeWindow:
+        schedule = self.schedule
+        return TimeWindow.around_middle(self.capture.times, first, schedule.fine, schedule.opens, schedule.full)
+
+    def _first_motion(self, still: Gaussians) -> FirstMotion:
+        """Return what travels before standing cameras, for a field that can begin on its way."""
+        if not can_begin_on_its_way(self.options.deform):
+            return FirstMotion()
+        return first_motion(self.capture.standing(), still, self.capture.extent, self.options.num_random_moving)
 
     def _frozen(self, scene: DynamicScene) -> DynamicScene:
         """Return the scene in which Gaussians whose motion is too small to be seen no longer move."""

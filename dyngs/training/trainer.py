@@ -189,9 +189,9 @@ class Trainer:
             self.scene = self.scene.with_gaussians(self.optimizer.parameters)
             self._follow(result)
         self.done = step
-        finding = self._drop_harmonics(step)
+        findings = (self._drop_harmonics(step), None if grown is None else grown[1].finding)
         self.scene.changed()
-        return self.priors.told(finding)
+        return self.priors.told("; ".join(text for text in findings if text) or None)
 
     def _apply(self, result: EditResult) -> None:
         """Change the set of Gaussians, and everything that is stored per Gaussian with it."""
