@@ -63,7 +63,13 @@ from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.scene import StaticScene
 from dyngs.static.training import FilterUpdate, StaticTraining
-from dyngs.training.background import background_colour, evaluation_background
+from dyngs.training.background import (
+    PICTURES,
+    AlphaWeight,
+    background_colour,
+    evaluation_background,
+    measured_alpha_weight,
+)
 from dyngs.training.limits import within_cap
 from dyngs.training.loop import Trainable
 from dyngs.training.prediction import assemble_network
@@ -165,6 +171,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         extent=extent,
         world_offset=(x, y, z),
         has_test_views=bool(capture.splits.get("test")),
+        alpha=_alpha_weight(config, capture, pictures),
         generator=generator,
         held_out=held_out_views(capture.splits["train"], config.train.hold_out_every),
         held_out_until=hold_out_until(config.train),
@@ -279,6 +286,19 @@ def _static_or_dynamic(
             return DynamicTraining(model, deform_schedule(model, rates_of(config)), views, update, generator)
         case _:
             return StaticTraining(update)
+
+
+def _alpha_weight(config: Config, capture: Capture, pictures: PictureLoader) -> AlphaWeight:
+    """Return how much silhouettes count: what was asked for, or what moving things before this background need."""
+    asked, background = config.train.alpha_weight, resolved_background(config, capture)
+    if asked is not None:
+        return AlphaWeight(asked)
+    match config.model:
+        case DynamicModel() if capture.has_alpha and background != "random" and len(set(training_times(capture))) > 1:
+            shown = (pictures[i] for i in evenly_spaced(len(pictures), PICTURES))
+            return measured_alpha_weight(shown, background_colour(background))
+        case _:
+            return AlphaWeight()
 
 
 def human_start(

@@ -43,6 +43,7 @@ from dyngs.static.densify import DefaultDensifier
 from dyngs.static.fixed import FixedDensifier
 from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.scene import StaticScene
+from dyngs.training.background import AlphaWeight
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +145,22 @@ def test_times_make_a_dynamic_model(capture: Path, tmp_path: Path) -> None:
     assert trainer.scene.times == (0.0, 0.25, 0.5, 1.0)
     assert trainer.training.schedule.rates.steps == 12
     assert isinstance(assemble(_dynamic(root, model=StaticModel())).scene, StaticScene)
+
+
+def test_silhouettes_are_weighed_by_measurement_only_where_things_may_move(capture: Path, tmp_path: Path) -> None:
+    """A weight that is given holds for all."""
+    root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
+    given = TrainConfig(steps=12, alpha_weight=0.3)
+    moving = assemble(_dynamic(root)).alpha
+    assert moving.finding is not None
+    assert "opaque pixels" in moving.finding
+    assert assemble(_dynamic(root, train=given)).alpha == AlphaWeight(0.3)
+    random = DataConfig(root=root, background="random")
+    for config in (_dynamic(root, model=StaticModel()), _dynamic(capture), _dynamic(root, data=random)):
+        assert assemble(config).alpha == AlphaWeight()
+    trainer = assemble(_dynamic(root))
+    assert trainer.step().finding == moving.finding
+    assert trainer.step().finding is None
 
 
 @pytest.mark.parametrize("times", [None, [0.5] * 5], ids=["no times", "one time"])

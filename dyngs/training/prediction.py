@@ -121,7 +121,7 @@ class NetworkTrainer:
             rendering = scene.render(picture.cameras, moment, options=drawing, background=background)
             truth = picture.composite(background)
             loss = l1_ssim_loss(rendering.rgb[0], truth, options.ssim_weight, picture.mask)
-            if options.alpha_weight > 0 and picture.alpha is not None:
+            if options.alpha_weight and picture.alpha is not None:
                 loss = loss + options.alpha_weight * (rendering.alpha[0] - picture.alpha).abs().mean()
             total = total + loss / len(targets)
         if not math.isfinite(float(total.detach())):

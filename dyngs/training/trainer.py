@@ -25,7 +25,7 @@ from dyngs.state import Role, State, prefixed, tensors_of, with_role
 from dyngs.static.densify import Densifier
 from dyngs.static.fixed import FixedDensifier
 from dyngs.static.optimizer import GaussianOptimizer
-from dyngs.training.background import background_colour
+from dyngs.training.background import AlphaWeight, background_colour
 from dyngs.training.events import StepReport
 from dyngs.training.priors.used import StepView, UsedPriors
 from dyngs.training.sampler import ViewSampler
@@ -43,6 +43,7 @@ class Trainer:
         densifier: the strategy, which adds and removes Gaussians.
         options: how training pictures are drawn.
         background: "white", "black" or "random" (a new colour in each step, behind render and truth alike).
+        alpha: how much silhouettes count in the loss.
         generator: the only source of randomness, on the CPU.
         priors: what the user knows about the capture.
         done: steps done.
@@ -64,6 +65,7 @@ class Trainer:
     extent: float
     world_offset: tuple[float, float, float]
     has_test_views: bool
+    alpha: AlphaWeight
     generator: torch.Generator
     priors: UsedPriors = field(default_factory=UsedPriors)
     done: int = 0
@@ -102,8 +104,8 @@ class Trainer:
         rendering = scene.render(picture.cameras, moment, options=options, background=background, probe=probe)
         rendered, truth = rendering.rgb[0], picture.composite(background)
         terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
-        if config.train.alpha_weight > 0 and picture.alpha is not None:
-            terms["alpha"] = config.train.alpha_weight * (rendering.alpha[0] - picture.alpha).abs().mean()
+        if self.alpha.weight > 0 and picture.alpha is not None:
+            terms["alpha"] = self.alpha.weight * (rendering.alpha[0] - picture.alpha).abs().mean()
         terms |= moment.penalties
         first, last = self.training.window(step)
         view = StepView(index, lambda time: first <= time <= last, options)
@@ -115,7 +117,8 @@ class Trainer:
             size = (picture.cameras.width, picture.cameras.height)
             # Fewer Gaussians suit small pictures: a gradient counts for less there.
             self.densifier.after_backward(step, probe.grad / divisor, rendering.radii, size)
-        finding = self._update(step)
+        found = (self.alpha.finding if step == 1 else None, self._update(step))
+        finding = "; ".join(text for text in found if text is not None) or None
         return StepReport(step, loss, picture, rendered.detach(), truth, finding)
 
     def holds_out(self, index: int, step: int) -> bool:
