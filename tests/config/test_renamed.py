@@ -41,16 +41,14 @@ ADDED = {"dynamic": ("model.compare_with_still=false",)}
 
 
 def with_choices(config: Config) -> Config:
-    """``config``, in which numbers that stood for never, or for no choice, are what a preset now says instead."""
-    strategy, train = config.strategy, config.train
-    if train.alpha_weight == 0:
-        train = train.model_copy(update={"alpha_weight": None})
+    """``config``, in which numbers that stood for never are what a preset now says instead."""
+    strategy = config.strategy
     if isinstance(strategy, DefaultStrategy):
         if strategy.max_gaussians == 1:
             strategy = strategy.model_copy(update={"grow": False, "max_gaussians": DefaultStrategy().max_gaussians})
         if strategy.reset_every == 1_000_000:
             strategy = strategy.model_copy(update={"reset_every": None})
-    return config.model_copy(update={"strategy": strategy, "train": train})
+    return config.model_copy(update={"strategy": strategy})
 
 
 @pytest.mark.parametrize("preset", PRESETS)
