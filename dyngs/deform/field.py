@@ -84,6 +84,11 @@ class DeformationField(Protocol):
         """Number of values that the field stores."""
         ...
 
+    @property
+    def taken_untried(self) -> tuple[str, ...]:
+        """Options ("rigid_groups", "lifetimes") that are on whether they win a trial or not."""
+        ...
+
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """Return the offsets at ``time``.
 
@@ -104,6 +109,14 @@ class DeformationField(Protocol):
 
     def edited(self, edit: TopologyEdit) -> DeformationField:
         """Return the field after an edit of the moving Gaussians."""
+        ...
+
+    def with_groups(self, means: Tensor) -> DeformationField | None:
+        """Return the field with rigid groups that move ``means`` (M, 3) nearly as now; None: there are none."""
+        ...
+
+    def with_lifetimes(self, means: Tensor) -> DeformationField | None:
+        """Return the field with a long time window for each of ``means`` (M, 3); None: it has none, or has them."""
         ...
 
     def regroup(self) -> None:
@@ -138,6 +151,11 @@ class NetworkField:
     def num_values(self) -> int:
         return self.parameters.num_values
 
+    @property
+    def taken_untried(self) -> tuple[str, ...]:
+        """Return nothing: only nodes form groups."""
+        return ()
+
     def penalties(self, time: float) -> dict[str, Tensor]:
         return {}
 
@@ -146,6 +164,12 @@ class NetworkField:
 
     def edited(self: F, edit: TopologyEdit) -> F:
         return self
+
+    def with_groups(self, means: Tensor) -> DeformationField | None:
+        """Return None: only nodes form groups."""
+
+    def with_lifetimes(self, means: Tensor) -> DeformationField | None:
+        """Return None: only what follows nodes has time windows."""
 
     def regroup(self) -> None:
         """Do nothing: nothing is derived from the set of Gaussians."""

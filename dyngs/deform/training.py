@@ -26,7 +26,7 @@ from dyngs.deform.standing.start import FirstMotion, first_motion
 from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.scene import Moment, Scene
+from dyngs.scene import Moment, Scene, Variant
 from dyngs.state import Role, State, with_role
 from dyngs.static.filters import FILTER_VARIANCE, filter_std
 from dyngs.static.rates import Rates
@@ -36,6 +36,8 @@ SURELY_MOVING = 1.5
 """Multiple of ``motion_threshold`` above which an error always counts as motion."""
 SURELY_STILL = 0.25
 """Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in place."""
+TRIAL, MIN_TRIAL = 0.015, 40
+"""Steps of a trial, as a share of the run, and fewest of them."""
 MIN_MOVING_SHARE = 0.02
 """Share of surely moving Gaussians up to which the scene counts as still."""
 
@@ -50,6 +52,8 @@ class DeformSchedule:
         decays: step from which the field's rates fall.
         splits: steps after which Gaussians that do not move are frozen.
         rates: how the field's rates fall.
+        groups: step after which what moves may form rigid groups.
+        lifetimes: step after which moving Gaussians may get time windows.
     """
 
     fine: int
@@ -58,6 +62,8 @@ class DeformSchedule:
     decays: int
     splits: tuple[int, ...]
     rates: Rates
+    groups: int = 0
+    lifetimes: int = 0
 
 
 @dataclass(frozen=True)
@@ -172,6 +178,21 @@ class DynamicTraining:
             field = new_field(self.options.deform, setup, self._generator)
         std = self._update.of(gaussians)
         return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
+
+    def variant(self, scene: DynamicScene, step: int) -> Variant[DynamicScene] | None:
+        """Return the scene with its nodes in rigid groups, or with time windows, once all times are seen."""
+        if scene.field is None or step not in (self.schedule.groups, self.schedule.lifetimes):
+            return None
+        means = scene.gaussians.means.detach()[scene.moving]
+        if step == self.schedule.groups:
+            name, key, field = "rigid groups of control nodes", "rigid_groups", scene.field.with_groups(means)
+        else:
+            name, key, field = "time windows of moving Gaussians", "lifetimes", scene.field.with_lifetimes(means)
+        if field is None:
+            return None
+        steps = self.schedule.rates.steps
+        count = min(max(MIN_TRIAL, round(TRIAL * steps)), (steps - step) // 2)
+        return Variant(name, replace(scene, field=field), 0 if key in field.taken_untried else count)
 
     def all_moving(self, scene: DynamicScene, extent: float) -> DynamicScene:
         if not scene.is_still:

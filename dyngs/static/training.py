@@ -74,6 +74,9 @@ class StaticTraining:
         """Return None: the set of Gaussians is left to the strategy."""
         return None
 
+    def variant(self, scene: Scene, step: int) -> None:
+        """Return None: there is nothing to choose from."""
+
     def all_moving(self, scene: StaticScene, extent: float) -> StaticScene:
         """Return ``scene``: nothing moves."""
         return scene

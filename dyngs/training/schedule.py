@@ -35,6 +35,10 @@ MIN_COARSE_STEPS = 1000
 """Steps that a still model needs to show where it fails; short runs spend at most a third on it."""
 SPLITS = (0.1, 0.3, 0.5)
 """Steps at which still Gaussians are frozen, as shares of the part of the run that sees all times."""
+GROUPS = 0.12
+"""The step at which nodes may form rigid groups, likewise: after the first split."""
+LIFETIMES = 0.16
+"""The step at which Gaussians may get time windows, likewise."""
 
 
 def scaled(step: int, steps: int) -> int:
@@ -133,7 +137,9 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
     full = max(opens, round(model.time_window_full_at * steps))
     decays = full if model.time_window < 1 else fine
     splits = sorted({full + round(share * (steps - full)) for share in SPLITS}) if model.freeze_below_px > 0 else []
-    return DeformSchedule(fine, opens, full, decays, tuple(step for step in splits if step > full), rates)
+    splits = tuple(step for step in splits if step > full)
+    groups, lifetimes = (full + round(share * (steps - full)) for share in (GROUPS, LIFETIMES))
+    return DeformSchedule(fine, opens, full, decays, splits, rates, groups, lifetimes)
 
 
 def motion_begins_after(config: Config, steps: int) -> int | None:

@@ -31,6 +31,7 @@ from dyngs.training.priors.used import StepView, UsedPriors
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.schedule import active_sh_degree, means_rate, picture_divisor, rates_of
 from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
+from dyngs.training.trial import decide
 
 
 @dataclass
@@ -118,6 +119,9 @@ class Trainer:
             # Fewer Gaussians suit small pictures: a gradient counts for less there.
             self.densifier.after_backward(step, probe.grad / divisor, rendering.radii, size)
         found = (self.alpha.finding if step == 1 else None, self._update(step))
+        variant = self.training.variant(self.scene, step)
+        if variant is not None:
+            found = (*found, decide(self, variant))
         finding = "; ".join(text for text in found if text is not None) or None
         return StepReport(step, loss, picture, rendered.detach(), truth, finding)
 

@@ -82,6 +82,16 @@ class ControlNodesField(FieldSection):
         "spacings; lower where things bend",
     )
     smoothness: float = Field(default=0.01, ge=0, description="weight of the nodes' squared acceleration")
+    rigid_groups: Literal["never", "auto", "always"] = Field(
+        default="never",
+        description="nodes that move rigidly get one motion per body once all times are seen; auto: if that wins a "
+        "trial",
+    )
+    lifetimes: Literal["never", "auto", "always"] = Field(
+        default="never",
+        description="each moving Gaussian gets a time window and a velocity once all times are seen, for things that "
+        "come and go; auto: if that wins a trial",
+    )
 
 
 class TrajectoryField(FieldSection):

@@ -101,6 +101,9 @@ class HumanTraining:
         """Return None: the set of Gaussians is left to the strategy."""
         return None
 
+    def variant(self, scene: Scene, step: int) -> None:
+        """Return None: there is nothing to choose from."""
+
     def all_moving(self, scene: HumanScene, extent: float) -> HumanScene:
         """Return ``scene``: they do."""
         return scene
