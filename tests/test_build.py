@@ -151,14 +151,16 @@ def test_silhouettes_are_weighed_by_measurement_only_where_things_may_move(captu
     """A weight that is given holds for all."""
     root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
     given = TrainConfig(steps=12, alpha_weight=0.3)
-    moving = assemble(_dynamic(root)).alpha
+    unset = TrainConfig(steps=12, alpha_weight=None)
+    moving = assemble(_dynamic(root, train=unset)).alpha
     assert moving.finding is not None
     assert "opaque pixels" in moving.finding
     assert assemble(_dynamic(root, train=given)).alpha == AlphaWeight(0.3)
     random = DataConfig(root=root, background="random")
-    for config in (_dynamic(root, model=StaticModel()), _dynamic(capture), _dynamic(root, data=random)):
-        assert assemble(config).alpha == AlphaWeight()
-    trainer = assemble(_dynamic(root))
+    for changes in ({"model": StaticModel()}, {"data": DataConfig(root=capture)}, {"data": random}):
+        assert assemble(_dynamic(root, train=unset, **changes)).alpha == AlphaWeight()
+    assert assemble(_dynamic(root)).alpha == AlphaWeight(), "0 unless a preset leaves it open"
+    trainer = assemble(_dynamic(root, train=unset))
     assert trainer.step().finding == moving.finding
     assert trainer.step().finding is None
 

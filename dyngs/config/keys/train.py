@@ -26,7 +26,7 @@ class TrainConfig(Section):
         default=0.2, description="weight w of 1 - SSIM; the loss is (1 - w) L1 + w (1 - SSIM)"
     )
     alpha_weight: float | None = Field(
-        default=None,
+        default=0.0,
         ge=0,
         description="weight of the mean error of alpha, where pictures have alpha; null: 0.1 for a moving scene in "
         "front of a background of its own colours, else 0",
