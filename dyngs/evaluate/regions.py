@@ -130,8 +130,7 @@ def foreground_of(picture: Picture) -> Tensor | None:
 
 def given_motion(picture: Picture) -> Tensor | None:
     """Return (H, W) bool, the pixels of which the view's motion mask says that they move; None without one."""
-    moves = getattr(picture, "moves", None)
-    return None if moves is None else moves >= 0.5
+    return None if picture.moves is None else picture.moves >= 0.5
 
 
 def _psnr_inside(part: Tensor | None, picture: Picture, rendered: Tensor, truth: Tensor) -> float | None:

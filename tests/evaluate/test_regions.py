@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -26,13 +26,6 @@ from dyngs.evaluate.regions import (
 
 SIDE = 24
 WHITE = torch.ones(3)
-
-
-@dataclass(frozen=True)
-class Masked(Picture):
-    """A picture with a motion mask."""
-
-    moves: torch.Tensor | None = None
 
 
 def pictures_of_a_walk(count: int = 5) -> list[Picture]:
@@ -90,8 +83,8 @@ def test_scores_are_those_of_the_pixels_of_each_region() -> None:
 def test_motion_masks_come_first_and_empty_background_counts_nowhere() -> None:
     moves, alpha = torch.zeros(SIDE, SIDE), torch.zeros(SIDE, SIDE)
     moves[:, :12], alpha[:12] = 1.0, 1.0
-    plain = replace(pictures_of_a_walk()[0], alpha=alpha, rgb_premultiplied=torch.zeros(SIDE, SIDE, 3))
-    picture = Masked("v0", plain.cameras, plain.rgb_premultiplied, alpha, None, 0.0, moves=moves)
+    black = torch.zeros(SIDE, SIDE, 3)
+    picture = replace(pictures_of_a_walk()[0], alpha=alpha, rgb_premultiplied=black, moves=moves)
     regions = regions_of([picture])
     truth = picture.composite(WHITE)
     rendered = truth.clone()

@@ -242,6 +242,9 @@ def test_parts_of_a_moving_scene_are_measured(tmp_path, capsys) -> None:
     report = evaluate_run(run_dir)
     assert report.psnr_foreground is not None
     assert report.psnr_foreground < report.psnr, "less white background"
+    assert report.moving_from == "motion masks"
+    assert report.psnr_moving is not None
+    assert report.psnr_still is not None
     assert report.track_error_px is not None
     assert report.track_motion_px is not None
     assert 0 < report.track_error_px < report.track_motion_px
