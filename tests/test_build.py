@@ -230,6 +230,20 @@ def test_no_points_are_triangulated_for_what_is_restored(tmp_path: Path, monkeyp
     assert all(torch.equal(x, tensors[name]) for name, x in again.checkpoint().tensors.items())
 
 
+def test_what_spoils_a_training_is_said_before_it(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Once, to stderr; nothing where a run goes on."""
+    root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 0.055, 0.5, 0.25])
+    config = _dynamic(root)
+    assemble(config)
+    said = capsys.readouterr()
+    assert said.err.count("dyngs: warning: times run from 0 to 0.5 and were scaled to [0, 1]") == 1
+    assert said.out == ""
+    assemble(config, restored=True)
+    assert capsys.readouterr().err == ""
+
+
 def test_a_still_blender_scene_begins_with_random_points(capture: Path) -> None:
     config = Config(data=DataConfig(root=capture), init=PointsInit(num_random=7))
     assert with_points(read_capture(config.data), config).points is None
