@@ -129,13 +129,13 @@ def _random_points(
 def _seen_together(views: Sequence[View], count: int, generator: torch.Generator) -> Tensor:
     """Return ``count`` random points (N, 3) float64 in what the cameras see together, see ``points_in_frusta``.
 
-    A candidate is taken with a chance proportional to the number of views that see it; those that fewer than
-    ``MIN_VIEWS`` see come last. So most points lie where most cameras look, some wherever depth can be told.
+    A candidate is taken with a chance proportional to the square of the number of views that see it; those that fewer
+    than ``MIN_VIEWS`` see come last. So most points lie where most cameras look, some wherever depth can be told.
     """
     unit = torch.rand((CANDIDATES * count, 5), generator=generator, dtype=torch.float64, device="cpu").numpy()
     xyz, seen = points_in_frusta(views, unit[:, :4])
     # The largest of u^(1 / weight) are a weighted sample without replacement (Efraimidis and Spirakis 2006).
-    order = np.log(np.maximum(unit[:, 4], 1e-300)) / np.maximum(seen, 1)
+    order = np.log(np.maximum(unit[:, 4], 1e-300)) / np.maximum(seen, 1) ** 2
     order[seen < min(MIN_VIEWS, len(views))] -= 1e6
     return torch.from_numpy(xyz[np.sort(np.argsort(-order, kind="stable")[:count])])
 

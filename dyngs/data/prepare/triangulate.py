@@ -36,9 +36,9 @@ MAX_FEATURES = 2048
 """SIFT features per picture."""
 CLIP_PICTURES = 50
 """Pictures of a clip, evenly spaced in time, that points are triangulated from."""
-TIME_STEPS = (1, 2, 6)
+TIME_STEPS = (1, 2, 4, 8)
 """Each picture of a clip is matched with those so many pictures before and after it,"""
-OVERLAPPING = 2
+OVERLAPPING = 4
 """and with so many others that share most of what they see."""
 MAX_TURN = 45.0
 """Degrees between the optical axes beyond which pictures are not matched for their overlap: SIFT does not."""
