@@ -102,8 +102,11 @@ def test_without_times_the_views_are_evenly_chosen(room: DataConfig) -> None:
     assert [view.name for view in views_of_a_moment(views, 4)] == ["0", "3", "6", "9"]
 
 
-def test_over_a_clip_what_stands_has_points_and_what_moves_has_none(room: DataConfig, tmp_path: Path) -> None:
+def test_over_a_clip_what_stands_has_points_and_what_moves_has_none(
+    room: DataConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One camera, at another place at each time; a patch that moves about violates the poses."""
+    monkeypatch.setattr("dyngs.data.prepare.triangulate.MIN_CLIP_POINTS", 30)
     patch = np.kron(np.random.default_rng(0).random((12, 12, 3)), np.ones((4, 4, 1)))
     corners = [(8, 100), (90, 20), (40, 60), (100, 110), (20, 30), (70, 90), (55, 10), (30, 70)]
     views = []
@@ -125,9 +128,12 @@ def test_over_a_clip_what_stands_has_points_and_what_moves_has_none(room: DataCo
         offset = 160 * places - corner
         on_patch += inside & (offset > 4).all(axis=1) & (offset < 44).all(axis=1)
     assert (on_patch >= len(views) - 2).mean() < 0.05
+    monkeypatch.setattr("dyngs.data.prepare.triangulate.MIN_CLIP_POINTS", len(found.xyz))
     again = points_over_clip(views, room)
     assert again is not None
     np.testing.assert_array_equal(again.xyz, found.xyz)
+    monkeypatch.setattr("dyngs.data.prepare.triangulate.MIN_CLIP_POINTS", len(found.xyz) + 1)
+    assert points_over_clip(views, room) is None
 
 
 def test_pairs_of_a_clip_are_bounded(room: DataConfig) -> None:
