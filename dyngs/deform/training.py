@@ -106,7 +106,7 @@ class DynamicTraining:
     ) -> None:
         self.options, self.schedule, self.capture = options, schedule, capture
         self.times = tuple(sorted(set(capture.times)))
-        self._window = self._window_from(options.time_window)
+        self._on_its_way(False)
         self._update, self._generator = update, generator
 
     def first_scene(self, gaussians: Gaussians) -> DynamicScene:
@@ -161,7 +161,7 @@ class DynamicTraining:
             return None
         threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(found.usual > threshold)[:, 0]
-        first = self._first_motion(now.detach())
+        first = self._first_motion(now.detach(), rows)
         if first.seeds:
             result = replace(with_gaussians(now.detach(), first.gaussians), finding=first.finding)
         else:
@@ -173,7 +173,7 @@ class DynamicTraining:
         setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
         if first.seeds:
             field = field_on_its_way(self.options.deform, setup, first, now.means.detach()[rows])
-            self._window = self._window_from(1.0)  # what is on its way need not be followed outwards
+            self._on_its_way(True)
         else:
             field = new_field(self.options.deform, setup, self._generator)
         std = self._update.of(gaussians)
@@ -207,24 +207,25 @@ class DynamicTraining:
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> DynamicScene:
         scene = DynamicScene.restored(self.options, gaussians, tensors)
-        self._window = self._window_from(1.0 if "tracked" in tensors else self.options.time_window)
+        self._on_its_way("tracked" in tensors)
         return replace(scene, colour=like.colour, options=like.options, background=like.background)
 
     def state(self) -> State:
         """Return whether tracks are known, so that all times are trained on."""
-        if self._window.first == self.options.time_window:
-            return {}
-        return with_role({"tracked": torch.ones(1, device="cpu")}, Role.TRAINING)
+        return with_role({"tracked": torch.ones(1, device="cpu")}, Role.TRAINING) if self._tracked else {}
 
-    def _window_from(self, first: float) -> TimeWindow:
-        schedule = self.schedule
-        return TimeWindow.around_middle(self.capture.times, first, schedule.fine, schedule.opens, schedule.full)
+    def _on_its_way(self, tracked: bool) -> None:
+        """Train on all times from the first where tracks are known: nothing need be followed outwards."""
+        first, schedule = 1.0 if tracked else self.options.time_window, self.schedule
+        phases = schedule.fine, schedule.opens, schedule.full
+        self._tracked, self._window = tracked, TimeWindow.around_middle(self.capture.times, first, *phases)
 
-    def _first_motion(self, still: Gaussians) -> FirstMotion:
+    def _first_motion(self, still: Gaussians, rows: Tensor) -> FirstMotion:
         """Return what travels before standing cameras, for a field that can begin on its way."""
         if not can_begin_on_its_way(self.options.deform):
             return FirstMotion()
-        return first_motion(self.capture.standing(), still, self.capture.extent, self.options.num_random_moving)
+        standing, limit = self.capture.standing(), self.options.num_random_moving
+        return first_motion(standing, still, rows, self.capture.extent, limit)
 
     def _frozen(self, scene: DynamicScene) -> DynamicScene:
         """Return the scene in which Gaussians whose motion is too small to be seen no longer move."""
@@ -256,8 +257,8 @@ class DynamicTraining:
         return min(max(time + noise * max(0.0, 1 - step / self.schedule.rates.steps), 0.0), 1.0)
 
     def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
-        """Return the mean motion as a penalty: what need not move should not."""
-        if self.options.motion_sparsity == 0 or not len(offsets.means):
+        """Return the mean motion as a penalty: what need not move should not. What was found to travel must."""
+        if self.options.motion_sparsity == 0 or self._tracked or not len(offsets.means):
             return {}
         tiny = 1e-6 * self.capture.extent
         length = (offsets.means.square().sum(1) + tiny**2).sqrt().mean()

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import look_around
+from standing_balls import Ball, filmed
 from tiny_fields import KINDS, cloud, stir, tiny_options
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import DynamicModel, OptimConfig, TrajectoryField
+from dyngs.config import ControlNodesField, DynamicModel, OptimConfig, TrajectoryField
 from dyngs.data.loader import Picture
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
@@ -528,3 +530,48 @@ def test_the_box_holds_what_is_solid() -> None:
     logits[2:40], far[2:40] = -10.0, -500.0
     bounded = box_of(gaussians.replace(means=far, logit_opacities=logits), 1.0)
     assert (bounded[1] < 1.5 * half_size).all()
+
+
+# --- standing cameras -------------------------------------------------------------------------------------------------
+
+
+def test_motion_begins_with_what_travels() -> None:
+    """Before standing cameras: no random Gaussians, all times from the start, and the same after a restart."""
+    times = tuple(i / 7 for i in range(8))
+    footage = filmed(lambda t: [Ball((0.0, 0.1, 1.6 * t - 0.8))], times)
+    errors = alike(torch.tensor(ERRORS))
+    deform = ControlNodesField(nodes=32)
+    begin = partial(new_run, flat_cloud(), times, deform=deform, num_random_moving=300, time_window=0.2, full=FINE + 20)
+    run = begin(still_errors=lambda _: errors, motion_threshold=0.1)
+    run.training.capture = replace(run.training.capture, standing=lambda: footage)
+    assert not run.training.trains_on(0.0, FINE + 1)
+    result = run.grow(FINE)
+    assert result is not None
+    assert result.finding is not None
+    assert "1 thing travels" in result.finding
+    added = run.scene.num_moving - 3
+    assert 0 < added < 300
+    assert run.training.trains_on(0.0, FINE + 1)
+    for time in times:
+        middle = run.drawn_at(time).means[-added:].mean(0)
+        assert (middle - torch.tensor([0.0, 0.1, 1.6 * time - 0.8])).norm() < 0.05
+    stored = run.model_state | tensors_of(run.training.state())
+    other = begin()
+    scene = other.training.restored(run.scene.gaussians, stored, run.scene)
+    assert other.training.trains_on(0.0, FINE + 1)
+    assert scene.field is not None
+    assert run.scene.field is not None
+    torch.testing.assert_close(scene.at(0.3).means, run.scene.at(0.3).means)
+
+
+def test_where_nothing_travels_random_gaussians_are_added() -> None:
+    """And for the fields that cannot begin on their way the cameras are not even asked."""
+    errors = alike(torch.tensor(ERRORS))
+    for deform, footage in ((ControlNodesField(nodes=4), filmed(lambda _: [], TIMES[:4])), (TrajectoryField(), None)):
+        run = new_run(flat_cloud(), still_errors=lambda _: errors, deform=deform, num_random_moving=4)
+        run.training.capture = replace(run.training.capture, standing=lambda shown=footage: shown)
+        result = run.grow(FINE)
+        assert result is not None
+        assert result.finding is None
+        assert run.scene.num_moving == 7
+        assert run.training.state() == {}

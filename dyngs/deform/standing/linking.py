@@ -19,8 +19,8 @@ REACH, SPEED_REACH = 3.0, 1.5
 """Radii, and shares of the last displacement, by which a thing may be away from where its velocity takes it."""
 COLOR_REACH, SIZE_REACH = 0.35, 1.2
 """Differences of colour, and of the logarithm of the radius, at which a blob is another thing."""
-TRAVELS = 2.0
-"""Radii between the farthest places of a thing that travels."""
+FEWEST_STEPS, SAME_WAY = 2, 0.2
+"""Steps of at least a radius that a thing which travels makes, and the least correlation of each with the next."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,19 @@ class Track:
 
     @property
     def travels(self) -> bool:
-        """Whether it goes farther than it is large: what turns or bends in place is no track to start from."""
-        spread = self.centers[:, None] - self.centers
-        return float(np.linalg.norm(spread, axis=-1).max()) > TRAVELS * self.radius
+        """Whether it goes on and on: what turns or bends in place is no track to start from.
+
+        Of places a radius apart or more, in the order of time, successive steps must mostly go the same way.
+        """
+        centers = self.centers
+        places = [centers[0]]
+        for center in centers[1:]:
+            if np.linalg.norm(center - places[-1]) >= self.radius:
+                places.append(center)
+        steps: np.ndarray = np.diff(np.stack(places), axis=0)
+        if len(steps) < FEWEST_STEPS:
+            return False
+        return float((steps[1:] * steps[:-1]).sum()) > SAME_WAY * float((steps**2).sum())
 
     def predicted(self, time: float) -> np.ndarray:
         """Return the (3,) place at ``time`` at constant velocity, that of the last two places."""

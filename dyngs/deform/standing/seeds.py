@@ -35,6 +35,13 @@ FIT = 0.1
 """Mean error of a spline, in radii of the thing, that is small enough."""
 BEND = 1e-4
 """Weight of squared second differences in a fit: it decides where a track has gaps, and straight on at its ends."""
+APART = 3.0
+"""Radii from the centre of a thing within which others are near."""
+PAYS = 0.9
+"""Share of the medians' error that may be left where seeds cover a picture."""
+SHOWN = 0.4
+"""Share of the pixels that seeds cover in which a picture must change; else something still hides the thing;
+and of pictures that are not so."""
 JUDGED_TIMES = 8
 """Times at which seeds are compared with the pictures."""
 COVERED = 0.1
@@ -66,7 +73,7 @@ class Seeds:
         return self.gaussians.replace(means=self.gaussians.means + torch.from_numpy(shift).float())
 
 
-def seeds_of(track: Track, footage: Sequence[Footage], limit: int, num_terms: int) -> Seeds:
+def seeds_of(track: Track, footage: Sequence[Footage], limit: int, num_terms: int, others: np.ndarray) -> Seeds:
     """Return at most ``limit`` Gaussians on the surface of what ``track`` follows, coloured from the pictures.
 
     The surface is that of the cubes, in the thing's own frame, which lie in its hulls at many times; the colour of a
@@ -74,6 +81,8 @@ def seeds_of(track: Track, footage: Sequence[Footage], limit: int, num_terms: in
 
     Args:
         num_terms: of the spherical harmonics; the first is set.
+        others: (M, 3) other things that move: the Gaussians begin where the track is apart from them, so that none
+            follows the nodes of another thing.
     """
     points, side = _surface(track)
     count = min(limit, max(len(points) // THINNED, FEWEST))
@@ -81,42 +90,46 @@ def seeds_of(track: Track, footage: Sequence[Footage], limit: int, num_terms: in
         side *= math.sqrt(len(points) / count)
         points = points[np.linspace(0, len(points) - 1, count).round().astype(int)]
     colors = _colors(points, track, footage)
-    middle = len(track.times) // 2
+    begin = _apart(track, others)
     count = len(points)
     sh = torch.zeros(count, num_terms, 3, device="cpu")
     sh[:, 0] = torch.from_numpy((colors - 0.5) / SH_C0).float()
     gaussians = Gaussians(
-        means=torch.from_numpy(points + track.centers[middle]).float(),
+        means=torch.from_numpy(points + track.centers[begin]).float(),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device="cpu").repeat(count, 1),
         log_scales=torch.full((count, 3), math.log(SCALE * side), device="cpu"),
         logit_opacities=torch.full((count,), LOGIT, device="cpu"),
         sh=sh,
     )
-    return Seeds(track, track.times[middle], gaussians)
+    return Seeds(track, track.times[begin], gaussians)
 
 
 def pays(seeds: Seeds, footage: Sequence[Footage]) -> bool:
     """Return whether ``seeds``, drawn over the cameras' medians, are nearer to the pictures than the medians alone.
 
-    Over the pixels that the seeds cover, at some times of the track. A false hull, where silhouettes of different
-    things cross, does not pay.
+    Over the pixels that the seeds cover, at some times of the track, in the pictures in which the thing is not hidden.
+    A false hull, where silhouettes of different things cross, does not pay.
     """
     before = after = 0.0
+    looked_at = shown = 0
     for index in np.unique(np.linspace(0, len(seeds.track.times) - 1, JUDGED_TIMES).round().astype(int)):
         gaussians, time = seeds.placed(int(index)), seeds.track.times[index]
-        for one in footage:
-            if time not in one.times:
-                continue
+        for one in (one for one in footage if time in one.times):
+            i = one.times.index(time)
             with torch.no_grad():
                 drawn = render(gaussians, one.camera)
             alpha = drawn.alpha[0].reshape(*one.changed.shape[1:], 1)
-            i = one.times.index(time)
-            truth = torch.from_numpy(one.pictures[i]).float() / 255
-            still = torch.from_numpy(one.median).float() / 255
             covered = (alpha[..., 0] > COVERED) & torch.from_numpy(one.counted[i])
+            if not bool(covered.any()):
+                continue
+            looked_at += 1
+            if float(torch.from_numpy(one.changed[i])[covered].float().mean()) < SHOWN:
+                continue
+            shown += 1
+            truth, still = (torch.from_numpy(x).float() / 255 for x in (one.pictures[i], one.median))
             before += float((still - truth).abs().sum(-1)[covered].sum())
             after += float((drawn.rgb[0] + (1 - alpha) * still - truth).abs().sum(-1)[covered].sum())
-    return after < before
+    return shown >= SHOWN * looked_at and after < PAYS * before
 
 
 def pieces_for(tracks: Sequence[Track], pieces: range) -> int:
@@ -151,6 +164,15 @@ def _basis(times: Sequence[float], pieces: int) -> np.ndarray:
         piece = min(int(time * pieces), pieces - 1)
         basis[row, piece : piece + SPAN] = cubic_shares(time * pieces - piece).numpy()
     return basis
+
+
+def _apart(track: Track, others: np.ndarray) -> int:
+    """Return the index of the time, near the middle, at which nothing of ``others`` (M, 3) is near, or least so."""
+    from_middle = sorted(range(len(track.times)), key=lambda i: abs(i - (len(track.times) - 1) / 2))
+    if not len(others):
+        return from_middle[0]
+    gaps = [float(np.linalg.norm(others - track.centers[i], axis=1).min()) for i in from_middle]
+    return from_middle[int(np.argmax(np.minimum(gaps, APART * track.radius)))]
 
 
 def _surface(track: Track) -> tuple[np.ndarray, float]:

@@ -20,8 +20,10 @@ from dyngs.deform.standing.linking import Track, linked
 from dyngs.deform.standing.seeds import Seeds, fitted, pays, pieces_for, seeds_of
 from dyngs.gaussians import Gaussians
 
+ROOM = 0.25
+"""Room around the things that stand still and the cameras, in sides of their box."""
 MAX_TRACKS = 24
-NODES_PER_TRACK = 12
+NODES_PER_TRACK = 40
 NODE_SHARE = 0.5
 """Nodes on things that are tracked, as a share of all, at most."""
 
@@ -70,12 +72,15 @@ class FirstMotion:
         )
 
 
-def first_motion(footage: Sequence[Footage], still: Gaussians, extent: float, limit: int) -> FirstMotion:
+def first_motion(
+    footage: Sequence[Footage], still: Gaussians, moving: Tensor, extent: float, limit: int
+) -> FirstMotion:
     """Return what travels before the cameras of ``footage``, wherever ``still`` Gaussians are or the cameras look on.
 
     Args:
         footage: of cameras that stand still; of fewer than two, nothing is found.
         still: the model so far, for the size of the scene.
+        moving: indices of those of its Gaussians that will move, too.
         extent: of the scene, world units.
         limit: number of Gaussians, at most.
     """
@@ -84,10 +89,12 @@ def first_motion(footage: Sequence[Footage], still: Gaussians, extent: float, li
     tracks = found_tracks(footage, *_box(footage, still, extent))
     travelling = [track for track in tracks if track.travels][:MAX_TRACKS]
     seeds: list[Seeds] = []
+    others = still.means[moving].double().numpy()
     for track in travelling:
-        one = seeds_of(track, footage, limit // max(len(travelling), 1), still.sh.shape[1])
+        one = seeds_of(track, footage, limit // max(len(travelling), 1), still.sh.shape[1], others)
         if pays(one, footage):
             seeds.append(one)
+            others = np.concatenate([others, one.gaussians.means.double().numpy()])
     if not seeds:
         return FirstMotion()
     total = len({time for one in footage for time in one.times})
@@ -107,7 +114,9 @@ def found_tracks(footage: Sequence[Footage], low: np.ndarray, high: np.ndarray) 
 
 
 def _box(footage: Sequence[Footage], still: Gaussians, extent: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return two corners (3,) of a box with the still things and the cameras: what moves is seen before those."""
+    """Return two corners (3,) of a box with the still things and the cameras, and some room around."""
     center, half_size = (x.double().numpy() for x in box_of(still, extent))
     centers = np.concatenate([one.camera.centers.double().numpy() for one in footage])
-    return np.minimum(center - half_size, centers.min(0)), np.maximum(center + half_size, centers.max(0))
+    low, high = np.minimum(center - half_size, centers.min(0)), np.maximum(center + half_size, centers.max(0))
+    room = ROOM * (high - low).max()
+    return low - room, high + room

@@ -85,3 +85,11 @@ def test_what_stays_does_not_travel() -> None:
     found = [[blob(random.normal(0, 0.03, 3))] for _ in TIMES]
     (track,) = linked(TIMES, found)
     assert not track.travels
+
+
+def test_what_jumps_to_and_fro_does_not_travel() -> None:
+    """As parts of a thing that turns in place seem to do."""
+    found = [[blob((0.9 * (i % 3 == 0), 0.0, 0.0), 0.1 + 0.1 * (i == 5))] for i in range(len(TIMES))]
+    assert not any(track.travels for track in linked(TIMES, found))
+    once = [[blob((0.9 * (i > 9), 0.0, 0.0))] for i in range(len(TIMES))]
+    assert not any(track.travels for track in linked(TIMES, once))

@@ -31,7 +31,7 @@ def test_seeds_cover_a_ball_and_pay() -> None:
     footage = filmed(lambda t: [ball_at(t)], TIMES, 7)
     track = found_tracks(footage, *BOX)[0]
     assert len(track.times) == len(TIMES)
-    seeds = seeds_of(track, footage, limit=500, num_terms=4)
+    seeds = seeds_of(track, footage, limit=500, num_terms=4, others=np.zeros((0, 3)))
     now = seeds.gaussians
     apart = (now.means - torch.tensor(ball_at(seeds.time).center)).norm(dim=1)
     assert ((apart - BALL.radius).abs() < 0.5 * BALL.radius).float().mean() > 0.8, "a hull has corners"
@@ -40,9 +40,21 @@ def test_seeds_cover_a_ball_and_pay() -> None:
     assert pays(seeds, footage)
     beside = Seeds(track, seeds.time, now.replace(means=now.means + torch.tensor([0.0, 0.9, 0.0])))
     assert not pays(beside, footage)
-    few = seeds_of(track, footage, limit=20, num_terms=1)
+    few = seeds_of(track, footage, limit=20, num_terms=1, others=np.zeros((0, 3)))
     assert len(few.gaussians) == 20
     assert few.gaussians.log_scales[0, 0] > now.log_scales[0, 0]
+
+
+def test_seeds_begin_apart_from_other_things() -> None:
+    """In the middle of the clip, unless something else that moves is there."""
+    footage = filmed(lambda t: [ball_at(t)], TIMES)
+    track = found_tracks(footage, *BOX)[0]
+    begins = [
+        seeds_of(track, footage, 50, 1, np.array(others).reshape(-1, 3)).time
+        for others in ([], [(3.0, 0.0, 0.0)], [(0.1, 0.2, 0.0)])
+    ]
+    assert begins[0] == begins[1] in TIMES[3:5]
+    assert begins[2] in (TIMES[0], TIMES[-1], TIMES[1], TIMES[-2])
 
 
 def test_splines_have_as_many_pieces_as_the_motion_needs() -> None:

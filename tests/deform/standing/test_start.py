@@ -16,7 +16,7 @@ TIMES = tuple(i / 11 for i in range(12))
 
 
 def started(balls: Balls, count: int = 6, limit: int = 600) -> FirstMotion:
-    return first_motion(filmed(balls, TIMES, count), cloud(50), 1.0, limit)
+    return first_motion(filmed(balls, TIMES, count), cloud(50), torch.arange(9), 1.0, limit)
 
 
 def crossing(time: float) -> tuple[float, float, float]:
