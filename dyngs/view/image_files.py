@@ -110,9 +110,10 @@ def write_split_images(run_dir: Path, split: str, out_dir: Path, output: OutputO
 
 
 def files_of(capture: Capture) -> frozenset[Path]:
-    """Return the paths of the pictures and masks of a capture, with symbolic links resolved."""
+    """Return the paths of the pictures, masks and maps of a capture, with symbolic links resolved."""
     views = [view for split in capture.splits.values() for view in split]
-    files = (path for view in views for path in (view.image_path, view.mask_path) if path is not None)
+    own = ("image_path", "mask_path", "depth_path", "motion_mask_path", "flow_path")
+    files = (path for view in views for name in own if (path := getattr(view, name)) is not None)
     return frozenset(path.resolve() for path in files)
 
 
