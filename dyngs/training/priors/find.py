@@ -91,7 +91,7 @@ def _judged_depth(config: Config, pictures: PictureLoader) -> tuple[Kind, Agreem
     triples = []
     for i in spread_pairs([i for i, view in enumerate(views) if view.depth_path]):
         apart = (centers - centers[i]).norm(dim=1) / distance
-        usable = (apart > 0.2 * _BASELINE) & (apart < 5 * _BASELINE) & ((times - times[i]).abs() < _NEAR_TIME)
+        usable = (apart > 0.2 * _BASELINE) & (apart < 12 * _BASELINE) & ((times - times[i]).abs() < _NEAR_TIME)
         cost = (apart / _BASELINE).log().abs() + (times - times[i]).abs() / _NEAR_TIME
         nearest = [int(j) for j in cost.argsort() if usable[j]][:2]
         if len(nearest) == 2:
