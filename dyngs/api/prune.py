@@ -12,12 +12,15 @@ from dyngs.api.train import num_cores, train
 from dyngs.build import assemble
 from dyngs.config import Config, PruneConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.config.kinds import network_of
+from dyngs.config.kinds import network_of, person_of
+from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
 from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
-from dyngs.prune.search import Limit, Search, Stored
+from dyngs.prune.search import MOST_HELD_OUT, Limit, Search, Stored
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, latest_checkpoint, save_checkpoint, seconds_at
 from dyngs.runs.folder import EXPORT_FOLDER, new_folder, require_empty
 from dyngs.runs.log import LOG_NAME
@@ -35,11 +38,12 @@ class Promise:
     Attributes:
         folder: of the new run; its file is in ``EXPORT_FOLDER`` there.
         asked: largest loss on the views held out, dB.
-        before: mean PSNR on the views held out of the run as it is, fine-tuned as long as what is compared with it.
+        before: mean PSNR on ``views`` of the run: as it is, where those are new to it; else fine-tuned like the rest.
         after: that of the file.
         cut: what was taken away, for people; "nothing" where nothing could be.
         limits: why no more was.
-        num_held_out, trials: number of views held out, and of candidates that were fine-tuned.
+        views: that losses were measured on, for people.
+        trials: number of candidates that were fine-tuned.
     """
 
     folder: Path
@@ -48,12 +52,13 @@ class Promise:
     after: float
     cut: str
     limits: tuple[Limit, ...]
-    num_held_out: int
+    views: str
     trials: int
 
     def __str__(self) -> str:
-        views = f"{self.num_held_out} training views held out" if self.num_held_out else "its only training view"
-        kept = f"{self.after - self.before:+.2f} dB on {views}, drawn from the file ({self.asked:g} dB may be lost)"
+        kept = (
+            f"{self.after - self.before:+.2f} dB on {self.views}, drawn from the file ({self.asked:g} dB may be lost)"
+        )
         if self.cut == "nothing":
             told = f"nothing can be taken away for {self.asked:g} dB: the run is as it was; {kept}"
         else:
@@ -102,7 +107,7 @@ def prune_within(
     Args:
         run_dir: a run with at least one checkpoint; an interrupted one counts as finished there.
         out: must not exist, or be empty.
-        max_loss: of PSNR on training views held out, after fine-tuning, drawn from the file, dB.
+        max_loss: of PSNR on views that fine-tuning does not see, drawn from the file, dB.
         overrides: ``prune.steps=N``, ``prune.score``, ``prune.rewind``, ``data.*`` and ``run.threads=N``.
         tell: is told what is tried and found.
 
@@ -120,7 +125,7 @@ def prune_within(
     with kernel_threads(config.run.threads or num_cores()):
         trainer = assemble(config, restored=True)
         trainer.restore(start)
-        search = Search(trainer, start, tell)
+        search = Search(trainer, start, tell, _unseen(config))
         found = search.run(max_loss)
         stored = search.stored(found, max_loss)
     with new_folder(out) as started:
@@ -134,7 +139,7 @@ def prune_within(
         after=stored.file.quality,
         cut=str(chosen.cut),
         limits=(*found.limits, stored.limit),
-        num_held_out=len(found.held_out),
+        views=found.views,
         trials=found.trials,
     )
 
@@ -147,6 +152,18 @@ def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequenc
     if network_of(config) is not None:
         raise DyngsError(f"{run_dir}: a network, not a scene; prune what it predicts")
     return config
+
+
+def _unseen(config: Config) -> list[Picture]:
+    """Return at most ``MOST_HELD_OUT`` pictures of the split `val`, which no training sees; of people none.
+
+    They play other motions there, in which poses are not refined.
+    """
+    views = read_capture(config.data).splits.get("val", ())
+    if not views or person_of(config) is not None:
+        return []
+    loader = PictureLoader(views, config.data)
+    return [loader[i] for i in evenly_spaced(len(loader), MOST_HELD_OUT)]
 
 
 def _copy_start(run_dir: Path, folder: Path) -> None:

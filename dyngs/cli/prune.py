@@ -34,7 +34,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "prune",
         help="take from a run as much as a loss of 0.2 dB allows: a smaller, faster run and its file",
         description="Remove Gaussians, faint blending, control nodes, pieces of splines, harmonics and precision as "
-        "far as training views that were held out lose no more than --max-loss. Every trial is fine-tuned. Writes a "
+        "far as views that fine-tuning does not see lose no more than --max-loss. Every trial is fine-tuned. Writes a "
         "new run folder with its file and prints quality, speed and size before and after.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -45,7 +45,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--max-loss",
         type=_decibels,
         metavar="DB",
-        help=f"largest loss of PSNR on held-out training views, drawn from the file (default {MAX_LOSS})",
+        help=f"largest loss of PSNR on views that fine-tuning does not see, drawn from the file (default {MAX_LOSS})",
     )
     parser.add_argument(
         "--prune", metavar="R", help="no search: remove just this share of the Gaussians, in [0, 1), and nothing else"
@@ -124,7 +124,7 @@ def cost_table(before: Cost, after: Cost, promise: Promise | None = None) -> Tab
         ("PSNR, held-out views", before.psnr_test, after.psnr_test),
     ]
     if promise is not None:
-        rows.insert(1, ("PSNR, training views held out", promise.before, promise.after))
+        rows.insert(1, (f"PSNR, {promise.views}", promise.before, promise.after))
     for label, old, new in rows:
         if old is not None and new is not None:
             table.add_row(label, f"{old:.2f} dB", f"{new:.2f} dB", f"{new - old:+.2f} dB")

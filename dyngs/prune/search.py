@@ -1,9 +1,14 @@
 """The most that can be taken from a run for a given loss, found by bisection.
 
-Some training views are held out. The run as it is and every candidate are fine-tuned equally long on the others, from
-the same checkpoint, with the same views in the same order; the loss of a candidate is the difference of their mean
-PSNR on the views held out. One kind of thing after the other is taken away, as listed in ``ALLOWED``: of each the most,
-by bisection, that keeps the loss below a share of what is allowed, with what was found for those before.
+Every candidate is fine-tuned equally long from the same checkpoint, with the same views in the same order. What it
+loses is measured as mean PSNR
+
+- on views that the run was never trained on, against the run as it is, where the capture has such views;
+- else on training views that fine-tuning leaves out. The run was trained on them, so that it is fine-tuned like a
+  candidate, too, before it is compared.
+
+One kind of thing after the other is taken away, as listed in ``ALLOWED``: of each the most, by bisection, that keeps
+the loss below a share of what is allowed, with what was found for those before.
 """
 
 from __future__ import annotations
@@ -15,16 +20,18 @@ from dataclasses import dataclass, replace
 import torch
 
 from dyngs.config import Config
+from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
 from dyngs.prune.cut import Cut, FieldSize, apply_cut, field_size, with_field
-from dyngs.prune.stage import chosen_scores, probe_pictures, quality_of
+from dyngs.prune.stage import PROBED_VIEWS, chosen_scores, probe_pictures, quality_of
 from dyngs.scene import Scene
 from dyngs.storage.coarsest import CoarseFile, coarsest_file
 from dyngs.training.state import Checkpoint
 from dyngs.training.trainer import Trainer
 
 HELD_OUT_SHARE, MOST_HELD_OUT = 1 / 8, 32
-"""Share and number of the training views that are held out."""
+"""Share and number of the training views that are held out; the number also limits those never trained on."""
 LEFT_GAUSSIANS = tuple(2 ** (-step / 2) for step in range(1, 13))
 """Shares of the Gaussians that are left, tried by bisection."""
 CUT_OFFS = (0.01, 0.02, 0.03)
@@ -52,7 +59,7 @@ class Candidate:
         checkpoint: at its end.
         num_gaussians: left.
         psnr: mean on the views held out, dB.
-        loss: that of the run as it is, fine-tuned equally long, minus ``psnr``.
+        loss: that of what it is compared with, minus ``psnr``.
     """
 
     cut: Cut
@@ -91,13 +98,13 @@ class Found:
     Attributes:
         accepted: candidates that keep the promise, each smaller than the one before; the first is the run as it is.
         limits: why no more was taken, by kind of thing.
-        held_out: indices of the training views held out.
+        views: that losses were measured on, for people.
         trials: number of fine-tuned candidates, the run as it is included.
     """
 
     accepted: tuple[Candidate, ...]
     limits: tuple[Limit, ...]
-    held_out: tuple[int, ...]
+    views: str
     trials: int
 
 
@@ -123,28 +130,30 @@ class Search:
         trainer: of the run, restored from ``start``; it is changed.
         start: checkpoint at the end of the run.
         tell: is told what is tried and found.
+        unseen: pictures that the run was never trained on; without any, training views are held out.
     """
 
-    def __init__(self, trainer: Trainer, start: Checkpoint, tell: Tell) -> None:
+    def __init__(self, trainer: Trainer, start: Checkpoint, tell: Tell, unseen: Sequence[Picture] = ()) -> None:
         self.trainer, self.start, self.tell = trainer, start, tell
-        self.held_out = held_out_views(len(trainer.pictures))
+        self.held_out = () if unseen else held_out_views(len(trainer.pictures))
         self.trials = 0
         self._begin = trainer.config, trainer.options, trainer.colours
         trainer.held_out, trainer.held_out_until = frozenset(self.held_out), math.inf
         self._scores = chosen_scores(trainer)
-        self._truths = [trainer.pictures[i] for i in self.held_out] or probe_pictures(trainer)
-        self._unpruned = 0.0
+        self._truths = list(unseen) or [trainer.pictures[i] for i in self.held_out] or probe_pictures(trainer)
+        self.views = f"{len(self._truths)} training views held out" if self.held_out else "its only training view"
+        if unseen:
+            self.views = f"{len(self._truths)} views never trained on"
+        self._is_fair, self._reference = bool(unseen), 0.0
 
     def run(self, max_loss: float) -> Found:
         """Return what can be taken away for ``max_loss``, dB."""
         self._restart()
         config, exact = self._begin[0], quality_of(self.trainer, self.trainer.scene, self._truths)
         accepted, limits = [Candidate(Cut(), config, self.start, self.trainer.num_gaussians, exact, 0.0)], []
-        self._unpruned = self._tried(Cut()).psnr
-        self.tell(
-            f"as it is, {len(self._scores):,} Gaussians, fine-tuned on the other training views: "
-            f"{self._unpruned:.2f} dB on {len(self._truths)} held out"
-        )
+        self._reference = exact if self._is_fair else self._tried(Cut()).psnr
+        how = "" if self._is_fair else ", fine-tuned on the others"
+        self.tell(f"as it is{how}: {len(self._scores):,} Gaussians, {self._reference:.2f} dB on {self.views}")
         for kind, knob in self._knobs().items():
             levels = knob(accepted[-1].cut)
             if not levels:
@@ -152,7 +161,7 @@ class Search:
             found, limit = self._bisected(kind, levels, ALLOWED[kind] * max_loss)
             limits.append(limit)
             accepted += [] if found is None else [found]
-        return Found(tuple(accepted), tuple(limits), self.held_out, self.trials)
+        return Found(tuple(accepted), tuple(limits), self.views, self.trials)
 
     def stored(self, found: Found, max_loss: float) -> Stored:
         """Return the smallest accepted candidate whose file keeps the promise, and that file, rounded as far as it may.
@@ -174,7 +183,7 @@ class Search:
         raise DyngsError(f"no file of it loses less than {max(max_loss, SMALLEST_FILE_LOSS):g} dB; allow more")
 
     def _quality(self, scene: Scene) -> float:
-        """Return the mean PSNR of the views held out drawn of ``scene`` as it wants to be drawn, dB."""
+        """Return the mean PSNR of the views that count, drawn of ``scene`` as it wants to be drawn, dB."""
         self.trainer.options = replace(self.trainer.options, alpha_min=scene.options.alpha_min)
         return quality_of(self.trainer, scene, self._truths)
 
@@ -215,7 +224,7 @@ class Search:
         while trainer.done < end:
             trainer.step()
         psnr = quality_of(trainer, trainer.scene, self._truths)
-        return Candidate(cut, trainer.config, trainer.checkpoint(), len(trainer.scene), psnr, self._unpruned - psnr)
+        return Candidate(cut, trainer.config, trainer.checkpoint(), len(trainer.scene), psnr, self._reference - psnr)
 
     def _restart(self) -> None:
         trainer = self.trainer
@@ -240,8 +249,8 @@ class Search:
         whole = field_size(trainer.scene)
         if whole is None:
             return []
-        pictures = [trainer.pictures[i] for i in range(len(trainer.pictures)) if i not in self.held_out]
-        pictures = pictures[:: max(1, len(pictures) // 16)][:16]
+        others = [i for i in range(len(trainer.pictures)) if i not in self.held_out]
+        pictures = [trainer.pictures[others[i]] for i in evenly_spaced(len(others), PROBED_VIEWS)]
         at_most: list[FieldSize] = []
         exact = quality_of(trainer, trainer.scene, pictures)
 

@@ -103,6 +103,7 @@ def test_an_interruption_leaves_nothing(run_dir: Path, tmp_path: Path, monkeypat
         patch.setattr("dyngs.api.prune.save_config", interrupted)
         with pytest.raises(KeyboardInterrupt):
             prune_run(run_dir, tmp_path / "small", ASKED)
+        patch.setattr("dyngs.prune.search.apply_cut", interrupted)
         with pytest.raises(KeyboardInterrupt):
             prune_within(run_dir, tmp_path / "small", 50.0, BRIEFLY, silent)
     assert not list(tmp_path.iterdir())

@@ -69,6 +69,17 @@ def test_nothing_is_trained_on_what_is_held_out(trainer: Trainer) -> None:
     seen = {trainer.step().picture.name for _ in range(2 * len(trainer.pictures))}
     assert not names & seen
     assert len(seen | names) == len(trainer.pictures)
+    assert search.views == f"{len(names)} training views held out"
+
+
+def test_views_that_are_new_leave_all_others_to_training(trainer: Trainer) -> None:
+    """And the run is compared as it is: nothing of it is memory."""
+    search = Search(trainer, trainer.checkpoint(), lambda text: None, [trainer.pictures[0]])
+    assert (search.held_out, trainer.left_out) == ((), frozenset())
+    assert search.views == "1 views never trained on"
+    whole = search.run(-100.0).accepted
+    assert [candidate.cut for candidate in whole] == [Cut()]
+    assert whole[0].psnr == search._reference
 
 
 def test_sizes_of_a_field() -> None:
