@@ -26,7 +26,7 @@ MAX_CAMERAS, MAX_MOMENTS = 8, 24
 MAX_VIEWS = 100
 MIN_VIEWS = 24
 """With fewer views, agreement by chance cannot be told from other."""
-STEPS, MAX_GAUSSIANS, FIRST_POINTS = 600, 10_000, 5000
+STEPS, MAX_GAUSSIANS, FIRST_POINTS = 450, 10_000, 5000
 """Of the small still model."""
 SCATTERED = 0.5
 """Distance between cameras that follow each other in time, in medians of the distance of any two, from which time and
