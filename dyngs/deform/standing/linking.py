@@ -19,8 +19,9 @@ REACH, SPEED_REACH = 3.0, 1.5
 """Radii, and shares of the last displacement, by which a thing may be away from where its velocity takes it."""
 COLOR_REACH, SIZE_REACH = 0.35, 1.2
 """Differences of colour, and of the logarithm of the radius, at which a blob is another thing."""
-FEWEST_STEPS, SAME_WAY = 2, 0.2
-"""Steps of at least a radius that a thing which travels makes, and the least correlation of each with the next."""
+FEWEST_STEPS, SAME_WAY = 2, -0.2
+"""Steps of at least a radius that a thing which travels makes, and the least correlation of each with the next:
+what hops turns back, too, but less often than noise does."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Track:
     def travels(self) -> bool:
         """Whether it goes on and on: what turns or bends in place is no track to start from.
 
-        Of places a radius apart or more, in the order of time, successive steps must mostly go the same way.
+        Of places a radius apart or more, in the order of time, successive steps must not mostly turn back.
         """
         centers = self.centers
         places = [centers[0]]

@@ -38,7 +38,7 @@ BEND = 1e-4
 APART = 3.0
 """Radii from the centre of a thing within which others are near."""
 PAYS = 0.9
-"""Share of the medians' error that may be left where seeds cover a picture."""
+"""Share of the medians' squared error that may be left where seeds cover a picture."""
 SHOWN = 0.4
 """Share of the pixels that seeds cover in which a picture must change; else something still hides the thing;
 and of pictures that are not so."""
@@ -127,8 +127,8 @@ def pays(seeds: Seeds, footage: Sequence[Footage]) -> bool:
                 continue
             shown += 1
             truth, still = (torch.from_numpy(x).float() / 255 for x in (one.pictures[i], one.median))
-            before += float((still - truth).abs().sum(-1)[covered].sum())
-            after += float((drawn.rgb[0] + (1 - alpha) * still - truth).abs().sum(-1)[covered].sum())
+            before += float((still - truth).square().sum(-1)[covered].sum())
+            after += float((drawn.rgb[0] + (1 - alpha) * still - truth).square().sum(-1)[covered].sum())
     return shown >= SHOWN * looked_at and after < PAYS * before
 
 

@@ -22,6 +22,8 @@ from dyngs.gaussians import Gaussians
 
 ROOM = 0.25
 """Room around the things that stand still and the cameras, in sides of their box."""
+LEAST_SHOWN = 0.05
+"""Least area that a thing shows over its times, as a share of that of the largest: less is noise at things in place."""
 MAX_TRACKS = 24
 NODES_PER_TRACK = 40
 NODE_SHARE = 0.5
@@ -87,7 +89,10 @@ def first_motion(
     if len(footage) < 2 or limit < 1:
         return FirstMotion()
     tracks = found_tracks(footage, *_box(footage, still, extent))
-    travelling = [track for track in tracks if track.travels][:MAX_TRACKS]
+    if not tracks:
+        return FirstMotion()
+    shown = [track.travels * len(track.times) * track.radius**2 for track in tracks]
+    travelling = [t for t, area in zip(tracks, shown, strict=True) if area > LEAST_SHOWN * max(shown)][:MAX_TRACKS]
     seeds: list[Seeds] = []
     others = still.means[moving].double().numpy()
     for track in travelling:
