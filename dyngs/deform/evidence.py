@@ -33,7 +33,7 @@ DAMPING = 0.02
 
 
 class Verdict(Enum):
-    """What the pictures say."""
+    """Answer of the pictures."""
 
     STILL = "still"
     MOVES = "moves"

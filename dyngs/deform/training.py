@@ -157,11 +157,12 @@ class DynamicTraining:
         now = scene.gaussians
         found = self.capture.still_errors(lambda _: now)
         floor = self.options.motion_threshold
-        if not bool((found.most > SURELY_MOVING * floor).float().mean() > MIN_MOVING_SHARE):
-            return None
+        errs = bool((found.most > SURELY_MOVING * floor).float().mean() > MIN_MOVING_SHARE)
         threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(found.usual > threshold)[:, 0]
         first = self._first_motion(now.detach(), rows)
+        if not errs and not first.seeds:
+            return None
         if first.seeds:
             result = replace(with_gaussians(now.detach(), first.gaussians), finding=first.finding)
         else:

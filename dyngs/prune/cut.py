@@ -1,4 +1,4 @@
-"""What is taken from a trained scene: Gaussians, faint blending, control nodes and pieces of splines, harmonics."""
+"""Cuts of a trained scene: Gaussians, faint blending, control nodes and pieces of splines, harmonics."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class FieldSize:
 
 @dataclass(frozen=True)
 class Cut:
-    """What is taken away; the defaults take nothing.
+    """A choice of parts to take away; the defaults take nothing.
 
     Attributes:
         share: of the Gaussians that is removed.

@@ -1,1 +1,1 @@
-"""What moves before cameras that stand still: changes in their pictures, hulls, and tracks over time."""
+"""Motion before cameras that stand still: changes in their pictures, hulls, and tracks over time."""

@@ -53,7 +53,7 @@ class Blob:
 
 @dataclass(frozen=True)
 class Silhouette:
-    """What one camera sees to change at one time.
+    """Change that one camera sees at one time.
 
     Attributes:
         projection: (3, 4) matrix from the world to homogeneous pixels.
