@@ -108,6 +108,9 @@ class _Lifted:
     def grown(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
         return None
 
+    def variant(self, scene: _LiftedScene, step: int) -> None:
+        """Try nothing else."""
+
     def window(self, step: int) -> tuple[float, float]:
         return 0.0, 1.0
 
