@@ -6,29 +6,28 @@ the pictures say so, and what moves must be worth it.
 
 from __future__ import annotations
 
-import json
+import math
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, stdev
 
 import torch
 from torch import Tensor
 
 from dyngs.api.motion_check import motion_evidence
 from dyngs.build import assemble
-from dyngs.config import Config, DynamicModel
-from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.config import BudgetConfig, Config, DynamicModel, PruneConfig
+from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.config.still import as_still
 from dyngs.data.capture import View
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.pictures.images import area_downscale
 from dyngs.data.read import read_capture
 from dyngs.deform.evidence import Verdict
 from dyngs.deform.still_error import signed_errors
-from dyngs.files.write import write_text
 from dyngs.metrics import psnr
-from dyngs.runs.checkpoint import Checkpoint, checkpoint_paths, latest_checkpoint, load_run, step_of
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.folder import STILL_FOLDER, begin
 from dyngs.scene import Scene
 from dyngs.training.background import background_colour
@@ -37,14 +36,8 @@ from dyngs.training.loop import Loop
 from dyngs.training.schedule import hold_out_until
 from dyngs.training.trainer import Trainer
 
-MAX_STILL_STEPS, STILL_SHARE = 3000, 1 / 3
-"""Steps of the still model where something moves for sure, and share of the run's length that they are at most."""
-CHECKED, LOOKED_BACK, GAINS = 0.05, 0.3, 0.3
-"""Shares of a run after which a still model is measured, and over which it must gain so many dB to be trained on."""
-MARGIN = 0.3
-"""dB by which motion must be better where it was not sure that anything moves: two runs differ by chance, too."""
-MEASURED_NAME = "held_out.json"
-"""In the folder of a still model: PSNR of the views held out, by step."""
+STILL_STEPS, STILL_SIDE = 3000, 256
+"""Most steps of the still model that is compared with, and longest side of its pictures, px: enough to fail by."""
 FEWEST_VIEWS = 8
 """With fewer training views none can be spared for a comparison."""
 FEW_VIEWS, OFTEN, HELD_OUT = 24, 4, 10
@@ -55,59 +48,13 @@ CLEAR = 0.05
 """Opacity of what moves up to which a pixel shows what stands."""
 
 
-@dataclass(frozen=True)
-class Start:
-    """How a run begins.
-
-    Attributes:
-        config: of what is trained: the run's own, or that of a still scene.
-        checkpoint: to go on from, or None.
-    """
-
-    config: Config
-    checkpoint: Checkpoint | None = None
-
-
-class Plateau:
-    """Listener that finds out when a still model gains no more on the views held out.
-
-    Args:
-        folder: of its run; what was measured is kept there, so that a resumed run ends at the same step.
-        trainer: returns its trainer.
-        last: step after which it ends in any case.
-        fixed: only the last step counts.
-    """
-
-    def __init__(self, folder: Path, trainer: Callable[[], Trainer], last: int, *, fixed: bool) -> None:
-        self._path, self._trainer, self._last, self._fixed = folder / MEASURED_NAME, trainer, last, fixed
-        self._measured = {} if fixed else _read_measured(self._path, trainer().done)
-
-    @property
-    def is_reached(self) -> bool:
-        """Return whether the still model is trained."""
-        done, steps = self._trainer().done, self._trainer().config.train.steps
-        if done >= self._last:
-            return True
-        before = [x for step, x in self._measured.items() if step <= done - LOOKED_BACK * steps]
-        since = [x for step, x in self._measured.items() if step > done - LOOKED_BACK * steps]
-        return bool(before and since) and max(since) < max(before) + GAINS
-
-    def __call__(self, event: Event) -> None:
-        """Measure when it is time to."""
-        match event:
-            case StepDone() if not self._fixed and event.step % max(1, round(CHECKED * event.total)) == 0:
-                self._measured[event.step] = _quality(self._trainer())
-                write_text(self._path, json.dumps(self._measured) + "\n")
-
-
-def start(config: Config, folder: Path, train_still: Callable[[Config, Path, bool], None]) -> Start:
-    """Return how the run of ``config`` begins in ``folder``: as a moving scene, or as a still one if nothing moves.
+def start(config: Config, folder: Path, train_still: Callable[[Config, Path], None]) -> Config:
+    """Return the configuration to train in ``folder``: of a moving scene, or of a still one if nothing moves.
 
     Args:
         config: of a run that has not begun, or was stopped before its first checkpoint.
         folder: of the run.
-        train_still: trains a still model in a folder, or goes on with it, until ``Plateau`` says that it is trained;
-            up to ``train.hold_out_until`` in any case, and always to there if told so.
+        train_still: trains the still model in a folder, or goes on with it, to its end.
 
     Raises:
         DyngsError: a capture that cannot be read.
@@ -116,49 +63,40 @@ def start(config: Config, folder: Path, train_still: Callable[[Config, Path, boo
         case DynamicModel() if config.model.compare_with_still:
             pass
         case _:
-            return Start(config)
+            return config
     views = read_capture(config.data).splits["train"]
     if len({view.time for view in views}) < 2:
-        return Start(config)
+        return config
     evidence = motion_evidence(config)
     if evidence.verdict is Verdict.STILL:
         print(f"nothing moves: {evidence.reason}; trained as a still scene", flush=True)
-        return Start(as_still(config))
+        return as_still(config)
     if len(views) < FEWEST_VIEWS:
         print(f"{len(views)} views are too few to compare with a still model on some of them", flush=True)
-        return Start(config)
+        return config
     every, moves = hold_out_every(views), evidence.verdict is Verdict.MOVES
-    still = _still_config(config, every, folder / STILL_FOLDER, moves=moves)
-    print(f"something {'moves' if moves else 'may move'}: {evidence.reason}; first a still model", flush=True)
     begin(folder, config)
-    train_still(still, folder / STILL_FOLDER, moves)
+    said = "moves" if moves else "may move"
+    print(f"something {said}: {evidence.reason}; first a small still model, to compare with", flush=True)
+    train_still(_still_config(config, every, folder / STILL_FOLDER), folder / STILL_FOLDER)
     if not moves:
         share = _erring_share(folder / STILL_FOLDER)
-        fails = f"a still model fails in {share:.1%} of held-out training views"
+        fails = f"a small still model fails in {share:.1%} of held-out training views"
         if share < MIN_ERRING:
-            print(f"nothing moves: {fails}; it is trained on", flush=True)
-            return still_instead(folder)
+            print(f"nothing moves: {fails}; trained as a still scene", flush=True)
+            return still_instead(folder, config)
         print(f"{fails}: motion is tried", flush=True)
-    train = config.train.model_copy(update={"hold_out_every": every})
-    return Start(config.model_copy(update={"train": train}))
+    return config.model_copy(update={"train": config.train.model_copy(update={"hold_out_every": every})})
 
 
-def still_instead(folder: Path) -> Start:
-    """Put the still model of a run in its place, and return how it goes on.
-
-    Raises:
-        DyngsError: there is none.
-    """
-    source = folder / STILL_FOLDER
-    still = load_resolved(source)
-    step = step_of(checkpoint_paths(source)[-1])
-    train = still.train.model_copy(update={"hold_out_until": step / still.train.steps})
-    config = still.model_copy(update={"train": train, "run": still.run.model_copy(update={"dir": folder})})
-    save_config(config, folder / RESOLVED_NAME)
+def still_instead(folder: Path, config: Config) -> Config:
+    """Remove what was trained in ``folder``, and return the configuration of the still scene to train instead."""
     shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-    (source / "checkpoints").rename(folder / "checkpoints")
-    shutil.rmtree(source, ignore_errors=True)
-    return Start(config, latest_checkpoint(folder))
+    train = config.train.model_copy(update={"hold_out_every": 0})
+    still = as_still(config.model_copy(update={"train": train}))
+    save_config(still, folder / RESOLVED_NAME)
+    shutil.rmtree(folder / STILL_FOLDER, ignore_errors=True)
+    return still
 
 
 def hold_out_every(views: Sequence[View]) -> int:
@@ -195,12 +133,11 @@ class StillComparison:
         if not trainer.held_out or not checkpoint_paths(source):
             return
         still = load_run(source)
-        pictures = [trainer.pictures[i] for i in sorted(trainer.held_out)]
-        found = [_compared(trainer, still.scene, picture) for picture in pictures]
+        small = PictureLoader(trainer.pictures.views, still.config.data)
+        found = [_compared(trainer, still.scene, trainer.pictures[i], small[i]) for i in sorted(trainer.held_out)]
         moving, standing = _means([x[0] for x in found]), [x[1] for x in found if x[1] is not None]
-        is_sure = still.config.train.hold_out_until < trainer.config.train.hold_out_until
-        self.is_lost = not moving[0] > moving[1] + (0.0 if is_sure else MARGIN)
-        kept = f"the still model of {still.step} steps is kept and trained on" if self.is_lost else "motion is kept"
+        self.is_lost = not _is_gain([x[0][0] - x[0][1] for x in found])
+        kept = "a still model is trained instead" if self.is_lost else "motion is kept"
         text = f"{len(found)} held-out training views: {moving[0]:.2f} dB with motion, {moving[1]:.2f} dB without"
         if standing:
             text += "; where nothing moves {:.2f} and {:.2f} dB".format(*_means(standing))
@@ -211,54 +148,48 @@ class StillComparison:
 
 @torch.no_grad()
 def _compared(
-    trainer: Trainer, still: Scene, picture: Picture
+    trainer: Trainer, still: Scene, picture: Picture, small: Picture
 ) -> tuple[tuple[float, float], tuple[float, float] | None]:
-    """Return PSNR of a picture with motion and without, whole and where nothing that moves is in front."""
+    """Return PSNR of a small picture with motion and without, whole and where nothing that moves is in front."""
     background, options = background_colour(trainer.background), trainer.options
-    truth = picture.composite(background)
-    drawn = [
-        scene.render(picture.cameras, picture.time, options=options, background=background).rgb[0]
-        for scene in (trainer.scene, still)
+    size, truth = (small.cameras.width, small.cameras.height), small.composite(background)
+    drawn = trainer.scene.render(picture.cameras, picture.time, options=options, background=background).rgb[0]
+    pictures = [
+        area_downscale(drawn, *size),
+        still.render(small.cameras, small.time, options=options, background=background).rgb[0],
     ]
-    moving = trainer.scene.part("moving").render(picture.cameras, picture.time, options=options).alpha[0]
-    stands = (moving < CLEAR).float() * (1.0 if picture.mask is None else picture.mask)
-    whole = psnr(drawn[0], truth, picture.mask), psnr(drawn[1], truth, picture.mask)
+    alpha = trainer.scene.part("moving").render(picture.cameras, picture.time, options=options).alpha[0]
+    stands = (area_downscale(alpha[..., None], *size)[..., 0] < CLEAR).float()
+    stands = stands * (1.0 if small.mask is None else small.mask)
+    whole = psnr(pictures[0], truth, small.mask), psnr(pictures[1], truth, small.mask)
     if not bool((stands > 0).any()):
         return whole, None
-    return whole, (psnr(drawn[0], truth, stands), psnr(drawn[1], truth, stands))
+    return whole, (psnr(pictures[0], truth, stands), psnr(pictures[1], truth, stands))
+
+
+def _is_gain(gains: Sequence[float]) -> bool:
+    """Return whether gains are positive by more than twice the standard error of their mean: runs differ by chance."""
+    return fmean(gains) > 2 * (stdev(gains) if len(gains) > 1 else 0.0) / math.sqrt(len(gains))
 
 
 def _means(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
     return fmean(x for x, _ in values), fmean(x for _, x in values)
 
 
-def _still_config(config: Config, every: int, folder: Path, *, moves: bool) -> Config:
-    """Return the configuration of the still model."""
+def _still_config(config: Config, every: int, folder: Path) -> Config:
+    """Return the configuration of the small still model, which never sees the views held out."""
     still = as_still(config)
-    steps = min(MAX_STILL_STEPS, max(1, round(STILL_SHARE * config.train.steps)))
-    until = steps / config.train.steps if moves else config.train.hold_out_until
-    train = still.train.model_copy(update={"hold_out_every": every, "hold_out_until": until})
-    return still.model_copy(update={"train": train, "run": config.run.model_copy(update={"dir": folder})})
-
-
-def _read_measured(path: Path, done: int) -> dict[int, float]:
-    """Return held-out PSNR by step, up to step ``done``; nothing where the file is lost or damaged."""
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        return {int(step): float(x) for step, x in stored.items() if int(step) <= done}
-    except (OSError, ValueError, AttributeError, TypeError):
-        return {}
-
-
-@torch.no_grad()
-def _quality(trainer: Trainer) -> float:
-    """Return the mean PSNR of the views held out, dB."""
-    background, values = background_colour(trainer.background), list[float]()
-    for index in sorted(trainer.held_out):
-        picture = trainer.pictures[index]
-        shown = trainer.scene.render(picture.cameras, picture.time, options=trainer.options, background=background)
-        values.append(psnr(shown.rgb[0], picture.composite(background), picture.mask))
-    return fmean(values)
+    held_out = {"hold_out_every": every, "hold_out_until": 1.0, "steps": min(config.train.steps, STILL_STEPS)}
+    side = min(config.data.longest_side or STILL_SIDE, STILL_SIDE)
+    return still.model_copy(
+        update={
+            "data": still.data.model_copy(update={"longest_side": side}),
+            "train": still.train.model_copy(update=held_out),
+            "budget": BudgetConfig(),
+            "prune": PruneConfig(),
+            "run": config.run.model_copy(update={"dir": folder}),
+        }
+    )
 
 
 def _erring_share(folder: Path) -> float:

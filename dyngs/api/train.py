@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -12,7 +12,7 @@ from typing import Protocol
 from torch import Tensor
 
 from dyngs.api import still_first
-from dyngs.api.still_first import Plateau, StillComparison
+from dyngs.api.still_first import StillComparison
 from dyngs.budget.count import count_limit
 from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
@@ -42,7 +42,6 @@ from dyngs.training.events import Evaluated, Event, Listener, Saved, StepDone
 from dyngs.training.interrupt import Interrupts
 from dyngs.training.limits import require_possible
 from dyngs.training.loop import Loop, Stopwatch
-from dyngs.training.schedule import hold_out_until
 
 _COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"
 """Names of the limits' states in a checkpoint."""
@@ -88,27 +87,19 @@ def train(config: Config, *, resume_from: Path | None = None, listeners: Sequenc
         if resumed is not None and resumed.info.step >= config.total_steps and not _owes_file(config, folder):
             return folder
         if resumed is None:
-            start = still_first.start(config, folder, _train_still)
-            config, resumed = start.config, start.checkpoint
-        if _Run(config, folder, resumed).run(listeners):
-            return folder
-        start = still_first.still_instead(folder)
-        _Run(start.config, folder, start.checkpoint).run(listeners)
+            config = still_first.start(config, folder, _train_still)
+        if not _Run(config, folder, resumed).run(listeners):
+            _Run(still_first.still_instead(folder, config), folder, None).run(listeners)
     return folder
 
 
-def _train_still(config: Config, folder: Path, fixed: bool) -> None:
-    """Train the still model of a run, or go on with it, until it is trained; see ``still_first.start``."""
+def _train_still(config: Config, folder: Path) -> None:
+    """Train the still model that a moving one is compared with, or go on with it, to its end."""
     resumed = latest_checkpoint(folder) if checkpoint_paths(folder) else None
-    run = _Run(config, folder, resumed)
-    trainer = run.built.scene_trainer
-    if trainer is None:
-        raise ValueError("a network is no scene")
-    plateau = Plateau(folder, lambda: trainer, hold_out_until(config.train), fixed=fixed)
-    if plateau.is_reached:
+    if resumed is not None and resumed.info.step >= config.total_steps:
         return
     try:
-        run.run((plateau,), until=lambda: plateau.is_reached)
+        _Run(config, folder, resumed).run(())
     except KeyboardInterrupt as stopped:
         again = f"stopped before anything moves; go on with: dyngs train --resume {folder.parent}"
         raise KeyboardInterrupt(again if stopped.args else "") from None
@@ -125,7 +116,7 @@ class _Run:
 
     def __init__(self, config: Config, folder: Path, resumed: Checkpoint | None) -> None:
         watch = Stopwatch()
-        self.built = built = build(config, restored=resumed is not None)
+        built = build(config, restored=resumed is not None)
         self.folder, self.limits = folder, dict[str, Limit]()
         self.loop = Loop(built.trainer, config.total_steps, watch, lambda: last_good(folder))
         if resumed is not None:
@@ -145,12 +136,8 @@ class _Run:
         """The configuration as saved; limits may change the number of steps."""
         return self._config if self.limited is None else self.limited.config
 
-    def run(self, listeners: Sequence[Listener], until: Callable[[], bool] = lambda: False) -> bool:
+    def run(self, listeners: Sequence[Listener]) -> bool:
         """Step until the end, or until interrupted, and keep the limits.
-
-        Args:
-            listeners: are told everything.
-            until: whether to end before the end of the schedule.
 
         Returns:
             false where the still model has turned out to be better, so that the run ends before its time.
@@ -166,18 +153,17 @@ class _Run:
             if limited is not None:
                 comparison = StillComparison(self.folder, lambda: limited.trainer, loop)
                 loop.subscribe(PruneStage(loop, lambda: limited.trainer), comparison)
-            loop.run(lambda: interrupts.requested or until() or _is_lost(comparison))
+            loop.run(lambda: interrupts.requested or _is_lost(comparison))
             if _is_lost(comparison):
                 return False
-            if loop.trainer.done < loop.total and loop.trainer.done > self._saved:
-                self._save()
-            if loop.trainer.done < loop.total and not until():
+            if loop.trainer.done < loop.total:
+                if loop.trainer.done > self._saved:
+                    self._save()
                 raise KeyboardInterrupt(
                     f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume {self.folder}"
                 )
-        if loop.trainer.done >= loop.total:
-            for line in self._reached():
-                print(line, flush=True)
+        for line in self._reached():
+            print(line, flush=True)
         return True
 
     def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None) -> None:
