@@ -76,7 +76,7 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
 
     Raises:
         DyngsError: no such run, a folder that is taken, a wrong value, nothing to do.
-        KeyboardInterrupt: after Ctrl-C; ``dyngs train --resume`` goes on.
+        KeyboardInterrupt: after Ctrl-C; ``dyngs train --resume`` goes on, and ``dyngs export`` writes the file then.
     """
     require_empty(out)
     start = latest_checkpoint(run_dir)

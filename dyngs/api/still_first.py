@@ -14,10 +14,20 @@ from statistics import fmean, stdev
 
 import torch
 from torch import Tensor
+from typing_extensions import assert_never
 
 from dyngs.api.motion_check import motion_evidence
 from dyngs.build import assemble
-from dyngs.config import BudgetConfig, Config, DynamicModel, PruneConfig
+from dyngs.config import (
+    BudgetConfig,
+    Config,
+    DefaultStrategy,
+    DynamicModel,
+    FixedStrategy,
+    McmcStrategy,
+    PruneConfig,
+    Strategy,
+)
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.config.still import as_still
 from dyngs.data.capture import View
@@ -36,8 +46,11 @@ from dyngs.training.loop import Loop
 from dyngs.training.schedule import hold_out_until
 from dyngs.training.trainer import Trainer
 
-STILL_STEPS, STILL_SIDE = 3000, 256
-"""Most steps of the still model that is compared with, and longest side of its pictures, px: enough to fail by."""
+STILL_STEPS, STILL_SIDE, STILL_GAUSSIANS = 2000, 192, 40_000
+"""Most steps and Gaussians of the still model that is compared with, and longest side of its pictures, px.
+
+A still model of what moves grows without end, to explain motion by viewpoint; a tenth of that is enough to fail by.
+"""
 FEWEST_VIEWS = 8
 """With fewer training views none can be spared for a comparison."""
 FEW_VIEWS, OFTEN, HELD_OUT = 24, 4, 10
@@ -184,12 +197,24 @@ def _still_config(config: Config, every: int, folder: Path) -> Config:
     return still.model_copy(
         update={
             "data": still.data.model_copy(update={"longest_side": side}),
+            "strategy": _limited(still.strategy),
             "train": still.train.model_copy(update=held_out),
             "budget": BudgetConfig(),
             "prune": PruneConfig(),
             "run": config.run.model_copy(update={"dir": folder}),
         }
     )
+
+
+def _limited(strategy: Strategy) -> Strategy:
+    match strategy:
+        case DefaultStrategy() | McmcStrategy():
+            most = min(strategy.max_gaussians, STILL_GAUSSIANS)
+            return strategy.model_copy(update={"max_gaussians": most})
+        case FixedStrategy():
+            return strategy
+        case _:
+            assert_never(strategy)
 
 
 def _erring_share(folder: Path) -> float:

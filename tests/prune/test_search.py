@@ -75,7 +75,7 @@ def test_nothing_is_trained_on_what_is_held_out(trainer: Trainer) -> None:
 def test_views_that_are_new_leave_all_others_to_training(trainer: Trainer) -> None:
     """And the run is compared as it is: nothing of it is memory."""
     search = Search(trainer, trainer.checkpoint(), lambda text: None, [trainer.pictures[0]])
-    assert (search.held_out, trainer.left_out) == ((), frozenset())
+    assert (search.held_out, trainer.held_out) == ((), frozenset())
     assert search.views == "1 views never trained on"
     whole = search.run(-100.0).accepted
     assert [candidate.cut for candidate in whole] == [Cut()]
