@@ -1,7 +1,8 @@
 """The most that can be taken from a run for a given loss, found by bisection.
 
 Every candidate is fine-tuned equally long from the same checkpoint, with the same views in the same order. What it
-loses is measured as mean PSNR
+loses is the larger of two losses of mean PSNR: on views that the run and fine-tuning see, against the run as it is (few
+other views may be kind to a candidate by chance), and
 
 - on views that the run was never trained on, against the run as it is, where the capture has such views;
 - else on training views that fine-tuning leaves out. The run was trained on them, so that it is fine-tuned like a
@@ -60,6 +61,7 @@ class Candidate:
         num_gaussians: left.
         psnr: mean on the views held out, dB.
         loss: that of what it is compared with, minus ``psnr``.
+        trained_loss: of views that the run and fine-tuning see, against the run as it is, dB.
     """
 
     cut: Cut
@@ -68,6 +70,12 @@ class Candidate:
     num_gaussians: int
     psnr: float
     loss: float
+    trained_loss: float = 0.0
+
+    @property
+    def worst(self) -> float:
+        """The larger of the two losses, dB."""
+        return max(self.loss, self.trained_loss)
 
 
 @dataclass(frozen=True)
@@ -144,12 +152,13 @@ class Search:
         self.views = f"{len(self._truths)} training views held out" if self.held_out else "its only training view"
         if unseen:
             self.views = f"{len(self._truths)} views never trained on"
-        self._is_fair, self._reference = bool(unseen), 0.0
+        self._is_fair, self._reference, self._exact_trained = bool(unseen), 0.0, 0.0
 
     def run(self, max_loss: float) -> Found:
         """Return what can be taken away for ``max_loss``, dB."""
         self._restart()
         config, exact = self._begin[0], quality_of(self.trainer, self.trainer.scene, self._truths)
+        self._exact_trained = quality_of(self.trainer, self.trainer.scene, self._others())
         accepted, limits = [Candidate(Cut(), config, self.start, self.trainer.num_gaussians, exact, 0.0)], []
         self._reference = exact if self._is_fair else self._fine_tuned()
         how = "" if self._is_fair else ", fine-tuned on the others"
@@ -187,7 +196,7 @@ class Search:
             DyngsError: not even the file of that does.
         """
         for candidate in reversed(found.accepted):
-            least = candidate.psnr + candidate.loss - max(max_loss, SMALLEST_FILE_LOSS)
+            least = candidate.psnr - max(max_loss - candidate.worst, SMALLEST_FILE_LOSS)
             file = coarsest_file(candidate.config, candidate.checkpoint, self._quality, least)
             if file is None:
                 self.tell(f"without {candidate.cut}: the file loses more than {max_loss:g} dB")
@@ -218,15 +227,16 @@ class Search:
             middle = (low + high) // 2
             name, cut = levels[middle]
             tried = self._tried(cut)
-            keeps = tried.loss <= allowed
+            keeps = tried.worst <= allowed
             self.tell(
                 f"trial {self.trials}: without {cut}: {tried.num_gaussians:,} Gaussians, {-tried.loss:+.2f} dB, "
+                f"{-tried.trained_loss:+.2f} on views trained on, "
                 f"{'kept' if keeps else f'more than {allowed:.2f} dB lost'}"
             )
             if keeps:
                 found, low = tried, middle + 1
             else:
-                refused, high = (name, tried.loss), middle
+                refused, high = (name, tried.worst), middle
         return found, Limit(kind, levels[low - 1][0] if low else "nothing", refused)
 
     def _tried(self, cut: Cut) -> Candidate:
@@ -239,7 +249,9 @@ class Search:
         while trainer.done < end:
             trainer.step()
         psnr = quality_of(trainer, trainer.scene, self._truths)
-        return Candidate(cut, trainer.config, trainer.checkpoint(), len(trainer.scene), psnr, self._reference - psnr)
+        trained_loss = self._exact_trained - quality_of(trainer, trainer.scene, self._others())
+        end_state = trainer.checkpoint()
+        return Candidate(cut, trainer.config, end_state, len(trainer.scene), psnr, self._reference - psnr, trained_loss)
 
     def _restart(self) -> None:
         trainer = self.trainer
