@@ -130,7 +130,10 @@ class DynamicTraining:
             return scene.moment(picture.time)
         time = self._jittered(picture.time or 0.0, step)
         gaussians, offsets = scene.deformed_at(time, detach=self._window.tracks(step))
-        return Moment(gaussians, picture.time, None, scene.field.penalties(time) | self._sparsity(offsets))
+        penalties = scene.field.penalties(time) | self._sparsity(offsets)
+        if self._tracked:  # it would pull what was found on a bent path back to a straight one, and out of the pictures
+            penalties.pop("node acceleration", None)
+        return Moment(gaussians, picture.time, None, penalties)
 
     def optimize(self, scene: DynamicScene, step: int) -> int:
         """Update the field."""
