@@ -133,12 +133,13 @@ class StillComparison:
 
     def __init__(self, folder: Path, trainer: Callable[[], Trainer], loop: Loop) -> None:
         self._folder, self._trainer, self._loop = folder, trainer, loop
-        self.is_lost = False
+        self.is_lost = self._is_done = False
 
     def __call__(self, event: Event) -> None:
-        """Compare after the last step that does without the views held out."""
+        """Compare after the last step that does without the views held out, or later where a limit has cut the run."""
         match event:
-            case StepDone() if event.step == hold_out_until(self._trainer().config.train):
+            case StepDone() if not self._is_done and event.step >= hold_out_until(self._trainer().config.train):
+                self._is_done = True
                 self._compare()
 
     def _compare(self) -> None:
