@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -98,6 +99,8 @@ from dyngs.training.views import (
 
 MAX_STANDING = 12
 """Cameras that stand still from which tracks are found, at most."""
+_TOLD: set[tuple[Path, str]] = set()
+"""Captures, and warnings about them that were told in this process."""
 FIRST_VIEWS = 50
 """Number of pictures from which a person's first colours are taken."""
 
@@ -235,7 +238,9 @@ def with_points(capture: Capture, config: Config) -> Capture:
         case _:
             pass
     for line in [*lines, *before_training(capture)]:
-        print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)
+        if (capture.root, line) not in _TOLD:  # a run may train a still model of the same capture, too
+            print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)
+            _TOLD.add((capture.root, line))
     return capture
 
 
