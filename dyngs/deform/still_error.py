@@ -12,6 +12,7 @@ from dyngs.data.capture import View
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture
 from dyngs.data.times import static_cameras
+from dyngs.deform.standing.changes import median_picture
 from dyngs.gaussians import Gaussians
 from dyngs.rendering import RenderOptions, Shader, render
 
@@ -127,7 +128,7 @@ def _median_pictures(pictures: Sequence[Picture], background: Tensor) -> dict[by
     same: dict[bytes, list[Tensor]] = {}
     for picture in pictures:
         same.setdefault(_camera_key(picture), []).append(picture.composite(background))
-    return {key: torch.stack(seen).median(0).values for key, seen in same.items() if len(seen) >= MIN_SAME}
+    return {key: median_picture(seen) for key, seen in same.items() if len(seen) >= MIN_SAME}
 
 
 def _camera_key(picture: Picture) -> bytes:

@@ -125,7 +125,7 @@ class Stored:
     limit: Limit
 
 
-def held_out_views(count: int) -> tuple[int, ...]:
+def evenly_held_out(count: int) -> tuple[int, ...]:
     """Return the indices of those of ``count`` training views that are held out, evenly spread; none of one view."""
     chosen = min(max(1, round(HELD_OUT_SHARE * count)), MOST_HELD_OUT) if count > 1 else 0
     return tuple((2 * i + 1) * count // (2 * chosen) for i in range(chosen))
@@ -143,7 +143,7 @@ class Search:
 
     def __init__(self, trainer: Trainer, start: Checkpoint, tell: Tell, unseen: Sequence[Picture] = ()) -> None:
         self.trainer, self.start, self.tell = trainer, start, tell
-        self.held_out = () if unseen else held_out_views(len(trainer.pictures))
+        self.held_out = () if unseen else evenly_held_out(len(trainer.pictures))
         self.trials = 0
         self._begin = trainer.config, trainer.options, trainer.colours
         trainer.held_out, trainer.held_out_until = frozenset(self.held_out), math.inf

@@ -15,7 +15,7 @@ from dyngs.config import PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.evaluate.comparison import compared
-from dyngs.prune.search import held_out_views
+from dyngs.prune.search import evenly_held_out
 from dyngs.prune.stage import quality_of
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, latest_checkpoint, load_run
 
@@ -66,7 +66,7 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     config = load_resolved(first.folder)
     trainer = assemble(config, restored=True)
     trainer.restore(latest_checkpoint(first.folder))
-    shown = [trainer.pictures[i] for i in held_out_views(len(trainer.pictures))]
+    shown = [trainer.pictures[i] for i in evenly_held_out(len(trainer.pictures))]
     assert quality_of(trainer, load_run(file_of(first.folder)).scene, shown) == pytest.approx(first.after, abs=1e-4)
     before, after = compared([run_dir, file_of(first.folder)], 1)
     assert after.num_gaussians < before.num_gaussians

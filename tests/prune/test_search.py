@@ -10,7 +10,7 @@ from tiny_fields import busy_config
 from dyngs.build import assemble
 from dyngs.config import PruneConfig
 from dyngs.prune.cut import Cut
-from dyngs.prune.search import Candidate, Limit, Search, _fewest, _halved, held_out_views
+from dyngs.prune.search import Candidate, Limit, Search, _fewest, _halved, evenly_held_out
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -26,13 +26,13 @@ def trainer(moving: Path) -> Trainer:
 
 
 def test_views_held_out_are_spread_and_few() -> None:
-    assert held_out_views(1) == ()
-    assert held_out_views(2) == (1,)
-    assert held_out_views(16) == (4, 12)
-    assert len(held_out_views(100)) == 12
-    assert len(held_out_views(10_000)) == 32
-    assert 0 not in held_out_views(100)
-    assert 99 not in held_out_views(100)
+    assert evenly_held_out(1) == ()
+    assert evenly_held_out(2) == (1,)
+    assert evenly_held_out(16) == (4, 12)
+    assert len(evenly_held_out(100)) == 12
+    assert len(evenly_held_out(10_000)) == 32
+    assert 0 not in evenly_held_out(100)
+    assert 99 not in evenly_held_out(100)
 
 
 @pytest.mark.parametrize("allowed", [0.0, 0.05, 0.31, 0.69, 9.0])
