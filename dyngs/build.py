@@ -19,6 +19,7 @@ from dyngs.colour.training import AutoTraining, ColourTraining, NetworkTraining
 from dyngs.config import (
     AutoColour,
     Config,
+    DataConfig,
     DefaultStrategy,
     DynamicModel,
     FixedStrategy,
@@ -101,6 +102,8 @@ MAX_STANDING = 12
 """Cameras that stand still from which tracks are found, at most."""
 _TOLD: set[tuple[Path, str]] = set()
 """Captures, and warnings about them that were told in this process."""
+_FIRST_POINTS: dict[str, tuple[Capture, list[str]]] = {}
+"""The last capture with its first points, and lines on them: a run and the small ones beside it begin with the same."""
 FIRST_VIEWS = 50
 """Number of pictures from which a person's first colours are taken."""
 
@@ -231,7 +234,7 @@ def with_points(capture: Capture, config: Config) -> Capture:
     lines: list[str] = []
     match config.init, config.model:
         case PointsInit() as init, StaticModel() | DynamicModel():
-            capture, lines = with_first_points(capture, config.data, init.triangulate, init.half_extent)
+            capture, lines = _with_known_points(capture, config.data, init)
         case RandomInit() as init, StaticModel() | DynamicModel():
             why = outside_of_cube(capture.splits["train"], init.half_extent)
             lines = [] if why is None else [f"init.kind=random draws points around the origin, but {why}: give auto"]
@@ -242,6 +245,17 @@ def with_points(capture: Capture, config: Config) -> Capture:
             print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)
             _TOLD.add((capture.root, line))
     return capture
+
+
+def _with_known_points(capture: Capture, options: DataConfig, init: PointsInit) -> tuple[Capture, list[str]]:
+    """Return ``capture`` with its first points, and lines on them; found once for all sizes of its pictures."""
+    read_as = options.model_dump_json(exclude={"downscale", "longest_side", "cache_mb"})
+    key = f"{read_as} {init.triangulate} {init.half_extent}"
+    if key not in _FIRST_POINTS:
+        _FIRST_POINTS.clear()
+        _FIRST_POINTS[key] = with_first_points(capture, options, init.triangulate, init.half_extent)
+    known, lines = _FIRST_POINTS[key]
+    return capture.replace(points=known.points, points_file=known.points_file), list(lines)
 
 
 @dataclass(frozen=True)

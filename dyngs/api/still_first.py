@@ -6,31 +6,21 @@ the pictures say so, and what moves must be worth it.
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean
 
 import torch
 from torch import Tensor
-from typing_extensions import assert_never
 
 from dyngs.api.motion_check import motion_evidence
+from dyngs.api.pilot_runs import with_choices
+from dyngs.api.small_runs import FEWEST_VIEWS, drawn, held_out_scores, hold_out_every, is_gain, small_run
 from dyngs.build import assemble
-from dyngs.config import (
-    BudgetConfig,
-    Config,
-    DefaultStrategy,
-    DynamicModel,
-    FixedStrategy,
-    McmcStrategy,
-    PruneConfig,
-    Strategy,
-)
-from dyngs.config.io import RESOLVED_NAME, save_config
+from dyngs.config import Config, DynamicModel
+from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.config.still import as_still
-from dyngs.data.capture import View
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.pictures.images import area_downscale
 from dyngs.data.read import read_capture
@@ -46,15 +36,8 @@ from dyngs.training.loop import Loop
 from dyngs.training.schedule import hold_out_until
 from dyngs.training.trainer import Trainer
 
-STILL_STEPS, STILL_SIDE, STILL_GAUSSIANS = 2000, 192, 40_000
-"""Most steps and Gaussians of the still model that is compared with, and longest side of its pictures, px.
-
-A still model of what moves grows without end, to explain motion by viewpoint; a tenth of that is enough to fail by.
-"""
-FEWEST_VIEWS = 8
-"""With fewer training views none can be spared for a comparison."""
-FEW_VIEWS, OFTEN, HELD_OUT = 24, 4, 10
-"""Below so many views one in four is held out; from there on one in eight, and about ten in all."""
+STILL_STEPS = 2000
+"""Most steps of the still model that is compared with."""
 ERRS, MIN_ERRING = 0.1, 0.01
 """Colour error from which a still model fails, and the share of held-out views where it does so if things move."""
 CLEAR = 0.05
@@ -92,31 +75,32 @@ def start(config: Config, folder: Path, train_still: Callable[[Config, Path], No
     said = "moves" if moves else "may move"
     print(f"something {said}: {evidence.reason}; first a small still model, to compare with", flush=True)
     train_still(_still_config(config, every, folder / STILL_FOLDER), folder / STILL_FOLDER)
+    failing, scores = _small_still_model(folder / STILL_FOLDER)
     if not moves:
-        share = _erring_share(folder / STILL_FOLDER)
-        fails = f"a small still model fails in {share:.1%} of held-out training views"
-        if share < MIN_ERRING:
+        fails = f"a small still model fails in {failing:.1%} of held-out training views"
+        if failing < MIN_ERRING:
             print(f"nothing moves: {fails}; trained as a still scene", flush=True)
             return still_instead(folder, config)
         print(f"{fails}: motion is tried", flush=True)
-    return config.model_copy(update={"train": config.train.model_copy(update={"hold_out_every": every})})
+    chosen = with_choices(config, every, None if moves else scores)
+    if chosen is None:
+        print("motion does not pay; trained as a still scene", flush=True)
+        return still_instead(folder, config)
+    return chosen.model_copy(update={"train": config.train.model_copy(update={"hold_out_every": every})})
 
 
 def still_instead(folder: Path, config: Config) -> Config:
-    """Remove what was trained in ``folder``, and return the configuration of the still scene to train instead."""
+    """Remove what was trained in ``folder``, and return the configuration of the still scene to train instead.
+
+    Its colours are those that were asked for, as the small still model has them: pilot runs choose for what moves.
+    """
     shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     train = config.train.model_copy(update={"hold_out_every": 0})
-    still = as_still(config.model_copy(update={"train": train}))
+    colour = load_resolved(folder / STILL_FOLDER).colour
+    still = as_still(config.model_copy(update={"train": train, "colour": colour}))
     save_config(still, folder / RESOLVED_NAME)
     shutil.rmtree(folder / STILL_FOLDER, ignore_errors=True)
     return still
-
-
-def hold_out_every(views: Sequence[View]) -> int:
-    """Return of how many views one is held out; odd, so that it is not always the same of several cameras."""
-    if len(views) < FEW_VIEWS:
-        return OFTEN
-    return max(8, len(views) // HELD_OUT) | 1
 
 
 class StillComparison:
@@ -150,7 +134,7 @@ class StillComparison:
         small = PictureLoader(trainer.pictures.views, still.config.data)
         found = [_compared(trainer, still.scene, trainer.pictures[i], small[i]) for i in sorted(trainer.held_out)]
         moving, standing = _means([x[0] for x in found]), [x[1] for x in found if x[1] is not None]
-        self.is_lost = not _is_gain([x[0][0] - x[0][1] for x in found])
+        self.is_lost = not is_gain([x[0][0] - x[0][1] for x in found])
         kept = "a still model is trained instead" if self.is_lost else "motion is kept"
         text = f"{len(found)} held-out training views: {moving[0]:.2f} dB with motion, {moving[1]:.2f} dB without"
         if standing:
@@ -167,10 +151,9 @@ def _compared(
     """Return PSNR of a small picture with motion and without, whole and where nothing that moves is in front."""
     background, options = background_colour(trainer.background), trainer.options
     size, truth = (small.cameras.width, small.cameras.height), small.composite(background)
-    drawn = trainer.scene.render(picture.cameras, picture.time, options=options, background=background).rgb[0]
     pictures = [
-        area_downscale(drawn, *size),
-        still.render(small.cameras, small.time, options=options, background=background).rgb[0],
+        area_downscale(drawn(trainer.scene, picture, options, background), *size),
+        drawn(still, small, options, background),
     ]
     alpha = trainer.scene.part("moving").render(picture.cameras, picture.time, options=options).alpha[0]
     stands = (area_downscale(alpha[..., None], *size)[..., 0] < CLEAR).float()
@@ -181,47 +164,23 @@ def _compared(
     return whole, (psnr(pictures[0], truth, stands), psnr(pictures[1], truth, stands))
 
 
-def _is_gain(gains: Sequence[float]) -> bool:
-    """Return whether gains are positive by more than twice the standard error of their mean: runs differ by chance."""
-    return fmean(gains) > 2 * (stdev(gains) if len(gains) > 1 else 0.0) / math.sqrt(len(gains))
-
-
 def _means(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
     return fmean(x for x, _ in values), fmean(x for _, x in values)
 
 
 def _still_config(config: Config, every: int, folder: Path) -> Config:
     """Return the configuration of the small still model, which never sees the views held out."""
-    still = as_still(config)
-    held_out = {"hold_out_every": every, "hold_out_until": 1.0, "steps": min(config.train.steps, STILL_STEPS)}
-    side = min(config.data.longest_side or STILL_SIDE, STILL_SIDE)
-    return still.model_copy(
-        update={
-            "data": still.data.model_copy(update={"longest_side": side}),
-            "strategy": _limited(still.strategy),
-            "train": still.train.model_copy(update=held_out),
-            "budget": BudgetConfig(),
-            "prune": PruneConfig(),
-            "run": config.run.model_copy(update={"dir": folder}),
-        }
-    )
+    small = small_run(as_still(config), every, min(config.train.steps, STILL_STEPS))
+    return small.model_copy(update={"run": config.run.model_copy(update={"dir": folder})})
 
 
-def _limited(strategy: Strategy) -> Strategy:
-    match strategy:
-        case DefaultStrategy() | McmcStrategy():
-            most = min(strategy.max_gaussians, STILL_GAUSSIANS)
-            return strategy.model_copy(update={"max_gaussians": most})
-        case FixedStrategy():
-            return strategy
-        case _:
-            assert_never(strategy)
-
-
-def _erring_share(folder: Path) -> float:
-    """Return the share of the held-out training views, by blending weights, where the still model in ``folder`` fails.
+def _small_still_model(folder: Path) -> tuple[float, list[float]]:
+    """Return how the still model in ``folder`` does on the held-out training views.
 
     The error of a Gaussian is that of the pixels that show it, with its sign: detail that is not yet resolved cancels.
+
+    Returns:
+        the share of the views, by blending weights, where it fails; PSNR of each view, dB.
     """
     run = load_run(folder)
     trainer = assemble(run.config, restored=True)
@@ -229,10 +188,10 @@ def _erring_share(folder: Path) -> float:
     fails = total = 0.0
     for index in sorted(trainer.held_out):
         picture = trainer.pictures[index]
-        with torch.no_grad():
-            shown = run.scene.render(picture.cameras, options=trainer.options, background=background).rgb[0]
+        shown = drawn(run.scene, picture, trainer.options, background)
         errors, weights = signed_errors(run.scene.gaussians, picture, trainer.options, background, shown)
         mean: Tensor = errors.abs().mean(1) / weights.clamp_min(1e-6)
         fails += float(weights[mean > ERRS].sum())
         total += float(weights.sum())
-    return fails / max(total, 1e-9)
+    scores = held_out_scores(run.scene, trainer.pictures, trainer.held_out, trainer.options, background)
+    return fails / max(total, 1e-9), scores

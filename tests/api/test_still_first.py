@@ -5,17 +5,14 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
-import numpy as np
 import pytest
 from tiny_fields import busy_config
 
 from dyngs.api import still_first
-from dyngs.api.still_first import hold_out_every
 from dyngs.api.train import train
-from dyngs.config import Config
+from dyngs.config import Config, NetworkColour
 from dyngs.config.io import load_resolved
 from dyngs.config.still import as_still
-from dyngs.data.capture import View
 from dyngs.deform.evidence import Evidence, Verdict
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.folder import STILL_FOLDER
@@ -30,8 +27,8 @@ def config(moving: Path, tmp_path: Path) -> Config:
 def say(monkeypatch: pytest.MonkeyPatch, verdict: Verdict, *, pays: bool = True, fails: float = 1.0) -> None:
     """Fix what the pictures say, whether motion is better, and how often the still model fails."""
     monkeypatch.setattr(still_first, "motion_evidence", lambda _: Evidence(verdict, "made up"))
-    monkeypatch.setattr(still_first, "_is_gain", lambda _: pays)
-    monkeypatch.setattr(still_first, "_erring_share", lambda _: fails)
+    monkeypatch.setattr(still_first, "is_gain", lambda _: pays)
+    monkeypatch.setattr(still_first, "_small_still_model", lambda _: (fails, [20.0]))
 
 
 def final_bytes(folder: Path) -> bytes:
@@ -102,12 +99,23 @@ def test_an_interrupted_run_ends_with_the_same_bytes(
     assert final_bytes(folder) == final_bytes(whole)
 
 
-@pytest.mark.parametrize(("gains", "pays"), [([1.0, 1.2, 0.8], True), ([0.5, -0.4, 0.3], False), ([-1.0, -1.1], False)])
-def test_gains_must_be_clear(gains: list[float], pays: bool) -> None:
-    assert still_first._is_gain(gains) is pays
+def test_a_pilot_run_that_loses_against_a_still_model_ends_the_search_for_motion(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the colours that were asked for, whatever pilot runs had chosen for what moves."""
+    say(monkeypatch, Verdict.OPEN)
+    monkeypatch.setattr(still_first, "with_choices", lambda *_: None)
+    folder = train(config)
+    static = train(as_still(config.model_copy(update={"run": config.run.model_copy(update={"dir": tmp_path / "s"})})))
+    assert final_bytes(folder) == final_bytes(static)
 
 
-def test_cameras_take_turns_in_being_held_out() -> None:
-    views = [View(f"{i}", Path("v.png"), np.eye(4), np.eye(3), 8, 8, time=i / 192) for i in range(192)]
-    assert hold_out_every(views) % 2 == 1
-    assert hold_out_every(views[:12]) == 4
+def test_colours_chosen_for_what_moves_do_not_stay_where_nothing_does(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    say(monkeypatch, Verdict.OPEN, pays=False)
+    chosen = {"colour": NetworkColour(width=4, depth=1)}
+    monkeypatch.setattr(still_first, "with_choices", lambda given, *_: given.model_copy(update=chosen))
+    folder = train(config)
+    static = train(as_still(config.model_copy(update={"run": config.run.model_copy(update={"dir": tmp_path / "s"})})))
+    assert final_bytes(folder) == final_bytes(static)

@@ -124,6 +124,12 @@ class DynamicModel(SceneModel):
         description="find out first whether anything moves; train a still model, too, compare the two on held-out "
         "training views, and keep the better one",
     )
+    pilot_steps: int = Field(
+        default=0,
+        ge=0,
+        description="with compare_with_still: steps of each small run that decides between settings which were not "
+        "asked for, at most a quarter of the run's; 0: none",
+    )
     motion_from: Fraction = Field(
         default=0.13,
         description="share of the run after which motion is learned; until then a static model is trained on all "

@@ -1,0 +1,132 @@
+"""Pilot runs: settings of a moving scene that are tried in small, short runs, and taken where held-out views gain.
+
+Things that travel want their motion followed outwards from the middle of the clip, things that stay in place want all
+times at once; light that changes wants colours that a network makes from direction and time. No capture says which it
+is, but 2,000 steps in small pictures do.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+from dyngs.api.small_runs import held_out_scores, is_gain, small_run
+from dyngs.build import assemble
+from dyngs.config import Config, ControlNodesField, DynamicModel, NetworkColour
+from dyngs.config.io import load_config, packaged_preset
+from dyngs.training.background import background_colour
+
+SHARE, FEWEST_STEPS = 0.25, 1000
+"""A pilot run has at most this share of the run's steps; with fewer steps than these it says nothing."""
+INITIAL_DOWNSCALE = 2
+"""Most that sides of the small pictures are divided by at first."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A setting that may be better than the preset's.
+
+    Attributes:
+        text: the keys and their values, as on the command line.
+        applied: returns a configuration with it; None where it means nothing, or something else was asked for.
+    """
+
+    text: str
+    applied: Callable[[Config], Config | None]
+
+
+def with_choices(config: Config, every: int, still: Sequence[float] | None) -> Config | None:
+    """Return ``config`` with the settings that win their pilot run; None if motion loses against a still model.
+
+    Each choice is compared with the best of those before it. A line says what was found.
+
+    Args:
+        config: of a moving scene.
+        every: of how many training views one is held out.
+        still: PSNR of a small still model on those views, dB; None: something certainly moves.
+
+    Raises:
+        DyngsError: a capture that cannot be read.
+    """
+    steps = pilot_steps(config)
+    if not steps:
+        return config
+    begun = time.monotonic()
+    scores = _scores(config, every, steps)
+    if still is not None and not is_gain([a - b for a, b in zip(scores, still, strict=True)]):
+        print(f"pilot run of {steps:,} steps: {fmean(scores):.2f} dB with motion, {fmean(still):.2f} dB without")
+        return None
+    found = [f"{fmean(scores):.2f} dB as it is"]
+    for choice in CHOICES:
+        changed = choice.applied(config)
+        if changed is None:
+            continue
+        after = _scores(changed, every, steps)
+        is_better = is_gain([a - b for a, b in zip(after, scores, strict=True)])
+        found.append(f"{choice.text} {fmean(after):.2f} dB, {'taken' if is_better else 'not taken'}")
+        if is_better:
+            config, scores = changed, after
+    print(
+        f"pilot runs of {steps:,} steps in small pictures, {len(scores)} held-out training views: {'; '.join(found)} "
+        f"({time.monotonic() - begun:.0f} s)",
+        flush=True,
+    )
+    return config
+
+
+def pilot_steps(config: Config) -> int:
+    """Return the steps of each pilot run; 0: none, as none were asked for, or the run is too short for them."""
+    match config.model:
+        case DynamicModel() if config.budget.max_minutes is None:
+            steps = min(config.model.pilot_steps, int(SHARE * config.train.steps))
+            return steps if steps >= min(FEWEST_STEPS, config.model.pilot_steps) else 0
+        case _:
+            return 0
+
+
+def _scores(config: Config, every: int, steps: int) -> list[float]:
+    """Return the PSNR of the held-out views after a pilot run, dB."""
+    small = small_run(config, every, steps)
+    downscale = min(small.train.initial_downscale, INITIAL_DOWNSCALE)
+    trainer = assemble(
+        small.model_copy(update={"train": small.train.model_copy(update={"initial_downscale": downscale})})
+    )
+    while trainer.done < steps:
+        trainer.step()
+    background = background_colour(trainer.background)
+    return held_out_scores(trainer.scene, trainer.pictures, trainer.held_out, trainer.options, background)
+
+
+def _all_times_at_once(config: Config) -> Config | None:
+    match config.model, _usual(config).model:
+        case DynamicModel() as model, DynamicModel() as usual if model.time_window == usual.time_window < 1:
+            return config.model_copy(update={"model": model.model_copy(update={"time_window": 1.0})})
+        case _:
+            return None
+
+
+def _colour_network(config: Config) -> Config | None:
+    return config.model_copy(update={"colour": NetworkColour()}) if config.colour == _usual(config).colour else None
+
+
+def _rigid_groups(config: Config) -> Config | None:
+    match config.model:
+        case DynamicModel(deform=ControlNodesField(rigid_groups="never") as deform) as model:
+            grouped = deform.model_copy(update={"rigid_groups": "always"})
+            return config.model_copy(update={"model": model.model_copy(update={"deform": grouped})})
+        case _:
+            return None
+
+
+def _usual(config: Config) -> Config:
+    """Return the preset ``dynamic``: what differs from it was asked for."""
+    return load_config(packaged_preset("dynamic"), [f"data.root={config.data.root}"])
+
+
+CHOICES = (
+    Choice("model.time_window=1", _all_times_at_once),
+    Choice("colour.kind=network", _colour_network),
+    Choice("model.deform.rigid_groups=always", _rigid_groups),
+)
