@@ -111,13 +111,25 @@ def _colour_network(config: Config) -> Config | None:
     return config.model_copy(update={"colour": NetworkColour()}) if config.colour == _usual(config).colour else None
 
 
-def _rigid_groups(config: Config) -> Config | None:
+def _moving_opacities(config: Config) -> Config | None:
     match config.model:
-        case DynamicModel(deform=ControlNodesField(rigid_groups="never") as deform) as model:
-            grouped = deform.model_copy(update={"rigid_groups": "always"})
-            return config.model_copy(update={"model": model.model_copy(update={"deform": grouped})})
+        case DynamicModel() as model if not model.deform.move_opacities:
+            return _with_field(config, model, move_opacities=True)
         case _:
             return None
+
+
+def _rigid_groups(config: Config) -> Config | None:
+    match config.model:
+        case DynamicModel(deform=ControlNodesField(rigid_groups="never")) as model:
+            return _with_field(config, model, rigid_groups="always")
+        case _:
+            return None
+
+
+def _with_field(config: Config, model: DynamicModel, **changes: object) -> Config:
+    deform = model.deform.model_copy(update=changes)
+    return config.model_copy(update={"model": model.model_copy(update={"deform": deform})})
 
 
 def _usual(config: Config) -> Config:
@@ -128,5 +140,6 @@ def _usual(config: Config) -> Config:
 CHOICES = (
     Choice("model.time_window=1", _all_times_at_once),
     Choice("colour.kind=network", _colour_network),
+    Choice("model.deform.move_opacities=true", _moving_opacities),
     Choice("model.deform.rigid_groups=always", _rigid_groups),
 )

@@ -67,7 +67,13 @@ def test_no_gain_is_no_reason_to_change(moving: Path, monkeypatch: pytest.Monkey
 
 
 def test_what_was_asked_for_stays(moving: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = preset(moving, "model.time_window=0.3", "colour.kind=auto", "model.deform.rigid_groups=auto")
+    config = preset(
+        moving,
+        "model.deform.move_opacities=true",
+        "model.time_window=0.3",
+        "colour.kind=auto",
+        "model.deform.rigid_groups=auto",
+    )
     tried = score_by(monkeypatch, lambda given: 20.0 + len(tried))
     chosen = with_choices(config, EVERY, None)
     assert chosen is not None
