@@ -353,7 +353,7 @@ def _training_views(
     looked_at = views_to_compare(views)
 
     def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
-        shown = [pictures[i].shrunk(divisor) for i in looked_at]
+        shown = [pictures.shrunk(i, divisor) for i in looked_at]
         if any(picture.moves is not None for picture in shown):
             return moving_share_of(
                 gaussians_at, shown, _training_options(config), SURELY_MOVING * model.motion_threshold

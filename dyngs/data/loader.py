@@ -81,6 +81,10 @@ class Picture:
             **maps,
         )
 
+    @property
+    def num_bytes(self) -> int:
+        return self.rgb_premultiplied.nbytes + sum(x.nbytes for x in self._maps().values() if x is not None)
+
     def _maps(self) -> dict[str, Tensor | None]:
         """Return everything per pixel beside the colours, by name."""
         return {name: getattr(self, name) for name in ("alpha", "mask", "moves", "depth", "flow")}
@@ -146,6 +150,8 @@ class PictureLoader:
         self._with_maps = with_maps
         self._cache: OrderedDict[int, _Decoded] = OrderedDict()
         self._cached_bytes = 0
+        self._small: dict[int, Picture] = {}
+        self._small_by, self._small_bytes = 1, 0
         self._last_map: tuple[object, LensMap] | None = None
         self._lock = Lock()
         with pictures_up_to(options.max_megapixels):
@@ -193,6 +199,24 @@ class PictureLoader:
             flow=decoded.flow,
         )
 
+    def shrunk(self, index: int, factor: int) -> Picture:
+        """Return ``self[index].shrunk(factor)``; cached for the last factor, where memory is left."""
+        if factor == 1:
+            return self[index]
+        index %= len(self._views)
+        with self._lock:
+            if factor != self._small_by:
+                self._small, self._small_by, self._small_bytes = {}, factor, 0
+            if index in self._small:
+                return self._small[index]
+        picture = self[index].shrunk(factor)
+        with self._lock:
+            is_new = index not in self._small and factor == self._small_by
+            if is_new and self.cached_bytes + picture.num_bytes <= self._options.cache_mb * 1e6:
+                self._small[index] = picture
+                self._small_bytes += picture.num_bytes
+        return picture
+
     def without_motion_masks(self) -> PictureLoader:
         """Return a loader of the same pictures that reads no motion masks."""
         if all(view.motion_mask_path is None for view in self._views):
@@ -203,7 +227,7 @@ class PictureLoader:
     @property
     def cached_bytes(self) -> int:
         """Bytes of memory that cached pictures take."""
-        return self._cached_bytes
+        return self._cached_bytes + self._small_bytes
 
     def _decoded(self, index: int) -> _Decoded:
         with self._lock:
@@ -217,7 +241,7 @@ class PictureLoader:
             if index not in self._cache and decoded.num_bytes <= limit:
                 self._cache[index] = decoded
                 self._cached_bytes += decoded.num_bytes
-            while self._cached_bytes > limit:
+            while self.cached_bytes > limit and self._cache:
                 self._cached_bytes -= self._cache.popitem(last=False)[1].num_bytes
         return decoded
 

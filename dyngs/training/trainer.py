@@ -91,7 +91,7 @@ class Trainer:
         config, step, scene = self.config, self.done + 1, self.scene
         divisor = picture_divisor(config.train, step)
         index = self.sampler.next(self.generator, self._wanted(step))
-        picture = self.pictures[index].shrunk(divisor)
+        picture = self.pictures.shrunk(index, divisor)
         background = background_colour(self.background, self.generator)
         moment = self.training.moment(scene, picture, step)
         probe = (

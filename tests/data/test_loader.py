@@ -89,6 +89,23 @@ def test_a_shrunk_picture_is_the_mean_of_its_pixels(tmp_path: Path) -> None:
     assert picture.shrunk(100).rgb_premultiplied.shape == (1, 1, 3)
 
 
+@pytest.mark.parametrize("cache_mb", [0, 1e-3, 1])
+def test_shrunk_pictures_are_the_same_cached_or_not(cache_mb: float, tmp_path: Path) -> None:
+    """Within the limit, whatever the factors."""
+    pictures = loader(views_of(tmp_path, 4), cache_mb=cache_mb)
+    for factor in (4, 2, 1, 2):
+        for i in (0, 1, 0, 3, -1):
+            wanted, found = pictures[i].shrunk(factor), pictures.shrunk(i, factor)
+            assert found.name == wanted.name
+            assert torch.equal(found.rgb_premultiplied, wanted.rgb_premultiplied)
+            assert torch.equal(found.cameras.intrinsics, wanted.cameras.intrinsics)
+            assert pictures.cached_bytes <= cache_mb * 1e6
+    for i in range(4):
+        (tmp_path / f"{i}.png").unlink()
+    if cache_mb == 1:
+        assert torch.equal(pictures.shrunk(0, 2).rgb_premultiplied, pictures[0].shrunk(2).rgb_premultiplied)
+
+
 def test_same_bytes_cached_or_not_and_from_threads(tmp_path: Path) -> None:
     views = views_of(tmp_path, 4)
     views = tuple(replace(view, lens=Lens("opencv", (0.1, 0.0, 0.0, 0.0))) for view in views)
