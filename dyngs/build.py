@@ -42,6 +42,7 @@ from dyngs.data.loader import PictureLoader
 from dyngs.data.prepare.first_points import with_first_points
 from dyngs.data.read import read_capture
 from dyngs.deform.given_masks import moving_share_of
+from dyngs.deform.pieces import psnr_of_views
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.standing.changes import Footage, footage_of
 from dyngs.deform.still_error import StillErrors, cameras_in_place, still_errors, views_to_compare
@@ -56,7 +57,7 @@ from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.motion.captured import captured_motion
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.load import load_template, rest_shape
-from dyngs.rendering import RenderOptions
+from dyngs.rendering import RenderOptions, Shader
 from dyngs.scene import Scene, SceneTraining, render_options
 from dyngs.static.densify import DefaultDensifier, Densifier
 from dyngs.static.fixed import FixedDensifier
@@ -350,17 +351,16 @@ def _training_views(
     views = capture.splits["train"]
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     divisor = picture_divisor(config.train, deform_schedule(model, rates_of(config)).fine)
-    looked_at = views_to_compare(views)
+    looked_at, options = views_to_compare(views), _training_options(config)
+
+    def shader(time: float) -> Shader | None:
+        return None if colours.network is None else colours.network.shader(time)
 
     def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
         shown = [pictures.shrunk(i, divisor) for i in looked_at]
         if any(picture.moves is not None for picture in shown):
-            return moving_share_of(
-                gaussians_at, shown, _training_options(config), SURELY_MOVING * model.motion_threshold
-            )
-        network = colours.network
-        shader = (lambda time: None) if network is None else network.shader
-        return still_errors(gaussians_at, shown, _training_options(config), background, shader)
+            return moving_share_of(gaussians_at, shown, options, SURELY_MOVING * model.motion_threshold)
+        return still_errors(gaussians_at, shown, options, background, shader)
 
     cameras, extent = training_cameras(views, config.data), surroundings(capture).extent
     in_place = cameras_in_place(views)
@@ -369,8 +369,19 @@ def _training_views(
         used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
         return [footage_of((pictures[i] for i in seen), background, sum(map(len, used))) for seen in used]
 
+    held_out = held_out_views(views, config.train.hold_out_every)
+
+    def scores_of(gaussians_at: Callable[[float], Gaussians]) -> list[float]:
+        return psnr_of_views(gaussians_at, (pictures[i] for i in sorted(held_out)), options, background, shader)
+
     return TrainingViews(
-        training_times(capture), cameras, extent, errors_of, cameras_stay=bool(in_place), standing=standing
+        training_times(capture),
+        cameras,
+        extent,
+        errors_of,
+        cameras_stay=bool(in_place),
+        standing=standing,
+        held_out=scores_of if held_out else None,
     )
 
 

@@ -231,11 +231,13 @@ class Variant(Generic[S]):
         name: of what is different, for a line about it.
         scene: the other one.
         steps: that each is to be trained for before they are compared; 0: the other one is taken.
+        reason: of a scene that is taken so.
     """
 
     name: str
     scene: S
     steps: int
+    reason: str = "taken, as asked for"
 
 
 class SceneTraining(Protocol[S]):

@@ -7,7 +7,6 @@ is, but 2,000 steps in small pictures do.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -53,27 +52,26 @@ def with_choices(config: Config, every: int, still: Sequence[float] | None) -> C
     steps = pilot_steps(config)
     if not steps:
         return config
-    begun = time.monotonic()
-    scores = _scores(config, every, steps)
+    print(f"pilot runs of {steps:,} steps in small pictures, compared on training views that are held out:", flush=True)
+    scores = _told("the settings as they are", _scores(config, every, steps))
     if still is not None and not is_gain([a - b for a, b in zip(scores, still, strict=True)]):
-        print(f"pilot run of {steps:,} steps: {fmean(scores):.2f} dB with motion, {fmean(still):.2f} dB without")
+        _told("a still model, which is no worse", still)
         return None
-    found = [f"{fmean(scores):.2f} dB as it is"]
     for choice in CHOICES:
         changed = choice.applied(config)
         if changed is None:
             continue
         after = _scores(changed, every, steps)
         is_better = is_gain([a - b for a, b in zip(after, scores, strict=True)])
-        found.append(f"{choice.text} {fmean(after):.2f} dB, {'taken' if is_better else 'not taken'}")
+        _told(f"{choice.text}, {'taken' if is_better else 'not taken'}", after)
         if is_better:
             config, scores = changed, after
-    print(
-        f"pilot runs of {steps:,} steps in small pictures, {len(scores)} held-out training views: {'; '.join(found)} "
-        f"({time.monotonic() - begun:.0f} s)",
-        flush=True,
-    )
     return config
+
+
+def _told(what: str, scores: Sequence[float]) -> Sequence[float]:
+    print(f"  {fmean(scores):.2f} dB: {what}", flush=True)
+    return scores
 
 
 def pilot_steps(config: Config) -> int:

@@ -19,6 +19,7 @@ from dyngs.data.loader import Picture
 from dyngs.deform.field import FieldSetup, Offsets, deformed
 from dyngs.deform.fields import can_begin_on_its_way, field_on_its_way, new_field
 from dyngs.deform.motion import bake_, measure_motion
+from dyngs.deform.pieces import MovingPart, Scores, paid_motion
 from dyngs.deform.random_gaussians import box_of, with_gaussians, with_random_gaussians
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.standing.changes import Footage
@@ -77,6 +78,7 @@ class TrainingViews:
         still_errors: how far its pictures disagree with what is still, where N Gaussians are seen.
         cameras_stay: in place, so that pictures show what is still exactly alike.
         standing: returns what those cameras show.
+        held_out: returns the PSNR, dB, of the pictures held out, of Gaussians at a time; None: none are.
     """
 
     times: tuple[float, ...]
@@ -85,6 +87,7 @@ class TrainingViews:
     still_errors: Callable[[Callable[[float], Gaussians]], StillErrors]
     cameras_stay: bool = False
     standing: Callable[[], Sequence[Footage]] = tuple
+    held_out: Scores | None = None
 
 
 class DynamicTraining:
@@ -184,7 +187,12 @@ class DynamicTraining:
         return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
 
     def variant(self, scene: DynamicScene, step: int) -> Variant[DynamicScene] | None:
-        """Return the scene with its nodes in rigid groups, or with time windows, once all times are seen."""
+        """Return the scene with its nodes in rigid groups, or with time windows, once all times are seen.
+
+        After the last freezing, with motion only where it pays.
+        """
+        if scene.field is not None and step in self.schedule.splits[-1:]:
+            return self._with_paid_motion(scene)
         if scene.field is None or step not in (self.schedule.groups, self.schedule.lifetimes):
             return None
         means = scene.gaussians.means.detach()[scene.moving]
@@ -243,14 +251,19 @@ class DynamicTraining:
             means = now.means[scene.moving]
             seen = self.capture.still_errors(lambda time: deformed(now, field.offsets(means, time), scene.moving))
             moves &= seen.usual[scene.moving] > SURELY_STILL * self.options.motion_threshold
-        still = torch.nonzero(~moves)[:, 0]
-        bake_(scene.gaussians, scene.moving[still], motion.mean.select(still))
-        kept = torch.nonzero(moves)[:, 0]
-        if not len(kept):
-            return replace(scene, field=None, moving=scene.moving[kept])
-        left = field.edited(TopologyEdit.select(kept))
-        left.regroup()
-        return replace(scene, field=left, moving=scene.moving[kept])
+        return _with_frozen(scene, motion.mean, ~moves)
+
+    def _with_paid_motion(self, scene: DynamicScene) -> Variant[DynamicScene] | None:
+        """Return the scene in which only pieces move whose motion pays; None where no view is held out to tell."""
+        field, scores = scene.field, self.capture.held_out
+        if field is None or scores is None or not len(scene.moving):
+            return None
+        now = scene.gaussians.detach()
+        means = now.means[scene.moving]
+        motion = measure_motion(field, now.select(scene.moving), self.times, torch.ones_like(means[:, 0]))
+        part = MovingPart(now, scene.moving, lambda time: field.offsets(means, time), motion.mean, scene.filter_std)
+        found = paid_motion(part, scores)
+        return Variant("motion", _with_frozen(scene, motion.mean, found.stays), 0, str(found))
 
     def _jittered(self, time: float, step: int) -> float:
         """Return ``time`` with the annealed noise of Deformable-3DGS (Yang et al. 2024), against overfitting."""
@@ -267,3 +280,14 @@ class DynamicTraining:
         tiny = 1e-6 * self.capture.extent
         length = (offsets.means.square().sum(1) + tiny**2).sqrt().mean()
         return {"motion sparsity": length * (self.options.motion_sparsity / self.capture.extent)}
+
+
+def _with_frozen(scene: DynamicScene, mean: Offsets, stays: Tensor) -> DynamicScene:
+    """Return the scene in which those of the moving Gaussians that ``stays`` (M,) names stand still at ``mean``."""
+    still, kept = torch.nonzero(stays)[:, 0], torch.nonzero(~stays)[:, 0]
+    bake_(scene.gaussians, scene.moving[still], mean.select(still))
+    if scene.field is None or not len(kept):
+        return replace(scene, field=None, moving=scene.moving[kept])
+    left = scene.field.edited(TopologyEdit.select(kept))
+    left.regroup()
+    return replace(scene, field=left, moving=scene.moving[kept])

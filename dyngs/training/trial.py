@@ -26,7 +26,7 @@ def decide(trainer: Trainer, variant: Variant[Scene]) -> str:
     if not variant.steps:
         trainer.scene = variant.scene
         trainer.restore(trainer.checkpoint())
-        return f"{variant.name} taken, as asked for"
+        return f"{variant.name} {variant.reason}"
     bad_gradients = trainer.bad_gradients
     plain = _copied(trainer.checkpoint())
     trainer.scene = variant.scene

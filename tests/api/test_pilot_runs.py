@@ -55,7 +55,7 @@ def test_settings_that_win_are_taken(
     assert chosen is not None
     assert (window_of(chosen) == 1) is wide
     assert chosen.colour == (NetworkColour() if network else ShColour())
-    line = f"model.time_window=1 {20 + wide + (not network):.2f} dB, {'' if wide else 'not '}taken"
+    line = f"{20 + wide + (not network):.2f} dB: model.time_window=1, {'' if wide else 'not '}taken"
     assert line in capsys.readouterr().out
 
 
