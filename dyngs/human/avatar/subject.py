@@ -44,7 +44,7 @@ def first_look(
         pictures: some of those to train on.
     """
     clip, anchors, skeleton = subject.footage.clip, subject.anchors, subject.skeleton
-    rows = {frame: row for row, frame in enumerate(subject.footage.frames)}
+    rows = subject.footage.rows
     shown = ((picture, frame_pose(clip, rows[picture.frame or 0])) for picture in pictures)
     normals = texels.normals.repeat(len(anchors) // max(len(texels), 1), 1)
     weights = skinning_weights(anchors, len(skeleton.joints))

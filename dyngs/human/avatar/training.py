@@ -76,6 +76,7 @@ class HumanTraining:
         if row is None:
             raise DyngsError(f"view {picture.name!r}: no body parameters for frame {picture.frame}")
         penalties = self._penalties(scene)
+        row = min(row, len(scene.clip) - 1)  # who never moves has one row
         if self._refines(step):
             gaussians, posing = scene.in_frame(row)
             penalties |= correction_penalties(scene.learned, self.options)

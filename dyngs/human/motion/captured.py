@@ -24,12 +24,17 @@ class CapturedMotion:
     """A clip of the frames that have pictures.
 
     Attributes:
-        clip: of F frames.
+        clip: of F frames, or of one where the person keeps one pose in one place: nothing moves.
         frames: (F,) frame numbers, as views name them.
     """
 
     clip: MotionClip
     frames: tuple[int, ...]
+
+    @property
+    def rows(self) -> dict[int, int]:
+        """The row of the clip that shows each frame."""
+        return {frame: min(row, len(self.clip) - 1) for row, frame in enumerate(self.frames)}
 
     def to(self, *, device: torch.device | str) -> CapturedMotion:
         """Return the motion with its clip on ``device``."""
@@ -58,15 +63,15 @@ def captured_motion(where: Path, given: BodyFrames, views: Sequence[View], joint
     }
     order = sorted(times, key=lambda row: (times[row], row))
     kept = [row for i, row in enumerate(order) if i == 0 or times[row] > times[order[i - 1]]]
-    return CapturedMotion(
-        MotionClip(
-            times=torch.tensor([times[row] for row in kept], dtype=torch.float64, device="cpu"),
-            poses=poses_for_joints(torch.from_numpy(found.poses[kept]).to(joints), len(joints)),
-            trans=torch.from_numpy(found.trans[kept]).to(joints),
-            scale=torch.from_numpy(found.scale[kept]).to(joints),
-        ),
-        tuple(found.frames[row] for row in kept),
+    clip = MotionClip(
+        times=torch.tensor([times[row] for row in kept], dtype=torch.float64, device="cpu"),
+        poses=poses_for_joints(torch.from_numpy(found.poses[kept]).to(joints), len(joints)),
+        trans=torch.from_numpy(found.trans[kept]).to(joints),
+        scale=torch.from_numpy(found.scale[kept]).to(joints),
     )
+    keeps_still = all(bool((x == x[:1]).all()) for x in (clip.poses, clip.trans, clip.scale))
+    frames = tuple(found.frames[row] for row in kept)
+    return CapturedMotion(clip.select(torch.tensor([0], device="cpu")) if keeps_still else clip, frames)
 
 
 def same_bodies(a: BodyFrames, b: BodyFrames) -> bool:

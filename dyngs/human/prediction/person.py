@@ -51,8 +51,8 @@ class CapturedPerson:
 
     def pose_in(self, view: View) -> BodyPose:
         """Return the pose of the person in ``view``."""
-        row = self.subject.footage.frames.index(-1 if view.frame is None else view.frame)
-        return frame_pose(self.subject.footage.clip, row)
+        footage = self.subject.footage
+        return frame_pose(footage.clip, footage.rows[-1 if view.frame is None else view.frame])
 
 
 def captured_person(capture: Capture, model: HumanModel, body: BodyTemplate) -> CapturedPerson:

@@ -35,6 +35,21 @@ def test_a_captured_motion_has_the_frames_that_views_show_in_order_of_time() -> 
     np.testing.assert_allclose(filmed.clip.poses.numpy(), given.poses[[0, 2, 3]], rtol=1e-6)
 
 
+def test_who_never_moves_has_one_pose_for_all_frames() -> None:
+    """And who goes on, or moves one joint, has one for each."""
+    given = bodies([3, 4, 7])
+    given.poses[:], given.trans[:] = given.poses[0], given.trans[0]
+    views = [view(3, 0.0), view(4, 0.5), view(7, 1.0)]
+    still = captured_motion(WHERE, given, views, torch.zeros(55, 3))
+    assert len(still.clip) == 1
+    assert still.rows == {3: 0, 4: 0, 7: 0}
+    np.testing.assert_allclose(still.clip.at(0.7).trans[0].numpy(), given.trans[0])
+    given.poses[1, 4, 0] += 1e-3
+    moving = captured_motion(WHERE, given, views, torch.zeros(55, 3))
+    assert len(moving.clip) == 3
+    assert moving.rows == {3: 0, 4: 1, 7: 2}
+
+
 def test_a_captured_motion_without_times_is_spread_by_frame_number() -> None:
     filmed = captured_motion(WHERE, bodies([0, 1, 2]), [view(2, None), view(1, None)], torch.zeros(55, 3))
     assert filmed.frames == (1, 2)
