@@ -140,7 +140,17 @@ class HumanScene(Scene):
         return self._derived["clip"]
 
     def moment(self, time: float | None) -> Moment:
-        """Return the person at ``time`` of the clip, clamped to it; None is the first moment."""
+        """Return the person at ``time`` of the clip, clamped to it; None is the first moment.
+
+        Who keeps one pose is posed once, but for gradients.
+        """
+        if not self.is_still or torch.is_grad_enabled():
+            return self._posed(time)
+        if "posed" not in self._derived:
+            self._derived["posed"] = self._posed(None)
+        return replace(self._derived["posed"], time=clamped_time(time))
+
+    def _posed(self, time: float | None) -> Moment:
         now = clamped_time(time)
         posing = frame_pose(self.moves_as.at(now), 0)
         offsets = rest_offsets(self.anchors, self.weights, posing, self.shapes, self.pose_dirs)

@@ -106,6 +106,21 @@ def test_parts_are_all_or_nothing() -> None:
     assert len(still.part("still")) == len(scene)
 
 
+def test_one_pose_is_posed_once_and_the_same_at_all_times() -> None:
+    still = reloaded(stirred()).playing(random_clip(1))
+    with torch.no_grad():
+        first, later = still.moment(0.0), still.moment(0.7)
+        assert first.gaussians is later.gaussians
+        assert (first.time, later.time) == (0.0, 0.7)
+    fresh = still.moment(0.7)
+    assert fresh.gaussians is not later.gaussians
+    for name, x in fresh.gaussians.detach().tensors().items():
+        assert torch.equal(x, later.gaussians.tensors()[name])
+    still.changed()
+    with torch.no_grad():
+        assert still.moment(0.0).gaussians is not first.gaussians
+
+
 def test_penalties_pull_corrections_back() -> None:
     learned = stirred().learned
     terms = correction_penalties(learned, OPTIONS)
