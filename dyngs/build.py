@@ -42,6 +42,7 @@ from dyngs.data.loader import PictureLoader
 from dyngs.data.prepare.first_points import with_first_points
 from dyngs.data.read import read_capture
 from dyngs.deform.given_masks import moving_share_of
+from dyngs.deform.matched_views import MatchedViews
 from dyngs.deform.pieces import psnr_of_views
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.standing.changes import Footage, footage_of
@@ -371,6 +372,8 @@ def _training_views(
 
     held_out = held_out_views(views, config.train.hold_out_every)
 
+    trained_on = [i for i in range(len(pictures)) if i not in held_out]
+
     def scores_of(gaussians_at: Callable[[float], Gaussians]) -> list[float]:
         return psnr_of_views(gaussians_at, (pictures[i] for i in sorted(held_out)), options, background, shader)
 
@@ -382,6 +385,7 @@ def _training_views(
         cameras_stay=bool(in_place),
         standing=standing,
         held_out=scores_of if held_out else None,
+        matched=MatchedViews(pictures, trained_on, options, background, shader),
     )
 
 

@@ -117,6 +117,14 @@ def _moving_opacities(config: Config) -> Config | None:
             return None
 
 
+def _block_matching(config: Config) -> Config | None:
+    match config.model:
+        case DynamicModel(deform=ControlNodesField(block_matching=False)) as model:
+            return _with_field(config, model, block_matching=True)
+        case _:
+            return None
+
+
 def _rigid_groups(config: Config) -> Config | None:
     match config.model:
         case DynamicModel(deform=ControlNodesField(rigid_groups="never")) as model:
@@ -137,6 +145,7 @@ def _usual(config: Config) -> Config:
 
 CHOICES = (
     Choice("model.time_window=1", _all_times_at_once),
+    Choice("model.deform.block_matching=true", _block_matching),
     Choice("colour.kind=network", _colour_network),
     Choice("model.deform.move_opacities=true", _moving_opacities),
     Choice("model.deform.rigid_groups=always", _rigid_groups),

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -23,9 +23,14 @@ from dyngs.deform.decoder import head_sizes
 from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, NetworkField, Offsets, chosen
 from dyngs.deform.lifetimes import RATES as LIFE_RATES
 from dyngs.deform.lifetimes import SIZES, lived, long_lives
+from dyngs.deform.node_shifts import SeenShift, spline_changes
 from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, nodes_of_label, spread_out, turned
 from dyngs.deform.rigid_groups import (
+    AGREES,
     ALONE,
+    FEWEST,
+    GROUP_TIMES,
+    MOST,
     Bodies,
     GroupMotion,
     Poses,
@@ -38,7 +43,7 @@ from dyngs.deform.rigid_groups import (
     with_free,
     with_zero,
 )
-from dyngs.deform.spline_fit import SPAN, refitted, spline_basis
+from dyngs.deform.spline_fit import SPAN, cubic_shares, refitted, spline_basis
 from dyngs.gaussians import TopologyEdit
 from dyngs.ops.quaternions import identity_quat, unit_quats
 from dyngs.parameters import Parameters
@@ -58,18 +63,12 @@ GROUP_PIECES_PER_TIME = 0.5
 """The same of the groups' splines: all that a body shows speaks for its pose."""
 GROUP_RATES = {"group_quats": 3e-3, "binding": 2e-2}
 """Learning rates of rigid groups other than of their shifts."""
-FEWEST, MOST = 6, 32
-"""Fewest nodes of a rigid group, and most groups."""
-GROUP_TIMES = 16
-"""Times at which the motion of nodes is compared."""
 LEAST = 0.02
 """Least share of a second group from which a Gaussian is bound to it."""
 RESIDUALS = 0.01
 """Weight of what the nodes of a rigid group move in its frame: squared, in node spacings."""
 PER_GAUSSIAN = ("followed", "others", "bodies")
 """Buffers with a row per moving Gaussian."""
-AGREES = 0.35
-"""Share of the nodes' spacing, and of as much motion as up to two of these, that a rigid motion may leave over."""
 
 
 class ControlNodes(NetworkField):
@@ -175,7 +174,7 @@ class ControlNodes(NetworkField):
         Splines are fitted to the present ones. The nodes that stay are the farthest from each other in the root mean
         square of their distances over time: what moves alike keeps fewer. With other pieces Adam's moments begin anew.
         """
-        self._nodes(means)
+        self.nodes_for(means)
         old, times = self.buffers["positions"], torch.linspace(0, 1, COMPARED_TIMES, device="cpu").tolist()
         paths = torch.cat([old + self._at(time).means.detach() for time in times], dim=1)
         kept = (
@@ -217,7 +216,7 @@ class ControlNodes(NetworkField):
         """See ``DeformationField.offsets``; differentiable in ``means``, which nodes turn about themselves."""
         if not len(means):  # whatever nodes there are
             return self._at(time).select(slice(0))
-        nodes, now = self._nodes(means), self._at(time)
+        nodes, now = self.nodes_for(means), self._at(time)
         others, binding = self.buffers.get("others"), self.parameters.get("binding")
         if rows is not None:
             nodes, means = nodes.followed_by(rows), means.index_select(0, rows)
@@ -260,6 +259,14 @@ class ControlNodes(NetworkField):
             x[:, high + 1 :] = x[:, high, None] + after * ((x[:, high] - x[:, high - reach]) / max(reach, 1))[:, None]
             x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
 
+    @torch.no_grad()
+    def shifted(self, means: Tensor, seen: Sequence[SeenShift]) -> ControlNodes | None:
+        if self.has_groups or not self.options.block_matching or not seen:
+            return None
+        nodes = self.nodes_for(means)
+        changed = self.parameters["means"].detach() + spline_changes(nodes, nodes.weights(means), seen, self.num_pieces)
+        return self.with_parameters(self.parameters.restored(tensors_of(self.parameters.state()) | {"means": changed}))
+
     def _at(self, time: float) -> Offsets:
         """Return the nodes' offsets at ``time``."""
         local = self._local(time)
@@ -297,7 +304,8 @@ class ControlNodes(NetworkField):
         """Return the control points (S, P, size) by head."""
         return {name: self.parameters[name] for name in head_sizes(self.options)}
 
-    def _nodes(self, means: Tensor) -> Nodes:
+    def nodes_for(self, means: Tensor) -> Nodes:
+        """Return the nodes, placed among ``means`` (M, 3) if need be, which follow them."""
         if "followed" not in self.buffers:
             self._place(means.detach())
         return Nodes(self.buffers["positions"], self.buffers["radii"], self.buffers["followed"])
@@ -322,7 +330,7 @@ class ControlNodes(NetworkField):
         wanted = self.options.rigid_groups != "never" and self.options.move_rotations
         if self.has_groups or not wanted or not len(means):
             return None
-        nodes, pieces = self._nodes(means), round(GROUP_PIECES_PER_TIME * self.setup.num_times)
+        nodes, pieces = self.nodes_for(means), round(GROUP_PIECES_PER_TIME * self.setup.num_times)
         num_points = min(max(self.num_pieces, pieces), MAX_KEY_TIMES) + SPAN - 1
         times = torch.linspace(0, 1, 2 * num_points, device="cpu")
         now = [self._at(float(time)) for time in times]
@@ -489,10 +497,3 @@ class ControlNodes(NetworkField):
         kept = arms if now.quats is None else turned(now.quats[:, None].expand(-1, arms.shape[1], -1), arms)
         strain = arms + now.means[neighbours] - now.means[:, None] - kept
         return (strain / self.buffers["radii"][:, None, None]).square().sum(-1).mean()
-
-
-def cubic_shares(place: float) -> Tensor:
-    """Return the (4,) weights of the control points of a piece of a uniform cubic B-spline, at ``place`` in [0, 1]."""
-    rest = 1 - place
-    middle = [(3 * x**3 - 6 * x**2 + 4) / 6 for x in (place, rest)]
-    return torch.tensor([rest**3 / 6, *middle, place**3 / 6], device="cpu")

@@ -6,9 +6,9 @@ Local letters: M moving Gaussians, a subset of the N of a scene.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,6 +19,9 @@ from dyngs.ops.quaternions import identity_quat, quat_product
 from dyngs.ops.registration import has_kernel
 from dyngs.parameters import Parameters
 from dyngs.state import State, moved_to, part_of, prefixed
+
+if TYPE_CHECKING:
+    from dyngs.deform.node_shifts import SeenShift
 
 F = TypeVar("F", bound="NetworkField")
 
@@ -119,6 +122,10 @@ class DeformationField(Protocol):
         """Return the field with a long time window for each of ``means`` (M, 3); None: it has none, or has them."""
         ...
 
+    def shifted(self, means: Tensor, seen: Sequence[SeenShift]) -> DeformationField | None:
+        """Return the field with the motion of ``means`` (M, 3) corrected by what was ``seen``; None: it cannot be."""
+        ...
+
     def regroup(self) -> None:
         """Drop what was derived from the set of Gaussians; it is computed again when next needed."""
         ...
@@ -170,6 +177,9 @@ class NetworkField:
 
     def with_lifetimes(self, means: Tensor) -> DeformationField | None:
         """Return None: only what follows nodes has time windows."""
+
+    def shifted(self, means: Tensor, seen: Sequence[SeenShift]) -> DeformationField | None:
+        """Return None: only splines of nodes are fitted to shifts."""
 
     def regroup(self) -> None:
         """Do nothing: nothing is derived from the set of Gaussians."""

@@ -27,6 +27,12 @@ MOST_SEEDS = 64
 """First guesses per group."""
 ROUNDS = 6
 """Refits of a guess to the nodes that agree with it."""
+FEWEST, MOST = 6, 32
+"""Fewest nodes of a rigid group, and most groups."""
+GROUP_TIMES = 16
+"""Times at which the motion of nodes is compared."""
+AGREES = 0.35
+"""Share of the nodes' spacing, and of as much motion as up to two of these, that a rigid motion may leave over."""
 ALONE = -20.0
 """Binding of a Gaussian that is of one group only; up to half of it counts as that, for files round it."""
 

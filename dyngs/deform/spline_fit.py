@@ -45,3 +45,10 @@ def refitted(points: Tensor, pieces: int) -> Tensor:
     places = (torch.arange(count, dtype=torch.float64, device=points.device) + 0.5) / count
     fit = torch.linalg.lstsq(spline_basis(places, pieces), spline_basis(places, old)).solution
     return torch.einsum("qp,spd->sqd", fit, points.double()).to(points)
+
+
+def cubic_shares(place: float) -> Tensor:
+    """Return the (4,) weights of the control points of a piece of a uniform cubic B-spline, at ``place`` in [0, 1]."""
+    rest = 1 - place
+    middle = [(3 * x**3 - 6 * x**2 + 4) / 6 for x in (place, rest)]
+    return torch.tensor([rest**3 / 6, *middle, place**3 / 6], device="cpu")

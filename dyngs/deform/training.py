@@ -18,6 +18,7 @@ from dyngs.config import DynamicModel
 from dyngs.data.loader import Picture
 from dyngs.deform.field import FieldSetup, Offsets, deformed
 from dyngs.deform.fields import can_begin_on_its_way, field_on_its_way, new_field
+from dyngs.deform.matched_views import MatchedViews
 from dyngs.deform.motion import bake_, measure_motion
 from dyngs.deform.pieces import MovingPart, Scores, paid_motion
 from dyngs.deform.random_gaussians import box_of, with_gaussians, with_random_gaussians
@@ -55,6 +56,7 @@ class DeformSchedule:
         rates: how the field's rates fall.
         groups: step after which what moves may form rigid groups.
         lifetimes: step after which moving Gaussians may get time windows.
+        matches: steps after which motion is corrected by block matching.
     """
 
     fine: int
@@ -65,6 +67,7 @@ class DeformSchedule:
     rates: Rates
     groups: int = 0
     lifetimes: int = 0
+    matches: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,7 @@ class TrainingViews:
         cameras_stay: in place, so that pictures show what is still exactly alike.
         standing: returns what those cameras show.
         held_out: returns the PSNR, dB, of the pictures held out, of Gaussians at a time; None: none are.
+        matched: pictures for block matching.
     """
 
     times: tuple[float, ...]
@@ -88,6 +92,7 @@ class TrainingViews:
     cameras_stay: bool = False
     standing: Callable[[], Sequence[Footage]] = tuple
     held_out: Scores | None = None
+    matched: MatchedViews | None = None
 
 
 class DynamicTraining:
@@ -153,7 +158,11 @@ class DynamicTraining:
             return scene
         if edited:
             scene.field.regroup()
-        scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
+        if step in self.schedule.matches:
+            scene = self._registered(scene, step)
+            scene.changed()
+        if scene.field is not None:
+            scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
         return self._frozen(scene) if step in self.schedule.splits else scene
 
     def grown(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
@@ -252,6 +261,21 @@ class DynamicTraining:
             seen = self.capture.still_errors(lambda time: deformed(now, field.offsets(means, time), scene.moving))
             moves &= seen.usual[scene.moving] > SURELY_STILL * self.options.motion_threshold
         return _with_frozen(scene, motion.mean, ~moves)
+
+    @torch.no_grad()
+    def _registered(self, scene: DynamicScene, step: int) -> DynamicScene:
+        """Return the scene with its motion corrected by block matching, if that lowers the error of the pictures."""
+        views, times = self.capture.matched, self._window.bounds(step)
+        if views is None or scene.field is None or not len(scene.moving):
+            return scene
+        with torch.enable_grad():
+            seen = views.shifts(lambda time: scene.deformed_at(time)[0].detach(), scene.moving, times)
+        field = scene.field.shifted(scene.gaussians.means.detach()[scene.moving], seen)
+        if field is None:
+            return scene
+        tried = replace(scene, field=field)
+        before, after = (views.error(lambda time, x=x: x.deformed_at(time)[0], times) for x in (scene, tried))
+        return tried if after < before else scene
 
     def _with_paid_motion(self, scene: DynamicScene) -> Variant[DynamicScene] | None:
         """Return the scene in which only pieces move whose motion pays; None where no view is held out to tell."""

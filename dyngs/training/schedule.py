@@ -8,6 +8,7 @@ from typing_extensions import assert_never
 
 from dyngs.config import (
     Config,
+    ControlNodesField,
     DefaultStrategy,
     DynamicModel,
     HumanModel,
@@ -35,6 +36,8 @@ MIN_COARSE_STEPS = 1000
 """Steps that a still model needs to show where it fails; short runs spend at most a third on it."""
 SPLITS = (0.1, 0.3, 0.5)
 """Steps at which still Gaussians are frozen, as shares of the part of the run that sees all times."""
+MATCH_SHARE, MATCHES_UNTIL = 0.04, 0.85
+"""Share of the run between two rounds of block matching, and after which there are no more."""
 GROUPS = 0.12
 """The step at which nodes may form rigid groups, likewise: after the first split."""
 LIFETIMES = 0.16
@@ -139,7 +142,17 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
     splits = sorted({full + round(share * (steps - full)) for share in SPLITS}) if model.freeze_below_px > 0 else []
     splits = tuple(step for step in splits if step > full)
     groups, lifetimes = (full + round(share * (steps - full)) for share in (GROUPS, LIFETIMES))
-    return DeformSchedule(fine, opens, full, decays, splits, rates, groups, lifetimes)
+    return DeformSchedule(fine, opens, full, decays, splits, rates, groups, lifetimes, _matches(model, fine, steps))
+
+
+def _matches(model: DynamicModel, fine: int, steps: int) -> tuple[int, ...]:
+    """Return the steps after which block matching corrects motion that begins after ``fine``."""
+    match model.deform:
+        case ControlNodesField(block_matching=True):
+            every = max(1, round(MATCH_SHARE * steps))
+            return tuple(range(fine + every, round(MATCHES_UNTIL * steps) + 1, every))
+        case _:
+            return ()
 
 
 def motion_begins_after(config: Config, steps: int) -> int | None:

@@ -70,6 +70,7 @@ def test_what_was_asked_for_stays(moving: Path, monkeypatch: pytest.MonkeyPatch)
     config = preset(
         moving,
         "model.deform.move_opacities=true",
+        "model.deform.block_matching=true",
         "model.time_window=0.3",
         "colour.kind=auto",
         "model.deform.rigid_groups=auto",

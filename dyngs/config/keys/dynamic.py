@@ -82,6 +82,11 @@ class ControlNodesField(FieldSection):
         "spacings; lower where things bend",
     )
     smoothness: float = Field(default=0.01, ge=0, description="weight of the nodes' squared acceleration")
+    block_matching: bool = Field(
+        default=False,
+        description="now and then look up to three small pixels around for where moving blocks of the drawn picture "
+        "belong in the true one, and correct the splines by that where it lowers the error",
+    )
     rigid_groups: Literal["never", "auto", "always"] = Field(
         default="never",
         description="nodes that move rigidly get one motion per body once all times are seen; auto: if that wins a "

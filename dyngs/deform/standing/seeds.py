@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dyngs.conventions import SH_C0
-from dyngs.deform.control_nodes import SPAN, cubic_shares
+from dyngs.deform.spline_fit import SPAN, cubic_shares
 from dyngs.deform.standing.changes import Footage
 from dyngs.deform.standing.hulls import silhouettes_at
 from dyngs.deform.standing.linking import Track
