@@ -17,10 +17,10 @@ from dyngs.metrics import psnr
 from dyngs.rendering import RenderOptions
 from dyngs.scene import Scene
 
-SMALL_SIDE, SMALL_GAUSSIANS = 128, 40_000
+SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000
 """Longest side of the pictures, px, and most Gaussians.
 
-A still model of what moves grows without end, to explain motion by viewpoint; so many are enough to fail by.
+A still model of what moves grows without end, to explain motion by viewpoint; one per pixel is enough to fail by.
 """
 FEWEST_VIEWS = 8
 """With fewer training views none can be spared for a comparison."""
