@@ -90,7 +90,10 @@ class VariantRuns:
     def _trained(self, wanted: Variant) -> Path:
         """Train the run from scratch with other colours or another field."""
         out = self.out / "training" / wanted.slug
-        changes = [*field_changes(load_resolved(self.run_dir), wanted)]
+        run = load_resolved(self.run_dir)
+        changes = [*field_changes(run, wanted)]
+        if field_of(run) is not None:  # a variant is what it says: nothing is chosen, and it stays a moving scene
+            changes += ["model.pilot_steps=0", "model.compare_with_still=false"]
         if wanted.colour is not None:
             changes.append(f"colour.kind={wanted.colour}")
         changes += [*NO_BUDGET, f"run.dir={out}", f"run.threads={self.threads}"]
