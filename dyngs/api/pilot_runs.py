@@ -19,8 +19,6 @@ from dyngs.training.background import background_colour
 
 SHARE, FEWEST_STEPS = 0.25, 1000
 """A pilot run has at most this share of the run's steps; with fewer steps than these it says nothing."""
-INITIAL_DOWNSCALE = 2
-"""Most that sides of the small pictures are divided by at first."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +84,7 @@ def pilot_steps(config: Config) -> int:
 
 def _scores(config: Config, every: int, steps: int) -> list[float]:
     """Return the PSNR of the held-out views after a pilot run, dB."""
-    small = small_run(config, every, steps)
-    downscale = min(small.train.initial_downscale, INITIAL_DOWNSCALE)
-    trainer = assemble(
-        small.model_copy(update={"train": small.train.model_copy(update={"initial_downscale": downscale})})
-    )
+    trainer = assemble(small_run(config, every, steps))
     while trainer.done < steps:
         trainer.step()
     background = background_colour(trainer.background)
