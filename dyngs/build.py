@@ -79,6 +79,7 @@ from dyngs.training.loop import Trainable
 from dyngs.training.prediction import assemble_network
 from dyngs.training.priors.find import used_priors
 from dyngs.training.priors.used import UsedPriors
+from dyngs.training.robust import RobustMasks
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.schedule import (
     deform_schedule,
@@ -184,6 +185,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         held_out=held_out_views(capture.splits["train"], config.train.hold_out_every),
         held_out_until=hold_out_until(config.train),
         priors=priors,
+        robust=_robust(config, capture, pictures),
     )
 
 
@@ -196,6 +198,16 @@ def _priors(config: Config, capture: Capture, pictures: PictureLoader) -> UsedPr
             return used_priors(config, capture, pictures, moves=len(set(training_times(capture))) > 1)
         case _:
             return UsedPriors()
+
+
+def _robust(config: Config, capture: Capture, pictures: PictureLoader) -> RobustMasks | None:
+    """Return the masks of what disagrees between views of a still scene, if they are asked for."""
+    match config.model:
+        case StaticModel() if config.train.robust == "always":
+            cameras = training_cameras(capture.splits["train"], config.data)
+            return RobustMasks(pictures, cameras, config.train.steps)
+        case _:
+            return None
 
 
 def restored_scene(checkpoint: Checkpoint, model: SceneModel) -> Scene:

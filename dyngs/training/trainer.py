@@ -28,6 +28,7 @@ from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.training.background import AlphaWeight, background_colour
 from dyngs.training.events import StepReport
 from dyngs.training.priors.used import StepView, UsedPriors
+from dyngs.training.robust import RobustMasks
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.schedule import active_sh_degree, means_rate, picture_divisor, rates_of
 from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
@@ -47,6 +48,7 @@ class Trainer:
         alpha: how much silhouettes count in the loss.
         generator: the only source of randomness, on the CPU.
         priors: what the user knows about the capture.
+        robust: masks of what disagrees with the other views; None: all pixels count.
         done: steps done.
         bad_gradients: how often a Gaussian was left out of a step because its gradient was not finite.
         held_out: indices of the training views that are not trained on up to ``held_out_until``.
@@ -69,6 +71,7 @@ class Trainer:
     alpha: AlphaWeight
     generator: torch.Generator
     priors: UsedPriors = field(default_factory=UsedPriors)
+    robust: RobustMasks | None = None
     done: int = 0
     bad_gradients: int = 0
     held_out: frozenset[int] = frozenset()
@@ -102,11 +105,18 @@ class Trainer:
         if scene.num_moving:
             _require_finite(moment.gaussians, step, picture, self.training.moves_by)
         options = self.priors.options(self._options(step), picture)
+        if self.robust is not None:
+            options = self.robust.options(index, step, options)
         rendering = scene.render(picture.cameras, moment, options=options, background=background, probe=probe)
+        if self.robust is not None:
+            picture = self.robust.masked(index, step, picture, rendering, background)
         rendered, truth = rendering.rgb[0], picture.composite(background)
         terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
         if self.alpha.weight > 0 and picture.alpha is not None:
-            terms["alpha"] = self.alpha.weight * (rendering.alpha[0] - picture.alpha).abs().mean()
+            error = (rendering.alpha[0] - picture.alpha).abs()
+            if self.robust is not None and picture.mask is not None:
+                error = error * picture.mask
+            terms["alpha"] = self.alpha.weight * error.mean()
         terms |= moment.penalties
         first, last = self.training.window(step)
         view = StepView(index, lambda time: first <= time <= last, options)
@@ -141,6 +151,8 @@ class Trainer:
         state |= prefixed("model.colour", self.colours.state()) | self.optimizer.state()
         state |= prefixed("strategy", with_role(self.densifier.state(), Role.TRAINING))
         state |= prefixed("sampler", with_role(self.sampler.state(), Role.TRAINING))
+        if self.robust is not None:
+            state |= prefixed("robust", with_role(self.robust.state(), Role.TRAINING))
         return state | with_role({"rng": self.generator.get_state()}, Role.TRAINING)
 
     def checkpoint(self) -> Checkpoint:
@@ -167,6 +179,8 @@ class Trainer:
                     self.densifier = FixedDensifier()
                 self.densifier.load_state(checkpoint.part("strategy"))
                 self.sampler.load_state(checkpoint.part("sampler"))
+                if self.robust is not None:
+                    self.robust.load_state(checkpoint.part("robust"))
                 self.generator.set_state(checkpoint.tensors["rng"])
             except KeyError as missing:
                 raise DyngsError(f"{checkpoint.name} lacks {missing}; {OTHER_CONFIG}") from None

@@ -45,6 +45,11 @@ class TrainConfig(Section):
     motion_masks: bool = Field(
         default=True, description="let motion masks say what moves, where the capture has any and they fit its pictures"
     )
+    robust: Literal["never", "auto", "always"] = Field(
+        default="never",
+        description="leave out pixels that disagree with the other views (people who walk through); still scenes only; "
+        "auto: where two small runs beforehand say that it pays",
+    )
     sh_every: int = Field(
         default=1000,
         ge=1,

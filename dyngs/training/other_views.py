@@ -1,0 +1,118 @@
+"""What other views show at the places that a rendering says a picture shows, in coarse cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
+
+from dyngs.camera import Cameras
+from dyngs.data.loader import PictureLoader
+
+CELLS = 40
+"""Cells along the longest side of a picture."""
+NEAREST = 24
+"""Views that are asked, at most."""
+FEWEST = 3
+"""Views that must see a place, at least."""
+SOLID = 0.5
+"""Alpha from which the drawn depth means anything; and the share of a cell that its picture's mask must keep."""
+_TINY = 1e-6
+
+
+def grid_of(width: int, height: int) -> tuple[int, int]:
+    """Return the rows and columns of the cells of a picture."""
+    longest = max(width, height)
+    return max(1, round(CELLS * height / longest)), max(1, round(CELLS * width / longest))
+
+
+class OtherViews:
+    """Mean colours of the cells of all training pictures, and where cells of one are found in the others.
+
+    Args:
+        pictures: of training.
+        cameras: V cameras of their full size.
+    """
+
+    def __init__(self, pictures: PictureLoader, cameras: Sequence[Cameras]) -> None:
+        self._pictures = pictures
+        self._poses = torch.cat([camera.cam_from_world for camera in cameras]).cpu()
+        self._intrinsics = torch.cat([camera.intrinsics for camera in cameras]).cpu()
+        self._sizes = torch.tensor([[camera.width, camera.height] for camera in cameras], device="cpu")
+        self._grids = torch.tensor([grid_of(camera.width, camera.height) for camera in cameras], device="cpu")
+        centres = torch.cat([camera.centers for camera in cameras]).cpu()
+        ahead = self._poses[:, 2, :3]
+        distance = torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")
+        same_side = (ahead[:, None] * ahead[None]).sum(-1) > 0
+        self._distance = torch.where(same_side, distance, torch.inf).fill_diagonal_(torch.inf)
+        self._cells: dict[int, Tensor] = {}
+
+    def cells_of(self, index: int, background: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the (3, h, w) mean colours of a picture on ``background`` (3,), and (h, w) bool which cells count."""
+        rows, columns = self._grids[index].tolist()
+        cells = self._table(index)[:, :rows, :columns]
+        return cells[:3] + (1 - cells[3]) * background[:, None, None], cells[4] > SOLID
+
+    def difference(self, index: int, which: Tensor, drawn: Tensor, background: Tensor) -> Tensor:
+        """Return (P,) the median difference of other views from the rendering; infinite where too few see a place.
+
+        Args:
+            index: of the picture.
+            which: (h, w) bool, P of its cells.
+            drawn: (5, h, w) colour, expected depth and alpha of the rendering.
+            background: (3,) behind all pictures.
+        """
+        shown, others = drawn[:, which], self._asked(index)
+        if not len(others) or not shown.shape[1]:
+            return torch.full_like(shown[0], torch.inf)
+        at, is_seen = self._found(index, which, shown[3], others)
+        table = torch.stack([self._table(i) for i in others.tolist()]).flatten(2)  # (J, 5, cells)
+        cells = table.gather(2, at[:, None].expand(-1, 5, -1)).transpose(1, 2)  # (J, P, 5)
+        there = cells[..., :3] + (1 - cells[..., 3:4]) * background
+        is_seen &= cells[..., 4] > SOLID
+        differ = (there - shown[:3].T).abs().mean(-1).masked_fill(~is_seen, torch.nan).nanmedian(0).values
+        is_known = (is_seen.sum(0) >= FEWEST) & (shown[4] > SOLID)
+        return torch.where(is_known, differ, torch.inf)
+
+    def _asked(self, index: int) -> Tensor:
+        """Return the (J,) indices of the nearest views that look the same way."""
+        order = self._distance[index].argsort(stable=True)[:NEAREST]
+        return order[self._distance[index][order].isfinite()]
+
+    def _found(self, index: int, which: Tensor, depth: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the (J, P) indices of the cells where other views see P cells of a picture, and whether they do."""
+        grid, size = self._grids[index], self._sizes[index].float()
+        places = which.nonzero().flip(1)  # column, row
+        pixels = (places + 0.5) * (size / grid.flip(0))
+        intrinsics, pose = self._intrinsics[index], self._poses[index]
+        focal, middle = intrinsics.diagonal()[:2], intrinsics[:2, 2]
+        local = torch.cat([(pixels - middle) / focal, torch.ones_like(pixels[:, :1])], 1) * depth[:, None]
+        world = (local - pose[:3, 3]) @ pose[:3, :3]
+        there = torch.einsum("jab,pb->jpa", self._poses[others, :3, :3], world) + self._poses[others, None, :3, 3]
+        z = there[..., 2:]
+        focal, middle = (
+            self._intrinsics[others].diagonal(dim1=1, dim2=2)[:, None, :2],
+            self._intrinsics[others, None, :2, 2],
+        )
+        pixels = there[..., :2] / z.clamp_min(_TINY) * focal + middle
+        grids = self._grids[others].flip(1)[:, None]
+        cells = (pixels / self._sizes[others, None].float() * grids).floor()
+        is_seen = (z[..., 0] > _TINY) & (cells >= 0).all(-1) & (cells < grids).all(-1)
+        cells = cells.clamp(torch.zeros_like(grids), grids - 1).long()
+        return cells[..., 1] * CELLS + cells[..., 0], is_seen
+
+    def _table(self, index: int) -> Tensor:
+        """Return the (5, CELLS, CELLS) cells of a picture: premultiplied colour, alpha, mask; zeros beyond its grid."""
+        if index not in self._cells:
+            picture = self._pictures[index]
+            rgb = picture.rgb_premultiplied
+            ones = torch.ones_like(rgb[..., 0])
+            alpha, mask = (ones if x is None else x for x in (picture.alpha, picture.mask))
+            rows, columns = self._grids[index].tolist()
+            table = torch.zeros(5, CELLS, CELLS, device="cpu")
+            pixels = torch.cat([rgb, alpha[..., None], mask[..., None]], -1).permute(2, 0, 1)
+            table[:, :rows, :columns] = adaptive_avg_pool2d(pixels.cpu(), (rows, columns))
+            self._cells[index] = table
+        return self._cells[index]

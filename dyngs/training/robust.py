@@ -1,0 +1,144 @@
+"""Masks of what disagrees with a still scene, found in training: people who walk through, for instance.
+
+Where a picture differs from its rendering, either the scene is not learned yet, or the picture shows something that the
+other pictures do not. So cells of a picture count no more where the residual is many times the median of the last
+views, *and* other views of that place look like the rendering rather than like this picture.
+
+After RobustNeRF (Sabour et al. 2023: residuals with spatial support) and SpotLessSplats (Sabour et al. 2024: a running
+histogram of residuals, a warm-up without masks). There a fixed share of the pixels is left out; here a multiple of the
+median decides, and the other views, so that hardly anything is where they agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, max_pool2d
+
+from dyngs.camera import Cameras
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.rendering import Rendering, RenderOptions
+from dyngs.tensor_checks import require_indices, require_tensor
+from dyngs.training.other_views import CELLS, OtherViews, grid_of
+
+EVERY = 3
+"""A picture is looked at each so many times that it is trained on; in between its mask stays."""
+WARM_UP = 0.05
+"""Share of the run in which everything counts."""
+SEED, GROWN = 5.0, 3.0
+"""Multiples of the median residual: from the first a cell is left out, from the second beside such cells."""
+REACH = 2
+"""Cells up to which a cell counts as beside another."""
+SUPPORT = 0.5
+"""Share of the 3 x 3 cells around that must be left out, too."""
+CLEARLY = 0.5
+"""A place disagrees where the other views differ from the rendering by less than this share of what it does."""
+RIM = 1
+"""Cells around what is left out that are left out with it."""
+DISCOUNT = 0.95
+"""Weight of the histogram of all looks before against that of the present one: it remembers about twenty."""
+_OCTAVES, _PER_OCTAVE = 12, 16
+"""The histogram spans residuals from 2 ** -12 to 1, so many bins for each factor of two."""
+
+
+class RobustMasks:
+    """Masks of the pixels that count, one per training picture, brought up to date as it is trained on.
+
+    Args:
+        pictures: of training.
+        cameras: theirs, V cameras of their full size.
+        steps: of the run.
+    """
+
+    def __init__(self, pictures: PictureLoader, cameras: list[Cameras], steps: int) -> None:
+        self._others, self._begins = OtherViews(pictures, cameras), WARM_UP * steps
+        self._visits = torch.zeros(len(pictures), dtype=torch.int64, device="cpu")
+        self._left_out = torch.zeros(len(pictures), CELLS, CELLS, dtype=torch.uint8, device="cpu")
+        self._histogram = torch.zeros(_OCTAVES * _PER_OCTAVE, dtype=torch.float64, device="cpu")
+
+    def options(self, index: int, step: int, options: RenderOptions) -> RenderOptions:
+        """Return how the picture is drawn in ``step``: with depth where it is looked at."""
+        return replace(options, depth="expected") if self._looks(index, step) else options
+
+    def masked(self, index: int, step: int, picture: Picture, rendering: Rendering, background: Tensor) -> Picture:
+        """Return ``picture``, of which only those pixels count that agree with the other views; call once a step.
+
+        Args:
+            index: of the view.
+            step: in which it was drawn with ``options``.
+            picture: may be smaller than that of the loader.
+            rendering: of it.
+            background: (3,) behind both.
+        """
+        if step <= self._begins:
+            return picture
+        if self._looks(index, step):
+            self._look(index, picture, rendering, background)
+        self._visits[index] += 1
+        height, width = picture.rgb_premultiplied.shape[:2]
+        rows, columns = grid_of(width, height)
+        left_out = self._left_out[index, :rows, :columns]
+        if not bool(left_out.any()):
+            return picture
+        at_rows = torch.arange(height, device="cpu") * rows // height
+        at_columns = torch.arange(width, device="cpu") * columns // width
+        counts = (1.0 - left_out.float())[at_rows][:, at_columns].to(picture.rgb_premultiplied)
+        return replace(picture, mask=counts if picture.mask is None else counts * picture.mask)
+
+    def state(self) -> dict[str, Tensor]:
+        return {"visits": self._visits, "left_out": self._left_out, "histogram": self._histogram}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Restore the state that ``state()`` returned. Raises KeyError, or ValueError for that of other pictures."""
+        count = len(self._visits)
+        visits = require_tensor("visits", state["visits"], (count,), torch.int64)
+        left_out = require_indices("left_out", state["left_out"], (count, CELLS, CELLS), 2, torch.uint8)
+        histogram = require_tensor("histogram", state["histogram"], self._histogram.shape, torch.float64)
+        self._visits, self._left_out, self._histogram = visits.clone(), left_out.clone(), histogram.clone()
+
+    def _looks(self, index: int, step: int) -> bool:
+        return step > self._begins and int(self._visits[index]) % EVERY == 0
+
+    @torch.no_grad()
+    def _look(self, index: int, picture: Picture, rendering: Rendering, background: Tensor) -> None:
+        """Find anew what is left out of a picture."""
+        assert rendering.depth is not None
+        grid = grid_of(picture.cameras.width, picture.cameras.height)
+        drawn, depth, alpha = (x[0].detach().cpu() for x in (rendering.rgb, rendering.depth, rendering.alpha))
+        drawn = adaptive_avg_pool2d(torch.cat([drawn, depth[..., None], alpha[..., None]], -1).permute(2, 0, 1), grid)
+        seen, keeps = self._others.cells_of(index, background.cpu())
+        residual = (drawn[:3] - seen).abs().mean(0, keepdim=True)
+        residual = avg_pool2d(residual * keeps, 3, stride=1, padding=1, count_include_pad=False)[0]
+        known = residual[keeps]
+        if not known.numel():
+            return
+        self._remember(known)
+        median = max(self._median(), float(known.median()))
+        candidates = (residual > GROWN * median) & keeps
+        if not bool((residual[candidates] > SEED * median).any()):
+            self._left_out[index] = 0
+            return
+        others = self._others.difference(index, candidates, drawn, background.cpu())
+        odd = candidates.clone()
+        odd[candidates] = others < CLEARLY * (drawn[:3] - seen).abs().mean(0)[candidates]
+        core = odd & _near(candidates & (residual > SEED * median), REACH)
+        core = avg_pool2d(core.float()[None], 3, stride=1, padding=1, count_include_pad=False)[0] >= SUPPORT
+        self._left_out[index, : grid[0], : grid[1]] = _near(core, RIM).to(torch.uint8)
+
+    def _remember(self, residual: Tensor) -> None:
+        bins = (_PER_OCTAVE * (residual.clamp(2.0**-_OCTAVES, 1.0).log2() + _OCTAVES)).long()
+        counts = torch.bincount(bins.clamp_max(len(self._histogram) - 1), minlength=len(self._histogram))
+        self._histogram = DISCOUNT * self._histogram + counts.to(self._histogram)
+
+    def _median(self) -> float:
+        """Return the median residual of the last looks, the upper end of its bin."""
+        below = self._histogram.cumsum(0)
+        index = int(torch.searchsorted(below, below[-1:] / 2))
+        return 2.0 ** ((index + 1) / _PER_OCTAVE - _OCTAVES)
+
+
+def _near(x: Tensor, reach: int) -> Tensor:
+    """Return (h, w) whether one of the cells up to ``reach`` away is true in ``x`` (h, w) bool."""
+    return max_pool2d(x.float()[None], 2 * reach + 1, stride=1, padding=reach)[0] > 0

@@ -1,0 +1,52 @@
+"""Other views are asked about the right places."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from flat_wall import BLACK, DISTANCE, cameras_before_wall, learned, seen_from, wall
+from torch.nn.functional import adaptive_avg_pool2d
+
+from dyngs.training.other_views import FEWEST, OtherViews, grid_of
+
+
+def asked(count: int, step: float = 0.15, distance: float = DISTANCE, alpha: float = 1.0) -> torch.Tensor:
+    """Return the differences of other views from what a perfect model shows of view 1, for all of its cells."""
+    cameras = cameras_before_wall(count, step)
+    others = OtherViews(seen_from(cameras), cameras)  # type: ignore[arg-type]
+    rgb = wall(cameras[1])
+    more = torch.stack([torch.full_like(rgb[..., 0], distance), torch.full_like(rgb[..., 0], alpha)], -1)
+    grid = grid_of(rgb.shape[1], rgb.shape[0])
+    drawn = adaptive_avg_pool2d(torch.cat([rgb, more], -1).permute(2, 0, 1), grid)
+    return others.difference(1, torch.ones(grid, dtype=torch.bool), drawn, BLACK).view(grid)
+
+
+def test_views_of_one_wall_agree_at_its_depth() -> None:
+    found = asked(6)
+    assert bool(found[:, :2].isinf().all())  # only views 0 and 1 see it
+    assert float(found[:, 2:].max()) < 0.006
+    assert float(asked(6, distance=2 * DISTANCE)[:, 10:30].max()) > 0.02
+
+
+@pytest.mark.parametrize("case", [{"count": FEWEST}, {"count": 6, "step": 50.0}, {"count": 6, "alpha": 0.3}])
+def test_where_too_few_see_a_place_nothing_is_known(case: dict[str, float]) -> None:
+    assert bool(asked(**case).isinf().all())  # type: ignore[arg-type]
+
+
+def test_colours_lie_on_the_background_and_masked_cells_do_not_count() -> None:
+    picture = seen_from(cameras_before_wall(1))[0]
+    alpha, mask = (
+        torch.zeros_like(picture.rgb_premultiplied[..., 0]),
+        torch.ones_like(picture.rgb_premultiplied[..., 0]),
+    )
+    mask[:, :40] = 0
+    empty = type(picture)("e", picture.cameras, torch.zeros_like(learned(picture.cameras)), alpha, mask, None)
+    colours, counts = OtherViews([empty], [picture.cameras]).cells_of(0, torch.tensor([0.2, 0.4, 0.6]))  # type: ignore[arg-type]
+    assert torch.allclose(colours, torch.tensor([0.2, 0.4, 0.6])[:, None, None].expand_as(colours))
+    assert not bool(counts[:, :20].any())
+    assert bool(counts[:, 20:].all())
+
+
+@pytest.mark.parametrize(("size", "grid"), [((80, 60), (30, 40)), ((60, 80), (40, 30)), ((1000, 3), (1, 40))])
+def test_the_longest_side_has_so_many_cells(size: tuple[int, int], grid: tuple[int, int]) -> None:
+    assert grid_of(*size) == grid

@@ -1,0 +1,183 @@
+"""Masks found in training: what one picture shows and the others do not is left out, and nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from flat_wall import BLACK, SIZE, cameras_before_wall, drawing, learned, places, seen_from, with_block
+from torch import Tensor
+
+from dyngs.build import assemble
+from dyngs.config import Config, DataConfig, DynamicModel, RandomInit, RunConfig, StaticModel, TrainConfig
+from dyngs.data.loader import Picture
+from dyngs.ops.loss import l1_ssim_loss
+from dyngs.rendering import RenderOptions
+from dyngs.training.robust import EVERY, WARM_UP, RobustMasks
+from dyngs.training.trainer import Trainer
+
+COUNT, STEPS = 8, 100
+AFTER = round(WARM_UP * STEPS) + 1
+ROWS, COLUMNS = slice(12, 42), slice(20, 44)
+
+
+def masks_of(pictures: list[Picture]) -> RobustMasks:
+    return RobustMasks(pictures, [picture.cameras for picture in pictures], STEPS)  # type: ignore[arg-type]
+
+
+def masked_pictures(pictures: list[Picture], drawn: list[Tensor], masks: RobustMasks | None = None) -> list[Picture]:
+    """Return all pictures after a round of training on them."""
+    masks = masks or masks_of(pictures)
+    return [
+        masks.masked(i, AFTER, picture, drawing(rgb), BLACK)
+        for i, (picture, rgb) in enumerate(zip(pictures, drawn, strict=True))
+    ]
+
+
+def busy_wall(which: tuple[int, ...] = (1, 4)) -> list[Picture]:
+    """Return pictures of the wall, some with a block in front."""
+    pictures = seen_from(cameras_before_wall(COUNT))
+    return [with_block(x, ROWS, COLUMNS) if i in which else x for i, x in enumerate(pictures)]
+
+
+def test_what_stands_in_front_of_some_views_is_left_out() -> None:
+    pictures = busy_wall()
+    found = masked_pictures(pictures, [learned(picture.cameras) for picture in pictures])
+    for i, picture in enumerate(found):
+        if i not in (1, 4):
+            assert picture.mask is None
+            continue
+        assert picture.mask is not None
+        assert not bool(picture.mask[ROWS, COLUMNS].any())
+        far = torch.ones(SIZE[1], SIZE[0], dtype=torch.bool)
+        far[ROWS.start - 7 : ROWS.stop + 7, COLUMNS.start - 7 : COLUMNS.stop + 7] = False
+        assert bool((picture.mask[far] == 1).all())
+
+
+def test_it_has_no_gradient() -> None:
+    picture = busy_wall()[1]
+    drawn = [learned(x.cameras) for x in busy_wall()]
+    mask = masked_pictures(busy_wall(), drawn)[1].mask
+    rendered = drawn[1].requires_grad_()
+    l1_ssim_loss(rendered, picture.rgb_premultiplied, 0.2, mask).backward()
+    assert rendered.grad is not None
+    assert not bool(rendered.grad[ROWS, COLUMNS].any())
+    assert bool(rendered.grad[0].any())
+
+
+def test_nothing_is_left_out_where_views_agree() -> None:
+    pictures = busy_wall(())
+    found = masked_pictures(pictures, [learned(picture.cameras) for picture in pictures])
+    assert all(picture.mask is None for picture in found)
+
+
+def test_what_is_not_learned_yet_counts() -> None:
+    """A hole in the model errs as much as a passer-by, but there the other views look like the picture."""
+    pictures, drawn = busy_wall(()), []
+    for picture in pictures:
+        x, y = places(picture.cameras)
+        rgb = learned(picture.cameras)
+        rgb[((x - 0.5).square() + y.square()) < 0.5] = 0.0
+        drawn.append(rgb)
+    assert all(picture.mask is None for picture in masked_pictures(pictures, drawn))
+
+
+def test_all_counts_while_the_run_warms_up() -> None:
+    pictures = busy_wall()
+    masks = masks_of(pictures)
+    usual = RenderOptions()
+    assert masks.options(1, AFTER - 1, usual) == usual
+    assert masks.masked(1, AFTER - 1, pictures[1], drawing(learned(pictures[1].cameras)), BLACK) is pictures[1]
+
+
+def test_a_picture_is_looked_at_now_and_then_and_its_mask_stays_in_between() -> None:
+    pictures = busy_wall()
+    masks, drawn = masks_of(pictures), drawing(learned(pictures[1].cameras))
+    first = masks.masked(1, AFTER, pictures[1], drawn, BLACK).mask
+    looks = []
+    for _ in range(EVERY):
+        looks.append(masks.options(1, AFTER, RenderOptions()).depth != "none")
+        mask = masks.masked(1, AFTER, pictures[1], drawn, BLACK).mask
+        assert mask is not None
+        assert first is not None
+        assert torch.equal(mask, first)
+    assert looks == [False] * (EVERY - 1) + [True]
+
+
+def test_the_pictures_own_mask_stays() -> None:
+    own = torch.ones(SIZE[1], SIZE[0])
+    own[:, :10] = 0
+    pictures = [replace(picture, mask=own) for picture in busy_wall()]
+    found = masked_pictures(pictures, [learned(picture.cameras) for picture in pictures])
+    for i in (0, 1):
+        mask = found[i].mask
+        assert mask is not None
+        assert not bool(mask[:, :10].any())
+    assert not bool(found[1].mask[ROWS, COLUMNS].any())  # type: ignore[index]
+    assert torch.equal(found[0].mask, own)  # type: ignore[arg-type]
+
+
+def test_smaller_pictures_have_the_same_cells() -> None:
+    pictures = busy_wall()
+    masks = masks_of(pictures)
+    masks.masked(1, AFTER, pictures[1], drawing(learned(pictures[1].cameras)), BLACK)
+    half = pictures[1].shrunk(2)
+    mask = masks.masked(1, AFTER, half, drawing(half.rgb_premultiplied), BLACK).mask
+    assert mask is not None
+    assert mask.shape == (SIZE[1] // 2, SIZE[0] // 2)
+    assert not bool(mask[ROWS.start // 2 : ROWS.stop // 2, COLUMNS.start // 2 : COLUMNS.stop // 2].any())
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("visits", torch.zeros(3, dtype=torch.int64)),
+        ("left_out", torch.full((COUNT, 40, 40), 7, dtype=torch.uint8)),
+        ("histogram", torch.zeros(5, dtype=torch.float64)),
+    ],
+)
+def test_a_state_of_other_pictures_is_refused(name: str, wrong: Tensor) -> None:
+    masks = masks_of(busy_wall())
+    with pytest.raises(ValueError, match=name):
+        masks.load_state(masks.state() | {name: wrong})
+
+
+def trainer_of(root: Path, choice: str, model: DynamicModel | None = None) -> Trainer:
+    return assemble(
+        Config(
+            data=DataConfig(root=root),
+            model=model or StaticModel(sh_degree=0),
+            init=RandomInit(num_random=60),
+            train=TrainConfig(steps=40, robust=choice),  # type: ignore[arg-type]
+            run=RunConfig(threads=1),
+        )
+    )
+
+
+def test_a_resumed_run_has_the_same_bytes(still: Path) -> None:
+    whole, first, second = (trainer_of(still, "always") for _ in range(3))
+    for _ in range(30):
+        whole.step()
+    for _ in range(15):
+        first.step()
+    second.restore(first.checkpoint())
+    for _ in range(15):
+        second.step()
+    ends = whole.checkpoint().tensors, second.checkpoint().tensors
+    assert ends[0].keys() == ends[1].keys()
+    assert "robust.left_out" in ends[0]
+    assert all(torch.equal(x, ends[1][name]) for name, x in ends[0].items())
+
+
+@pytest.mark.parametrize("choice", ["never", "auto"])
+def test_without_masks_nothing_is_kept_for_them(still: Path, choice: str) -> None:
+    """Auto is decided before a run begins."""
+    trainer = trainer_of(still, choice)
+    assert trainer.robust is None
+    assert not any(name.startswith("robust") for name in trainer.state())
+
+
+def test_what_moves_has_none(moving: Path) -> None:
+    assert trainer_of(moving, "always", DynamicModel(sh_degree=0)).robust is None
