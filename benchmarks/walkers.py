@@ -118,7 +118,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--share", type=float, default=1 / 3)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--robust", default="never,always")
-    options = parser.parse_args(words)
+    options = parser.parse_intermixed_args(words)
     captures = [Path(word) for word in options.words if "=" not in word]
     overrides = [word for word in options.words if "=" in word]
     print("| capture | pictures | train.robust | PSNR / SSIM | Gaussians | seconds |\n|---|---|---|---|---|---|")

@@ -56,10 +56,11 @@ def with_block(picture: Picture, rows: slice, columns: slice) -> Picture:
     return replace(picture, rgb_premultiplied=rgb)
 
 
-def drawing(rgb: Tensor) -> Rendering:
-    """Return ``rgb`` (H, W, 3) as an opaque rendering of the wall."""
-    depth = torch.full((1, *rgb.shape[:2]), DISTANCE)
-    return Rendering(rgb[None], torch.zeros_like(depth), depth, torch.zeros(1, 0, 2, dtype=torch.int32))
+def with_depth(cameras: Cameras) -> Rendering:
+    """Return an opaque rendering at the depth of the wall."""
+    depth = torch.full((1, cameras.height, cameras.width), DISTANCE)
+    rgb = torch.zeros(1, cameras.height, cameras.width, 3)
+    return Rendering(rgb, torch.zeros_like(depth), depth, torch.zeros(1, 0, 2, dtype=torch.int32))
 
 
 def learned(camera: Cameras, error: float = 0.004) -> Tensor:

@@ -11,6 +11,7 @@ median decides, and the other views, so that hardly anything is where they agree
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -19,11 +20,11 @@ from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, max_pool2d
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Picture, PictureLoader
-from dyngs.rendering import Rendering, RenderOptions
+from dyngs.rendering import Rendering
 from dyngs.tensor_checks import require_indices, require_tensor
 from dyngs.training.other_views import CELLS, OtherViews, grid_of
 
-EVERY = 3
+EVERY = 4
 """A picture is looked at each so many times that it is trained on; in between its mask stays."""
 WARM_UP = 0.05
 """Share of the run in which everything counts."""
@@ -58,24 +59,29 @@ class RobustMasks:
         self._left_out = torch.zeros(len(pictures), CELLS, CELLS, dtype=torch.uint8, device="cpu")
         self._histogram = torch.zeros(_OCTAVES * _PER_OCTAVE, dtype=torch.float64, device="cpu")
 
-    def options(self, index: int, step: int, options: RenderOptions) -> RenderOptions:
-        """Return how the picture is drawn in ``step``: with depth where it is looked at."""
-        return replace(options, depth="expected") if self._looks(index, step) else options
-
-    def masked(self, index: int, step: int, picture: Picture, rendering: Rendering, background: Tensor) -> Picture:
+    def masked(
+        self,
+        index: int,
+        step: int,
+        picture: Picture,
+        drawn: Tensor,
+        background: Tensor,
+        with_depth: Callable[[Cameras], Rendering],
+    ) -> Picture:
         """Return ``picture``, of which only those pixels count that agree with the other views; call once a step.
 
         Args:
             index: of the view.
-            step: in which it was drawn with ``options``.
+            step: that is being done.
             picture: may be smaller than that of the loader.
-            rendering: of it.
+            drawn: (H, W, 3) its rendering.
             background: (3,) behind both.
+            with_depth: draws the same scene with its expected depth.
         """
         if step <= self._begins:
             return picture
-        if self._looks(index, step):
-            self._look(index, picture, rendering, background)
+        if int(self._visits[index]) % EVERY == 0:
+            self._look(index, picture.cameras, drawn.detach().cpu(), background.cpu(), with_depth)
         self._visits[index] += 1
         height, width = picture.rgb_premultiplied.shape[:2]
         rows, columns = grid_of(width, height)
@@ -98,18 +104,20 @@ class RobustMasks:
         histogram = require_tensor("histogram", state["histogram"], self._histogram.shape, torch.float64)
         self._visits, self._left_out, self._histogram = visits.clone(), left_out.clone(), histogram.clone()
 
-    def _looks(self, index: int, step: int) -> bool:
-        return step > self._begins and int(self._visits[index]) % EVERY == 0
-
     @torch.no_grad()
-    def _look(self, index: int, picture: Picture, rendering: Rendering, background: Tensor) -> None:
+    def _look(
+        self,
+        index: int,
+        cameras: Cameras,
+        drawn: Tensor,
+        background: Tensor,
+        with_depth: Callable[[Cameras], Rendering],
+    ) -> None:
         """Find anew what is left out of a picture."""
-        assert rendering.depth is not None
-        grid = grid_of(picture.cameras.width, picture.cameras.height)
-        drawn, depth, alpha = (x[0].detach().cpu() for x in (rendering.rgb, rendering.depth, rendering.alpha))
-        drawn = adaptive_avg_pool2d(torch.cat([drawn, depth[..., None], alpha[..., None]], -1).permute(2, 0, 1), grid)
-        seen, keeps = self._others.cells_of(index, background.cpu())
-        residual = (drawn[:3] - seen).abs().mean(0, keepdim=True)
+        grid = grid_of(cameras.width, cameras.height)
+        drawn = adaptive_avg_pool2d(drawn.permute(2, 0, 1), grid)
+        seen, keeps = self._others.cells_of(index, background)
+        residual = (drawn - seen).abs().mean(0, keepdim=True)
         residual = avg_pool2d(residual * keeps, 3, stride=1, padding=1, count_include_pad=False)[0]
         known = residual[keeps]
         if not known.numel():
@@ -120,9 +128,12 @@ class RobustMasks:
         if not bool((residual[candidates] > SEED * median).any()):
             self._left_out[index] = 0
             return
-        others = self._others.difference(index, candidates, drawn, background.cpu())
+        coarse = with_depth(_as_cells(cameras, grid))
+        assert coarse.depth is not None
+        shown = torch.cat([drawn, coarse.depth.cpu(), coarse.alpha.cpu()])
+        others = self._others.difference(index, candidates, shown, background)
         odd = candidates.clone()
-        odd[candidates] = others < CLEARLY * (drawn[:3] - seen).abs().mean(0)[candidates]
+        odd[candidates] = others < CLEARLY * (drawn - seen).abs().mean(0)[candidates]
         core = odd & _near(candidates & (residual > SEED * median), REACH)
         core = avg_pool2d(core.float()[None], 3, stride=1, padding=1, count_include_pad=False)[0] >= SUPPORT
         self._left_out[index, : grid[0], : grid[1]] = _near(core, RIM).to(torch.uint8)
@@ -137,6 +148,12 @@ class RobustMasks:
         below = self._histogram.cumsum(0)
         index = int(torch.searchsorted(below, below[-1:] / 2))
         return 2.0 ** ((index + 1) / _PER_OCTAVE - _OCTAVES)
+
+
+def _as_cells(cameras: Cameras, grid: tuple[int, int]) -> Cameras:
+    """Return ``cameras`` with one pixel per cell."""
+    scale = cameras.intrinsics.new_tensor([grid[1] / cameras.width, grid[0] / cameras.height, 1.0])
+    return Cameras(cameras.cam_from_world, scale[:, None] * cameras.intrinsics, grid[1], grid[0])
 
 
 def _near(x: Tensor, reach: int) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -105,11 +106,11 @@ class Trainer:
         if scene.num_moving:
             _require_finite(moment.gaussians, step, picture, self.training.moves_by)
         options = self.priors.options(self._options(step), picture)
-        if self.robust is not None:
-            options = self.robust.options(index, step, options)
         rendering = scene.render(picture.cameras, moment, options=options, background=background, probe=probe)
         if self.robust is not None:
-            picture = self.robust.masked(index, step, picture, rendering, background)
+            coarse = replace(options, depth="expected", absgrad=False)
+            with_depth = partial(scene.render, time=moment, options=coarse, background=background)
+            picture = self.robust.masked(index, step, picture, rendering.rgb[0], background, with_depth)
         rendered, truth = rendering.rgb[0], picture.composite(background)
         terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
         if self.alpha.weight > 0 and picture.alpha is not None:

@@ -7,14 +7,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from flat_wall import BLACK, SIZE, cameras_before_wall, drawing, learned, places, seen_from, with_block
+from flat_wall import BLACK, SIZE, cameras_before_wall, learned, places, seen_from, with_block, with_depth
 from torch import Tensor
 
 from dyngs.build import assemble
+from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, RandomInit, RunConfig, StaticModel, TrainConfig
 from dyngs.data.loader import Picture
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.rendering import RenderOptions
+from dyngs.rendering import Rendering
 from dyngs.training.robust import EVERY, WARM_UP, RobustMasks
 from dyngs.training.trainer import Trainer
 
@@ -31,7 +32,7 @@ def masked_pictures(pictures: list[Picture], drawn: list[Tensor], masks: RobustM
     """Return all pictures after a round of training on them."""
     masks = masks or masks_of(pictures)
     return [
-        masks.masked(i, AFTER, picture, drawing(rgb), BLACK)
+        masks.masked(i, AFTER, picture, rgb, BLACK, with_depth)
         for i, (picture, rgb) in enumerate(zip(pictures, drawn, strict=True))
     ]
 
@@ -87,23 +88,26 @@ def test_what_is_not_learned_yet_counts() -> None:
 def test_all_counts_while_the_run_warms_up() -> None:
     pictures = busy_wall()
     masks = masks_of(pictures)
-    usual = RenderOptions()
-    assert masks.options(1, AFTER - 1, usual) == usual
-    assert masks.masked(1, AFTER - 1, pictures[1], drawing(learned(pictures[1].cameras)), BLACK) is pictures[1]
+    drawn = learned(pictures[1].cameras)
+    assert masks.masked(1, AFTER - 1, pictures[1], drawn, BLACK, with_depth) is pictures[1]
 
 
 def test_a_picture_is_looked_at_now_and_then_and_its_mask_stays_in_between() -> None:
     pictures = busy_wall()
-    masks, drawn = masks_of(pictures), drawing(learned(pictures[1].cameras))
-    first = masks.masked(1, AFTER, pictures[1], drawn, BLACK).mask
-    looks = []
-    for _ in range(EVERY):
-        looks.append(masks.options(1, AFTER, RenderOptions()).depth != "none")
-        mask = masks.masked(1, AFTER, pictures[1], drawn, BLACK).mask
+    masks, drawn = masks_of(pictures), learned(pictures[1].cameras)
+    found: list[Tensor] = []
+    looks: list[int] = []
+
+    def counted(cameras: Cameras) -> Rendering:
+        looks.append(len(found))
+        return with_depth(cameras)
+
+    for _ in range(EVERY + 1):
+        mask = masks.masked(1, AFTER, pictures[1], drawn, BLACK, counted).mask
         assert mask is not None
-        assert first is not None
-        assert torch.equal(mask, first)
-    assert looks == [False] * (EVERY - 1) + [True]
+        found.append(mask)
+    assert looks == [0, EVERY]
+    assert all(torch.equal(mask, found[0]) for mask in found)
 
 
 def test_the_pictures_own_mask_stays() -> None:
@@ -122,9 +126,9 @@ def test_the_pictures_own_mask_stays() -> None:
 def test_smaller_pictures_have_the_same_cells() -> None:
     pictures = busy_wall()
     masks = masks_of(pictures)
-    masks.masked(1, AFTER, pictures[1], drawing(learned(pictures[1].cameras)), BLACK)
+    masks.masked(1, AFTER, pictures[1], learned(pictures[1].cameras), BLACK, with_depth)
     half = pictures[1].shrunk(2)
-    mask = masks.masked(1, AFTER, half, drawing(half.rgb_premultiplied), BLACK).mask
+    mask = masks.masked(1, AFTER, half, half.rgb_premultiplied, BLACK, with_depth).mask
     assert mask is not None
     assert mask.shape == (SIZE[1] // 2, SIZE[0] // 2)
     assert not bool(mask[ROWS.start // 2 : ROWS.stop // 2, COLUMNS.start // 2 : COLUMNS.stop // 2].any())
