@@ -36,7 +36,7 @@ def now(preset: str, *overrides: str) -> Config:
     return config.model_copy(update={"run": config.run.model_copy(update={"name": name})})
 
 
-ADDED = {"dynamic": ("model.compare_with_still=false", "train.alpha_weight=0")}
+ADDED = {"dynamic": ("model.compare_with_still=false", "model.pilot_steps=0", "train.alpha_weight=0")}
 """Overrides that undo what presets ask for since."""
 
 
