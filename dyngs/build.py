@@ -41,9 +41,8 @@ from dyngs.data.inspection.scene_problems import before_training
 from dyngs.data.loader import PictureLoader
 from dyngs.data.prepare.first_points import with_first_points
 from dyngs.data.read import read_capture
+from dyngs.deform.compared_views import ComparedViews
 from dyngs.deform.given_masks import moving_share_of
-from dyngs.deform.matched_views import MatchedViews
-from dyngs.deform.pieces import psnr_of_views
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.standing.changes import Footage, footage_of
 from dyngs.deform.still_error import StillErrors, cameras_in_place, still_errors, views_to_compare
@@ -382,13 +381,9 @@ def _training_views(
         used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
         return [footage_of((pictures[i] for i in seen), background, sum(map(len, used))) for seen in used]
 
-    held_out = held_out_views(views, config.train.hold_out_every)
-
-    trained_on = [i for i in range(len(pictures)) if i not in held_out]
-
-    def scores_of(gaussians_at: Callable[[float], Gaussians]) -> list[float]:
-        return psnr_of_views(gaussians_at, (pictures[i] for i in sorted(held_out)), options, background, shader)
-
+    left_out = held_out_views(views, config.train.hold_out_every)
+    trained_on = [i for i in range(len(pictures)) if i not in left_out]
+    held_out = ComparedViews(pictures, sorted(left_out), options, background, shader)
     return TrainingViews(
         training_times(capture),
         cameras,
@@ -396,8 +391,8 @@ def _training_views(
         errors_of,
         cameras_stay=bool(in_place),
         standing=standing,
-        held_out=scores_of if held_out else None,
-        matched=MatchedViews(pictures, trained_on, options, background, shader),
+        held_out=held_out.psnr if left_out else None,
+        matched=replace(held_out, indices=trained_on),
     )
 
 

@@ -2,7 +2,7 @@
 
 Things that travel want their motion followed outwards from the middle of the clip, things that stay in place want all
 times at once; light that changes wants colours that a network makes from direction and time. No capture says which it
-is, but 2,000 steps in small pictures do.
+is. Small runs do, though not always: what pays in small pictures need not pay in large ones (docs/benchmarks.md).
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
-from dyngs.api.small_runs import held_out_scores, is_gain, small_run
-from dyngs.build import assemble
+from dyngs.api.small_runs import held_out_scores, is_gain, trained
 from dyngs.config import Config, ControlNodesField, DynamicModel, NetworkColour
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.training.background import background_colour
@@ -84,9 +83,7 @@ def pilot_steps(config: Config) -> int:
 
 def _scores(config: Config, every: int, steps: int) -> list[float]:
     """Return the PSNR of the held-out views after a pilot run, dB."""
-    trainer = assemble(small_run(config, every, steps))
-    while trainer.done < steps:
-        trainer.step()
+    trainer = trained(config, every, steps)
     background = background_colour(trainer.background)
     return held_out_scores(trainer.scene, trainer.pictures, trainer.held_out, trainer.options, background)
 

@@ -13,8 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from dyngs.api.small_runs import FEWEST_VIEWS, drawn, hold_out_every, is_gain, small_run
-from dyngs.build import assemble
+from dyngs.api.small_runs import FEWEST_VIEWS, drawn, hold_out_every, is_gain, trained
 from dyngs.config import Config, StaticModel
 from dyngs.data.read import read_capture
 from dyngs.metrics import psnr
@@ -45,7 +44,7 @@ def decided(config: Config) -> Config:
         print("train.robust=auto: too short a run, or too few views, to find out whether it pays; not used", flush=True)
         return _with(config, "never")
     begun, every = time.monotonic(), hold_out_every(views)
-    plain, robust = (_trained(_with(config, choice), every, steps) for choice in ("never", "always"))
+    plain, robust = (trained(_with(config, choice), every, steps) for choice in ("never", "always"))
     scores = compared(plain, robust)
     gains = [b - a for a, b in scores]
     pays = is_gain(gains) and fmean(gains) >= CLEAR_GAIN
@@ -86,14 +85,6 @@ def explained(one: Tensor, other: Tensor, truth: Tensor, mask: Tensor | None) ->
         return weight
     rank = max(1, round(EXPLAINED * known.numel()))
     return weight * (error <= known.sort().values[rank - 1])
-
-
-def _trained(config: Config, every: int, steps: int) -> Trainer:
-    """Return the trainer after a small run."""
-    trainer = assemble(small_run(config, every, steps))
-    while trainer.done < steps:
-        trainer.step()
-    return trainer
 
 
 def _with(config: Config, choice: Literal["never", "always"]) -> Config:

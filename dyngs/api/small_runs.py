@@ -10,12 +10,14 @@ import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
+from dyngs.build import assemble
 from dyngs.config import BudgetConfig, Config, DefaultStrategy, FixedStrategy, McmcStrategy, PruneConfig, Strategy
 from dyngs.data.capture import View
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.metrics import psnr
 from dyngs.rendering import RenderOptions
 from dyngs.scene import Scene
+from dyngs.training.trainer import Trainer
 
 SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000
 """Longest side of the pictures, px, and most Gaussians.
@@ -41,6 +43,14 @@ def small_run(config: Config, every: int, steps: int) -> Config:
             "prune": PruneConfig(),
         }
     )
+
+
+def trained(config: Config, every: int, steps: int) -> Trainer:
+    """Return the trainer after a small run of ``config``; see ``small_run``."""
+    trainer = assemble(small_run(config, every, steps))
+    while trainer.done < steps:
+        trainer.step()
+    return trainer
 
 
 def hold_out_every(views: Sequence[View]) -> int:

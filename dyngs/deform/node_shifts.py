@@ -47,6 +47,7 @@ def matching_factor(width: int, height: int) -> int:
     return max(1, math.ceil(max(width, height) / LONGEST_SIDE))
 
 
+@torch.enable_grad()
 def seen_shift(gaussians: Gaussians, rows: Tensor, picture: Picture, drawn: Tensor, truth: Tensor) -> SeenShift:
     """Return how the moving Gaussians would have to shift for the drawn picture to lie on the true one.
 

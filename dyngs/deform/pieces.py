@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
 import torch
 from torch import Tensor
 
-from dyngs.data.loader import Picture
 from dyngs.deform.field import Offsets, deformed
 from dyngs.deform.nodes import spread_out
 from dyngs.gaussians import Gaussians
-from dyngs.metrics import psnr
-from dyngs.rendering import RenderOptions, Shader, render
 from dyngs.static.scene import filtered
 
 PIECES = 16
@@ -95,23 +92,6 @@ def paid_motion(part: MovingPart, scores: Scores) -> PaidMotion:
         if score >= best:
             stays, best, still = tried, score, still + 1
     return PaidMotion(stays, count, count - still, before, best)
-
-
-@torch.no_grad()
-def psnr_of_views(
-    gaussians_at: Callable[[float], Gaussians],
-    pictures: Iterable[Picture],
-    options: RenderOptions,
-    background: Tensor,
-    shader_at: Callable[[float], Shader | None],
-) -> list[float]:
-    """Return the PSNR of each picture, dB, of Gaussians at its time; ``shader_at`` colours them at that time."""
-    found = []
-    for picture in pictures:
-        time = picture.time or 0.0
-        drawn = render(gaussians_at(time), picture.cameras, options, background=background, shader=shader_at(time))
-        found.append(psnr(drawn.rgb[0], picture.composite(background), picture.mask))
-    return found
 
 
 def _nearest(means: Tensor) -> Tensor:

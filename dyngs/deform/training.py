@@ -16,9 +16,9 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.config import DynamicModel
 from dyngs.data.loader import Picture
+from dyngs.deform.compared_views import ComparedViews
 from dyngs.deform.field import FieldSetup, Offsets, deformed
 from dyngs.deform.fields import can_begin_on_its_way, field_on_its_way, new_field
-from dyngs.deform.matched_views import MatchedViews
 from dyngs.deform.motion import bake_, measure_motion
 from dyngs.deform.pieces import MovingPart, Scores, paid_motion
 from dyngs.deform.random_gaussians import box_of, with_gaussians, with_random_gaussians
@@ -92,7 +92,7 @@ class TrainingViews:
     cameras_stay: bool = False
     standing: Callable[[], Sequence[Footage]] = tuple
     held_out: Scores | None = None
-    matched: MatchedViews | None = None
+    matched: ComparedViews | None = None
 
 
 class DynamicTraining:
@@ -268,8 +268,7 @@ class DynamicTraining:
         views, times = self.capture.matched, self._window.bounds(step)
         if views is None or scene.field is None or not len(scene.moving):
             return scene
-        with torch.enable_grad():
-            seen = views.shifts(lambda time: scene.deformed_at(time)[0].detach(), scene.moving, times)
+        seen = views.shifts(lambda time: scene.deformed_at(time)[0], scene.moving, times)
         field = scene.field.shifted(scene.gaussians.means.detach()[scene.moving], seen)
         if field is None:
             return scene

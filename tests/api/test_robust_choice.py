@@ -22,7 +22,7 @@ def score_by(monkeypatch: pytest.MonkeyPatch, gains: list[float]) -> list[str]:
     """Let ``gains`` take the place of small runs, and return the list of what is tried."""
     tried: list[str] = []
     monkeypatch.setattr(robust_choice, "FEWEST_VIEWS", 3)
-    monkeypatch.setattr(robust_choice, "_trained", lambda config, *_: tried.append(config.train.robust))
+    monkeypatch.setattr(robust_choice, "trained", lambda config, *_: tried.append(config.train.robust))
     monkeypatch.setattr(robust_choice, "compared", lambda *_: [(20.0, 20.0 + gain) for gain in gains])
     return tried
 

@@ -11,7 +11,7 @@ from tiny_fields import busy_config, tiny_options
 
 from dyngs.build import assemble
 from dyngs.config import Config
-from dyngs.deform.matched_views import MatchedViews
+from dyngs.deform.compared_views import ComparedViews
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.training import DynamicTraining
 from dyngs.gaussians import Gaussians
@@ -33,7 +33,7 @@ def trained(config: Config, steps: int) -> Trainer:
     return trainer
 
 
-def scene_and_views(trainer: Trainer) -> tuple[DynamicScene, MatchedViews]:
+def scene_and_views(trainer: Trainer) -> tuple[DynamicScene, ComparedViews]:
     views = cast(DynamicTraining, trainer.training).capture.matched
     assert views is not None
     return cast(DynamicScene, trainer.scene), views

@@ -1,4 +1,4 @@
-"""Training pictures, made small, that what moves is registered with by block matching."""
+"""Training pictures that moving Gaussians are compared with: those held out, or those that they are registered with."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.deform.node_shifts import SeenShift, matching_factor, seen_shift
 from dyngs.gaussians import Gaussians
+from dyngs.metrics import psnr
 from dyngs.rendering import RenderOptions, Shader, render
 
 MAX_VIEWS = 100
@@ -23,12 +24,12 @@ GaussiansAt = Callable[[float], Gaussians]
 
 
 @dataclass(frozen=True)
-class MatchedViews:
-    """Views that are trained on.
+class ComparedViews:
+    """Some of the training views.
 
     Attributes:
         pictures: of the training split.
-        indices: of those that are not held out.
+        indices: of those that are compared.
         options, background, shader_at: how they are drawn; the last colours the Gaussians at a time.
     """
 
@@ -37,6 +38,11 @@ class MatchedViews:
     options: RenderOptions
     background: Tensor
     shader_at: Callable[[float], Shader | None]
+
+    def psnr(self, gaussians_at: GaussiansAt) -> list[float]:
+        """Return the PSNR of each picture in its full size, dB."""
+        shown = (self.pictures[i] for i in self.indices)
+        return [psnr(self._drawn(gaussians_at(x.time or 0.0), x), x.composite(self.background), x.mask) for x in shown]
 
     def error(self, gaussians_at: GaussiansAt, times: tuple[float, float]) -> float:
         """Return the mean squared error of the small pictures within ``times``; 0 without any."""
