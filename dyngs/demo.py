@@ -16,10 +16,10 @@ from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import EvalReport, evaluate_run
 from dyngs.export.run_to_ply import export_ply
+from dyngs.output.image_files import OutputOptions, write_job_images, write_split_images
+from dyngs.output.job_of_run import job_of_run
+from dyngs.output.render_job import RenderJobOptions
 from dyngs.runs.lock import LOCK_NAME, InUseError, writing
-from dyngs.view.image_files import OutputOptions, write_job_images, write_split_images
-from dyngs.view.job_of_run import job_of_run
-from dyngs.view.render_job import RenderJobOptions
 
 if TYPE_CHECKING:
     from rich.table import Table

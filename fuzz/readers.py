@@ -188,7 +188,7 @@ def read_a_motion(root: Path) -> object:
 def read_splats(root: Path) -> object:
     """Read a .ply of Gaussians and render it."""
     from dyngs.export.ply import read_ply
-    from dyngs.view.job_of_ply import splat_options
+    from dyngs.output.job_of_ply import splat_options
 
     splat = read_ply(only(root))
     return splat, drawn(splat.gaussians, replace(splat_options(splat), nonfinite="skip"))
@@ -233,7 +233,7 @@ def read_override_lines(root: Path) -> object:
 
 def read_a_path(root: Path) -> object:
     """Read a camera path."""
-    from dyngs.view.camera_paths import read_path
+    from dyngs.output.camera_paths import read_path
 
     path = read_path(only(root))
     return path.cameras, path.fps, path.times
@@ -251,9 +251,9 @@ def read_a_point(root: Path) -> object:
 def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
     from dyngs.data.frame_selection import parse_frames
+    from dyngs.output.camera_paths import parse_times
     from dyngs.tradeoff.requirements import parse_requirements
     from dyngs.tradeoff.variants import parse_variations
-    from dyngs.view.camera_paths import parse_times
 
     parsers: tuple[Callable[[str], object], ...]
     parsers = (parse_requirements, lambda word: parse_variations([word], trains=True), parse_frames, parse_times)

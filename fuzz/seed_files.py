@@ -25,11 +25,11 @@ from dyngs.export.ply import write_ply
 from dyngs.files.tensor_file import write_tensors
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.output.camera_paths import CameraPath, write_path
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.scene import Scene
 from dyngs.state import tensors_of
 from dyngs.storage.file import SceneInfo, encoded
-from dyngs.view.camera_paths import CameraPath, write_path
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 

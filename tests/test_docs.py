@@ -162,10 +162,10 @@ def require_overrides(overrides: list[str]) -> None:
 
 def require_sound(command: Command, arguments: argparse.Namespace) -> None:
     """Nothing, if what a parsed command names besides its options can be: keys, variations, times, presets."""
+    from dyngs.output.camera_paths import parse_times
+    from dyngs.output.render_job import path_file
     from dyngs.tradeoff.requirements import parse_goal, parse_requirements
     from dyngs.tradeoff.variants import parse_variations
-    from dyngs.view.camera_paths import parse_times
-    from dyngs.view.render_job import path_file
 
     for word in command.words:
         if word.startswith(("configs/", "benchmarks/", "examples/")):

@@ -8,10 +8,10 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
+from dyngs.output.camera_paths import CameraPath
+from dyngs.output.render_job import DEFAULT_OPTIONS, RenderJob
 from dyngs.rendering import RenderOptions
 from dyngs.static.scene import StaticScene
-from dyngs.view.camera_paths import CameraPath
-from dyngs.view.render_job import DEFAULT_OPTIONS, RenderJob
 
 
 def two_balls(distance: float = 4.0) -> Gaussians:

@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
     times = _times(arguments)
     loaded = (read_avatar if is_file else load_run)(arguments.run_dir)
     if arguments.motion is not None:
-        from dyngs.view.animation import with_motion
+        from dyngs.output.animation import with_motion
 
         loaded = with_motion(loaded, arguments.motion).run
         times = loaded.scene.times if times is None else times
@@ -153,7 +153,7 @@ def _export_avatar(arguments: argparse.Namespace) -> int:
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """Return the times asked for, clamped to [0, 1], or None."""
     from dyngs.evaluate.temporal import clamped_times
-    from dyngs.view.camera_paths import parse_times
+    from dyngs.output.camera_paths import parse_times
 
     if arguments.times is None and arguments.time is None:
         return None

@@ -10,7 +10,7 @@ from dyngs.cli.arguments import frame_count, image_size, is_avatar_file, print_n
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
-    from dyngs.view.render_job import RenderJob
+    from dyngs.output.render_job import RenderJob
 
 _EPILOG = """\
 examples:
@@ -131,7 +131,7 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
     """Render and return the paths of the written files."""
     import torch
 
-    from dyngs.view.image_files import OutputOptions, write_job_images, write_split_images
+    from dyngs.output.image_files import OutputOptions, write_job_images, write_split_images
 
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)
@@ -147,11 +147,11 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
 
 def _job(arguments: argparse.Namespace) -> RenderJob:
     """Return the render job for a run, an avatar file or a .ply."""
-    from dyngs.view.camera_paths import parse_times
-    from dyngs.view.job_of_avatar import job_of_avatar
-    from dyngs.view.job_of_ply import job_of_ply
-    from dyngs.view.job_of_run import job_of_run
-    from dyngs.view.render_job import RenderJobOptions
+    from dyngs.output.camera_paths import parse_times
+    from dyngs.output.job_of_avatar import job_of_avatar
+    from dyngs.output.job_of_ply import job_of_ply
+    from dyngs.output.job_of_run import job_of_run
+    from dyngs.output.render_job import RenderJobOptions
 
     times = None if arguments.time is None else (arguments.time,)
     num_frames = arguments.frames

@@ -98,7 +98,7 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
 
 
 def read_avatar(path: Path) -> LoadedRun:
-    """Read the person of a file, upright and at rest; ``dyngs.view.animation`` moves it as it does one of a run.
+    """Read the person of a file, upright and at rest; ``dyngs.output.animation`` moves it as it does one of a run.
 
     A template other than the free one is looked for beside the file when a motion needs it.
 

@@ -24,8 +24,8 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.output.animation import in_rest_pose, with_motion
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.view.animation import in_rest_pose, with_motion
 
 
 @pytest.fixture(scope="module")

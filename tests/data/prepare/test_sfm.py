@@ -15,7 +15,7 @@ from dyngs.data.prepare.sfm import SfmOptions, SfmResult, estimate_poses
 from dyngs.data.synthetic.captures import orbit_cameras, render_scene, still_life
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
-from dyngs.view.video import VideoWriter
+from dyngs.output.video import VideoWriter
 
 FAST = SfmOptions(max_features=2000, num_threads=1)
 

@@ -17,9 +17,9 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians import TopologyEdit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.output.animation import in_rest_pose, with_motion
 from dyngs.runs.checkpoint import load_run, save_checkpoint
 from dyngs.training.trainer import Trainer
-from dyngs.view.animation import in_rest_pose, with_motion
 
 BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.11)
 

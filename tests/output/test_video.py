@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from dyngs.data.pictures.video import read_frames
 from dyngs.errors import DyngsError
-from dyngs.view.video import VideoWriter
+from dyngs.output.video import VideoWriter
 
 
 def _picture(height: int, width: int, shift: int = 0) -> np.ndarray:

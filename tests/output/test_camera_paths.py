@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
-from dyngs.view.camera_paths import (
+from dyngs.output.camera_paths import (
     CameraPath,
     frame_orbit_for_points,
     look_at,

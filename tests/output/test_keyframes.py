@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dyngs.view.keyframes import Keyframes, interpolate_keyframes
+from dyngs.output.keyframes import Keyframes, interpolate_keyframes
 
 
 def _poses(rotations: Rotation, centers: np.ndarray) -> np.ndarray:

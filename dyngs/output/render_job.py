@@ -12,9 +12,9 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
+from dyngs.output.camera_paths import CameraPath
 from dyngs.rendering import RenderOptions
 from dyngs.scene import Moment, Scene
-from dyngs.view.camera_paths import CameraPath
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)

@@ -13,10 +13,10 @@ from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
 from dyngs.export.ply import SplatFile, read_ply, splat_options, write_ply
 from dyngs.gaussians import Gaussians
+from dyngs.output.job_of_ply import job_of_ply
+from dyngs.output.render_job import RenderJobOptions, render_frame
 from dyngs.rendering import RenderOptions
 from dyngs.static.scene import StaticScene
-from dyngs.view.job_of_ply import job_of_ply
-from dyngs.view.render_job import RenderJobOptions, render_frame
 
 
 def some_gaussians(count: int = 50) -> Gaussians:

@@ -18,12 +18,12 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
 from dyngs.files.write import to_uint8, write_image
 from dyngs.metrics import psnr
+from dyngs.output.camera_paths import CameraPath
+from dyngs.output.contact_sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
+from dyngs.output.render_job import Frame, RenderJob, job_frames, render_frame
+from dyngs.output.video import VideoWriter
 from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import load_run
-from dyngs.view.camera_paths import CameraPath
-from dyngs.view.contact_sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
-from dyngs.view.render_job import Frame, RenderJob, job_frames, render_frame
-from dyngs.view.video import VideoWriter
 
 _SHEET_ROWS = 12
 _DEPTH_SAMPLES = 8

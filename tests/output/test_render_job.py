@@ -11,9 +11,9 @@ from moving_scene import Sliding, camera, moving_scene, still_scene
 from two_balls import balls_job, cameras_around, two_balls
 
 from dyngs.camera import Cameras
+from dyngs.output.camera_paths import static_path
+from dyngs.output.render_job import RenderJob, job_frames, render_frame, resize_cameras
 from dyngs.rendering import RenderOptions, render
-from dyngs.view.camera_paths import static_path
-from dyngs.view.render_job import RenderJob, job_frames, render_frame, resize_cameras
 
 sizes = st.integers(1, 400)
 

@@ -13,9 +13,9 @@ from dyngs.data.capture import Capture
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.view.camera_paths import CameraPath, write_path
-from dyngs.view.job_of_run import cameras_for_paths, job_of_run, view_to_show
-from dyngs.view.render_job import RenderJobOptions
+from dyngs.output.camera_paths import CameraPath, write_path
+from dyngs.output.job_of_run import cameras_for_paths, job_of_run, view_to_show
+from dyngs.output.render_job import RenderJobOptions
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dyngs.view.contact_sheet import GAP, LABEL_HEIGHT, SheetRow, color_map, contact_sheet, depth_limits, depth_to_rgb
+from dyngs.output.contact_sheet import GAP, LABEL_HEIGHT, SheetRow, color_map, contact_sheet, depth_limits, depth_to_rgb
 
 RNG = np.random.default_rng(0)
 

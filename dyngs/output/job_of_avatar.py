@@ -15,9 +15,16 @@ from dyngs.export.avatar import read_avatar
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion.placement import up_direction
 from dyngs.human.pose.skinning import axis_angle_to_matrix
-from dyngs.view.animation import with_motion
-from dyngs.view.camera_paths import CameraPath, frame_orbit_for_points, read_path, spiral_path, static_path, with_times
-from dyngs.view.render_job import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJob, RenderJobOptions, path_file, resize_cameras
+from dyngs.output.animation import with_motion
+from dyngs.output.camera_paths import (
+    CameraPath,
+    frame_orbit_for_points,
+    read_path,
+    spiral_path,
+    static_path,
+    with_times,
+)
+from dyngs.output.render_job import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJob, RenderJobOptions, path_file, resize_cameras
 
 _SAMPLED_TIMES = 8
 """Times of a motion at which the person must be in view."""

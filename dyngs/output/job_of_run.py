@@ -15,9 +15,8 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
-from dyngs.runs.checkpoint import LoadedRun, load_run
-from dyngs.view.animation import in_rest_pose, with_motion
-from dyngs.view.camera_paths import (
+from dyngs.output.animation import in_rest_pose, with_motion
+from dyngs.output.camera_paths import (
     CameraPath,
     orbit_path,
     read_path,
@@ -25,8 +24,9 @@ from dyngs.view.camera_paths import (
     static_path,
     with_times,
 )
-from dyngs.view.image_files import file_stems, files_of
-from dyngs.view.render_job import DEFAULT_FRAMES, RenderJob, RenderJobOptions, path_file, resize_cameras
+from dyngs.output.image_files import file_stems, files_of
+from dyngs.output.render_job import DEFAULT_FRAMES, RenderJob, RenderJobOptions, path_file, resize_cameras
+from dyngs.runs.checkpoint import LoadedRun, load_run
 
 
 def job_of_run(run_dir: Path, options: RenderJobOptions) -> RenderJob:

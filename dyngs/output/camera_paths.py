@@ -17,7 +17,7 @@ from dyngs.data.geometry.focus import focus_point, share_in_front
 from dyngs.data.geometry.poses import cam_from_opengl, checked_pose
 from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.write import write_text
-from dyngs.view.keyframes import Keyframes, interpolate_keyframes
+from dyngs.output.keyframes import Keyframes, interpolate_keyframes
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""

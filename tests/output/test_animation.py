@@ -8,8 +8,8 @@ import pytest
 from moving_scene import write_moving_run
 
 from dyngs.errors import DyngsError
+from dyngs.output.animation import in_rest_pose, with_motion
 from dyngs.runs.checkpoint import load_run
-from dyngs.view.animation import in_rest_pose, with_motion
 
 
 def test_only_people_play_motions(tmp_path: Path) -> None:

@@ -20,11 +20,11 @@ from dyngs.data.pictures.video import read_frames
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.output.camera_paths import static_path
+from dyngs.output.image_files import OutputOptions, file_stems, files_of, write_job_images, write_split_images
+from dyngs.output.render_job import RenderJob, job_frames
 from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.view.camera_paths import static_path
-from dyngs.view.image_files import OutputOptions, file_stems, files_of, write_job_images, write_split_images
-from dyngs.view.render_job import RenderJob, job_frames
 
 
 def read_image(path: Path) -> np.ndarray:

@@ -11,9 +11,9 @@ from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background
 from dyngs.export.ply import read_ply, splat_options
+from dyngs.output.camera_paths import CameraPath, frame_orbit_for_points, read_path, spiral_path
+from dyngs.output.render_job import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJob, RenderJobOptions, path_file, resize_cameras
 from dyngs.static.scene import StaticScene
-from dyngs.view.camera_paths import CameraPath, frame_orbit_for_points, read_path, spiral_path
-from dyngs.view.render_job import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJob, RenderJobOptions, path_file, resize_cameras
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
