@@ -16,6 +16,7 @@ _EPILOG = """\
 examples:
   dyngs render runs/bench --out pictures                          the test views and a contact sheet
   dyngs render runs/bench --out frames --path orbit --video orbit.mp4
+  dyngs render runs/street --path along --video along.mp4                  as it was filmed, smoothed
   dyngs render runs/dance --path orbit --time 0.5 --video frozen.mp4       moving camera, frozen scene
   dyngs render runs/dance --times 0:1:60 --view 3 --video standing.mp4     fixed camera, moving scene
   dyngs render runs/ann --motion walk.npz --video walk.mp4                 a person (model.kind=human) walks
@@ -44,7 +45,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--split", choices=("test", "val", "train", "pose"), help="render the views of this split (default: test)"
     )
     cameras.add_argument(
-        "--path", metavar="PATH", help="camera path: orbit (default for a .ply), spiral, or a .json file"
+        "--path",
+        metavar="PATH",
+        help="camera path: orbit (default for a file), spiral, along (as the capture was filmed), or a .json file",
     )
     when = parser.add_mutually_exclusive_group()
     when.add_argument("--time", type=scene_time, metavar="T", help="render the scene at this time, from 0 to 1")
@@ -52,14 +55,10 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--view", metavar="NAME|N", help="without --path: render from the camera of this view (default: the first one)"
     )
-    person = parser.add_mutually_exclusive_group()
-    person.add_argument(
-        "--motion", type=Path, metavar="FILE", help="motion for a person: AMASS .npz, .bvh, .glb or .gltf"
-    )
-    person.add_argument("--pose", choices=("rest",), help="show a person in the rest pose of the template")
+    _add_person(parser)
     parser.add_argument("--video", type=Path, metavar="FILE.mp4", help="write a video as well")
     parser.add_argument(
-        "--frames", type=frame_count, metavar="N", help="number of frames of orbit and spiral (default 120)"
+        "--frames", type=frame_count, metavar="N", help="number of frames of orbit, spiral and along (default 120)"
     )
     parser.add_argument(
         "--fps", type=float, metavar="F", help="frames per second of the video (default 30, or as in the .json)"
@@ -79,11 +78,20 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--up",
         choices=("x", "y", "z", "-x", "-y", "-z"),
-        default="z",
-        help="up axis of a .ply (default z); --up=-y suits many COLMAP captures",
+        help="up axis of the path (default: up for the cameras of a run, z for a .ply; --up=-y suits many COLMAP "
+        "captures)",
     )
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
     parser.set_defaults(run=run)
+
+
+def _add_person(parser: argparse.ArgumentParser) -> None:
+    """Add the options of people."""
+    person = parser.add_mutually_exclusive_group()
+    person.add_argument(
+        "--motion", type=Path, metavar="FILE", help="motion for a person: AMASS .npz, .bvh, .glb or .gltf"
+    )
+    person.add_argument("--pose", choices=("rest",), help="show a person in the rest pose of the template")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -115,6 +123,8 @@ def _checked(arguments: argparse.Namespace) -> argparse.Namespace:
         raise DyngsError("where to? Give --out DIR (or --video FILE.mp4 with --path, --time, --times or --view)")
     if not arguments.source.exists():
         raise DyngsError(f"{arguments.source}: no such run or file; give a folder that `dyngs train` wrote, or a .ply")
+    if arguments.up and not (is_file or arguments.path):
+        raise DyngsError("--up goes with --path orbit, spiral or along")
     unfit = [f"--{name}" for name in ("size", "background") if getattr(arguments, name)]
     if unfit and not is_job:
         raise DyngsError(f"{unfit[0]} goes with --path; the views of a split keep their size and background")

@@ -1,4 +1,4 @@
-"""Camera paths for rendering: orbits, spirals, and JSON files (docs/camera_paths.md)."""
+"""Camera paths for rendering, their scene times, and their JSON files (docs/camera_paths.md)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import numpy as np
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.data.geometry.focus import focus_point, share_in_front
 from dyngs.data.geometry.poses import cam_from_opengl, checked_pose
 from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.write import write_text
@@ -92,135 +91,6 @@ def parse_times(text: str) -> tuple[float, ...]:
     return tuple(np.linspace(start, stop, int(count)).tolist())
 
 
-def orbit_path(cameras: Cameras, num_frames: int, turns: float = 1.0) -> Cameras:
-    """Return cameras on a level circle around the point that the given ``cameras`` look at.
-
-    Radius, height and up direction are means over the given cameras; intrinsics are those of the first. A ring of
-    cameras gives the ring itself; cameras that all face one way give a circle through their side of the scene.
-
-    Args:
-        cameras: V >= 1 cameras, usually those of training.
-        num_frames: F; frame 0 is at the azimuth of the first camera.
-        turns: number of full circles; negative: in the other direction.
-    """
-    poses = _world_from_cam(cameras)
-    centers, up = poses[:, :3, 3], mean_up(cameras)
-    center = look_at_point(cameras)
-    offsets = centers - center
-    heights = offsets @ up
-    level = offsets - heights[:, None] * up
-    radius = np.linalg.norm(level, axis=1).mean()
-    first = level[np.argmax(np.linalg.norm(level, axis=1) > 1e-6)]
-    axis_x = _unit(first) if np.linalg.norm(first) > 1e-6 else _perpendicular(up)
-    radius = max(radius, 0.1 * float(np.linalg.norm(offsets, axis=1).mean()), 1e-6)
-    return _circle(center + heights.mean() * up, center, up, axis_x * radius, _Frames(cameras, num_frames, turns))
-
-
-def spiral_path(cameras: Cameras, num_frames: int, turns: float = 2.0, zoom: float = 0.5) -> Cameras:
-    """Return cameras on a closed spiral in front of a scene seen from one side, as in LLFF.
-
-    The spiral is centred on the mean camera and as wide as the 90% quantile of the distances of the given cameras from
-    it; all cameras look at the same point.
-
-    Args:
-        cameras: V >= 1 cameras, roughly facing one way.
-        num_frames: F.
-        turns: circles per loop.
-        zoom: extent along the viewing axis, relative to the width of the spiral.
-    """
-    poses = _world_from_cam(cameras)
-    centers, target, up = poses[:, :3, 3], look_at_point(cameras), mean_up(cameras)
-    middle = centers.mean(axis=0)
-    base = look_at(middle, target, up)
-    radii = np.quantile(np.abs((centers - middle) @ base[:3, :3]), 0.9, axis=0)
-    distance = np.linalg.norm(target - middle)
-    radii = np.maximum(radii, 0.02 * distance)
-    radii[2] = min(zoom * radii.max(), 0.3 * distance)
-    phase = 2 * np.pi * np.arange(num_frames) / max(num_frames, 1)
-    local = np.stack([np.cos(turns * phase), -np.sin(turns * phase), np.sin(phase)], axis=-1) * radii
-    eyes = middle + local @ base[:3, :3].T
-    return _with_poses(cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
-
-
-def frame_orbit_for_points(
-    means: np.ndarray, num_frames: int, size: tuple[int, int] = (960, 720), up: tuple[float, float, float] = (0, 0, 1)
-) -> Cameras:
-    """Return an orbit around a set of points whose robust extent fills the picture.
-
-    The centre is the median. The extent is the sphere around it that holds 99% of the points within the 1st to 99th
-    percentile of every axis, so that outliers have no effect.
-
-    Args:
-        means: (N, 3) points in world units; non-finite ones are ignored.
-        num_frames: F.
-        size: width and height in pixels.
-        up: up direction of the world; (0, -1, 0) for many COLMAP captures.
-
-    Raises:
-        DyngsError: no finite point, or a zero up direction.
-    """
-    points = np.asarray(means, np.float64).reshape(-1, 3)
-    points = points[np.isfinite(points).all(axis=1)]
-    if not len(points):
-        raise DyngsError("cannot place an orbit: there are no points with finite coordinates")
-    if not np.linalg.norm(up) > 0:
-        raise DyngsError(f"cannot place an orbit: the up direction {up} has no length")
-    low, high = np.quantile(points, [0.01, 0.99], axis=0)
-    inside = points[((points >= low) & (points <= high)).all(axis=1)]
-    points = inside if len(inside) else points
-    center = np.median(points, axis=0)
-    extent = max(float(np.quantile(np.linalg.norm(points - center, axis=1), 0.99)), 1e-3)
-    width, height = size
-    half_fov = math.radians(25.0)
-    focal = 0.5 * max(width, height) / math.tan(half_fov)
-    narrow = math.atan(0.5 * min(width, height) / focal)
-    matrix = [[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]]
-    intrinsics = torch.tensor(matrix, dtype=torch.float32, device="cpu")
-    distance = 0.85 * extent / math.sin(narrow)
-    axis_z = _unit(np.asarray(up, np.float64))
-    elevation = math.radians(20.0)
-    template = Cameras(torch.eye(4, device="cpu")[None], intrinsics[None], width, height)
-    eye_height = center + distance * math.sin(elevation) * axis_z
-    arm = distance * math.cos(elevation) * _perpendicular(axis_z)
-    return _circle(eye_height, center, axis_z, arm, _Frames(template, num_frames, 1.0))
-
-
-def look_at_point(cameras: Cameras) -> np.ndarray:
-    """Return the point (3,) float64 nearest to all optical axes in the least-squares sense, in front of the cameras.
-
-    (Nearly) parallel axes do not determine it: then it lies in front of the mean camera, at three times the spread of
-    the cameras (1 if they coincide).
-    """
-    poses = _world_from_cam(cameras)
-    centers, axes = poses[:, :3, 3], poses[:, :3, 2]
-    middle = centers.mean(axis=0)
-    spread = float(np.linalg.norm(centers - middle, axis=1).mean())
-    point = focus_point(poses)
-    if point is not None and share_in_front(poses, point) > 0.5:
-        return point
-    mean_axis = axes.mean(axis=0)
-    forward = _unit(mean_axis) if np.linalg.norm(mean_axis) > 1e-6 else axes[0]
-    return middle + 3.0 * (spread if spread > 1e-9 else 1.0) * forward
-
-
-def mean_up(cameras: Cameras) -> np.ndarray:
-    """Return the mean up direction (minus y) of the cameras, (3,); that of the first camera if they cancel."""
-    ups = -_world_from_cam(cameras)[:, :3, 1]
-    total = ups.mean(axis=0)
-    return _unit(total) if np.linalg.norm(total) > 1e-3 else ups[0]
-
-
-def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return the OpenCV camera-to-world pose (4, 4) at ``eye``, z towards ``target``, y away from ``up``."""
-    forward = target - eye
-    forward = _unit(forward) if np.linalg.norm(forward) > 1e-12 else _perpendicular(up)
-    right = np.cross(forward, up)
-    right = _unit(right) if np.linalg.norm(right) > 1e-6 * np.linalg.norm(up) else _perpendicular(forward)
-    pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(forward, right), forward, eye
-    return pose
-
-
 def write_path(file: Path, path: CameraPath, world_offset: np.ndarray | None = None) -> None:
     """Write a path as JSON in the format of ``read_path``, atomically; ``world_offset`` as there."""
     cameras = path.cameras
@@ -274,36 +144,6 @@ def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
         return path
     clamped, warnings = _clamped(times.tolist(), str(file))
     return replace(path, times=clamped, warnings=warnings)
-
-
-@dataclass(frozen=True)
-class _Frames:
-    """Intrinsics of a circle of cameras, number of frames and of turns."""
-
-    cameras: Cameras
-    num_frames: int
-    turns: float
-
-
-def _circle(hub: np.ndarray, target: np.ndarray, up: np.ndarray, arm: np.ndarray, frames: _Frames) -> Cameras:
-    """Return cameras around ``hub`` that look at ``target``, the first one at ``hub + arm``."""
-    angles = 2 * np.pi * frames.turns * np.arange(frames.num_frames) / max(frames.num_frames, 1)
-    eyes = hub + np.cos(angles)[:, None] * arm + np.sin(angles)[:, None] * np.cross(up, arm)
-    return _with_poses(frames.cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
-
-
-def _with_poses(cameras: Cameras, world_from_cam: np.ndarray) -> Cameras:
-    """Return cameras at new poses with intrinsics, dtype and device of the first of ``cameras``."""
-    cam_from_world = torch.from_numpy(np.linalg.inv(world_from_cam)).to(cameras.cam_from_world)
-    intrinsics = cameras.intrinsics[:1].expand(len(cam_from_world), 3, 3).clone()
-    return Cameras(cam_from_world, intrinsics, cameras.width, cameras.height)
-
-
-def _world_from_cam(cameras: Cameras) -> np.ndarray:
-    """Return camera-to-world poses (V, 4, 4), float64."""
-    if not len(cameras):
-        raise ValueError("a camera path is placed by at least one camera")
-    return np.linalg.inv(cameras.cam_from_world.detach().cpu().double().numpy())
 
 
 def _rebased(cam_from_world: np.ndarray, world_offset: np.ndarray | None, sign: float) -> np.ndarray:
@@ -441,13 +281,3 @@ def _number(
         problem = "is missing" if value is None else f"is {printable(repr(value), 60)}"
         raise DyngsError(f"{where}: '{key}' {problem}; it must be a number from {low:g} to {high:g}")
     return float(value)
-
-
-def _unit(a: np.ndarray) -> np.ndarray:
-    return a / np.linalg.norm(a)
-
-
-def _perpendicular(a: np.ndarray) -> np.ndarray:
-    """Return a unit vector perpendicular to ``a``."""
-    other = np.eye(3)[np.abs(a).argmin()]
-    return _unit(np.cross(a, other))

@@ -16,15 +16,18 @@ from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion.placement import up_direction
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.output.animation import with_motion
-from dyngs.output.camera_paths import (
-    CameraPath,
-    frame_orbit_for_points,
-    read_path,
-    spiral_path,
-    static_path,
-    with_times,
+from dyngs.output.camera_paths import CameraPath, read_path, static_path, with_times
+from dyngs.output.orbit import frame_orbit_for_points, spiral_path
+from dyngs.output.render_job import (
+    DEFAULT_FRAMES,
+    DEFAULT_SIZE,
+    RenderJob,
+    RenderJobOptions,
+    axis,
+    path_file,
+    refuse_to_follow,
+    resize_cameras,
 )
-from dyngs.output.render_job import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJob, RenderJobOptions, path_file, resize_cameras
 
 _SAMPLED_TIMES = 8
 """Times of a motion at which the person must be in view."""
@@ -39,6 +42,7 @@ def job_of_avatar(file: Path, options: RenderJobOptions) -> RenderJob:
     """
     if options.view is not None:
         raise DyngsError(f"{file}: an avatar file holds no views; leave out --view")
+    refuse_to_follow(file, options)
     run, fps = read_avatar(file), None
     if options.motion is not None:
         animated = with_motion(run, options.motion)
@@ -78,7 +82,7 @@ def _around(scene: HumanScene, options: RenderJobOptions, count: int) -> Cameras
     """Return an orbit around the person, a spiral in front, or without a path one camera in front."""
     moments = np.linspace(0, 1, 1 if scene.is_still else _SAMPLED_TIMES)
     means = torch.cat([scene.at(moment).means for moment in moments.tolist()]).numpy()
-    x, y, z = up_direction(scene.clip).tolist()
+    x, y, z = up_direction(scene.clip).tolist() if options.up is None else axis(options.up)
     size = options.size or DEFAULT_SIZE
     if options.path == "orbit":
         return frame_orbit_for_points(means, count, size, (x, y, z))

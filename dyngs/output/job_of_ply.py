@@ -11,11 +11,19 @@ from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background
 from dyngs.export.ply import read_ply, splat_options
-from dyngs.output.camera_paths import CameraPath, frame_orbit_for_points, read_path, spiral_path
-from dyngs.output.render_job import DEFAULT_FRAMES, DEFAULT_SIZE, RenderJob, RenderJobOptions, path_file, resize_cameras
+from dyngs.output.camera_paths import CameraPath, read_path
+from dyngs.output.orbit import frame_orbit_for_points, spiral_path
+from dyngs.output.render_job import (
+    DEFAULT_FRAMES,
+    DEFAULT_SIZE,
+    RenderJob,
+    RenderJobOptions,
+    axis,
+    path_file,
+    refuse_to_follow,
+    resize_cameras,
+)
 from dyngs.static.scene import StaticScene
-
-_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 def job_of_ply(file: Path, options: RenderJobOptions) -> RenderJob:
@@ -30,6 +38,7 @@ def job_of_ply(file: Path, options: RenderJobOptions) -> RenderJob:
         raise DyngsError(f"{file}: a .ply holds one time and no views; leave out --time, --times and --view")
     if options.motion is not None or options.at_rest:
         raise DyngsError(f"{file}: a .ply has no skeleton; give the run of a person for --motion and --pose")
+    refuse_to_follow(file, options)
     splat = read_ply(file, nonfinite="skip")
     named = path_file(options.path)
     if named is not None:
@@ -45,9 +54,7 @@ def job_of_ply(file: Path, options: RenderJobOptions) -> RenderJob:
 
 def _around_points(means: np.ndarray, options: RenderJobOptions) -> Cameras:
     """Return an orbit around the points, or a spiral in front of the side that an orbit shows first."""
-    axis = _AXES[options.up.lstrip("-")]
-    sign = -1.0 if options.up.startswith("-") else 1.0
-    up = (sign * axis[0], sign * axis[1], sign * axis[2])
+    up = axis(options.up or "z")
     size = options.size or DEFAULT_SIZE
     if options.path == "orbit":
         return frame_orbit_for_points(means, options.num_frames or DEFAULT_FRAMES, size, up)

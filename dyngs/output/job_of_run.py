@@ -15,17 +15,12 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
+from dyngs.output.along import path_along
 from dyngs.output.animation import in_rest_pose, with_motion
-from dyngs.output.camera_paths import (
-    CameraPath,
-    orbit_path,
-    read_path,
-    spiral_path,
-    static_path,
-    with_times,
-)
+from dyngs.output.camera_paths import CameraPath, read_path, static_path, with_times
 from dyngs.output.image_files import file_stems, files_of
-from dyngs.output.render_job import DEFAULT_FRAMES, RenderJob, RenderJobOptions, path_file, resize_cameras
+from dyngs.output.orbit import orbit_of, orbit_path, spiral_path
+from dyngs.output.render_job import DEFAULT_FRAMES, RenderJob, RenderJobOptions, axis, path_file, resize_cameras
 from dyngs.runs.checkpoint import LoadedRun, load_run
 
 
@@ -108,13 +103,25 @@ def _moving_path(run: LoadedRun, capture: Capture, options: RenderJobOptions) ->
     """Return the camera path that the options name, with ``options.times`` if there are any."""
     path = options.path or "orbit"
     file = path_file(path)
-    if file is not None:
-        found = read_path(file, capture.world_offset)
-    else:
-        place = orbit_path if path == "orbit" else spiral_path
-        frames = len(run.scene.times) if options.motion is not None else DEFAULT_FRAMES
-        found = CameraPath(place(cameras_for_paths(capture, run.config.data), options.num_frames or frames))
+    found = read_path(file, capture.world_offset) if file is not None else _placed_path(path, run, capture, options)
     if options.times is None:
         return found
     times = options.times * len(found) if len(options.times) == 1 else options.times
     return with_times(replace(found, warnings=()), times)
+
+
+def _placed_path(name: str, run: LoadedRun, capture: Capture, options: RenderJobOptions) -> CameraPath:
+    """Return the path called ``name`` (orbit, spiral, along), placed by the training cameras."""
+    cameras = cameras_for_paths(capture, run.config.data)
+    frames = options.num_frames or (len(run.scene.times) if options.motion is not None else DEFAULT_FRAMES)
+    up = None if options.up is None else np.asarray(axis(options.up))
+    match name:
+        case "orbit":
+            return CameraPath(orbit_path(cameras, frames, up), warnings=orbit_of(cameras, up).notes)
+        case "spiral":
+            return CameraPath(spiral_path(cameras, frames, up))
+        case _:
+            views = capture.splits["train"]
+            times = [view.time for view in views if view.time is not None]
+            clip = len(times) == len(views) and not run.scene.is_still and options.motion is None
+            return path_along(cameras, frames, times if clip else None, up)

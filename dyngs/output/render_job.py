@@ -18,6 +18,7 @@ from dyngs.scene import Moment, Scene
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)
+PLACED_PATHS = ("orbit", "spiral", "along")
 DEFAULT_OPTIONS = RenderOptions()
 
 
@@ -62,11 +63,13 @@ class RenderJobOptions:
     """Cameras and times to render.
 
     Attributes:
-        path: "orbit", "spiral", a JSON file of cameras (docs/camera_paths.md), or None: one fixed camera.
-        num_frames: frames of orbit and spiral; None: as many as a motion has, else 120.
+        path: "orbit", "spiral", "along" (the training cameras), a JSON file of cameras (docs/camera_paths.md), or None:
+            one fixed camera.
+        num_frames: frames of a path that is not a file; None: as many as a motion has, else 120.
         size: width and height in pixels; None: that of the pictures, of the JSON, or 960x720 for a .ply or avatar.
         background: "white" or "black"; None: that of training, black for a .ply.
-        up: up axis of a .ply, such as "z" or "-y".
+        up: up axis of the paths, such as "z" or "-y"; None: up for the cameras of a run, for the person of an avatar
+            file, and z for a .ply.
         times: scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of the view
             for a fixed camera, from 0 to 1 along a path.
         view: the view of the fixed camera: its name, the name of its picture, or its number from 0.
@@ -79,7 +82,7 @@ class RenderJobOptions:
     num_frames: int | None = None
     size: tuple[int, int] | None = None
     background: str | None = None
-    up: str = "z"
+    up: str | None = None
     times: tuple[float, ...] | None = None
     view: str | None = None
     split: str | None = None
@@ -134,10 +137,28 @@ def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
     return replace(cameras, intrinsics=intrinsics, width=width, height=height)
 
 
+def refuse_to_follow(file: Path, options: RenderJobOptions) -> None:
+    """Raise an error if the path follows cameras: a file of Gaussians has none.
+
+    Raises:
+        DyngsError: the path is "along".
+    """
+    if options.path == "along":
+        raise DyngsError(f"{file}: holds no cameras that --path along could follow; give its run, or --path orbit")
+
+
+def axis(name: str) -> tuple[float, float, float]:
+    """Return the unit vector of an axis: x, y or z, with a minus before it if it points the other way."""
+    sign = -1.0 if name.startswith("-") else 1.0
+    x, y, z = (sign * (name[-1] == letter) for letter in "xyz")
+    return x, y, z
+
+
 def path_file(path: str) -> Path | None:
-    """Return the JSON file that ``path`` names; None for orbit and spiral."""
-    if path in ("orbit", "spiral"):
+    """Return the JSON file that ``path`` names; None for a path that is placed: orbit, spiral, along."""
+    if path in PLACED_PATHS:
         return None
     if not path.endswith(".json"):
-        raise DyngsError(f"no camera path {path!r}; use orbit, spiral, or a .json file (docs/camera_paths.md)")
+        names = ", ".join(PLACED_PATHS)
+        raise DyngsError(f"no camera path {path!r}; use {names}, or a .json file (docs/camera_paths.md)")
     return Path(path)

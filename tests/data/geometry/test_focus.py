@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.data.geometry.focus import focus_point, share_in_front
-from dyngs.output.camera_paths import look_at
+from dyngs.output.aim import look_at
 
 
 def _ring(center: np.ndarray, count: int) -> np.ndarray:
