@@ -19,12 +19,20 @@ Colours are display-referred sRGB in [0, 1].
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import Enum
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic: ``rgb = SH_C0 * f_dc + 0.5``."""
 
 MAX_SH_DEGREE = 4
+
+ReportProgress = Callable[[str, int, int], None]
+"""Function that is told how far long work has come: what is being done, how many parts of it are done, of how many."""
+
+
+def report_nothing(what: str, done: int, total: int) -> None:
+    """Tell nobody: the default of functions that report their progress."""
 
 
 class RasterizeMode(str, Enum):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import threads
+from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
@@ -143,7 +144,8 @@ def run_sfm(arguments: argparse.Namespace) -> int:
         follow_links=limits.follow_links,
         max_megapixels=limits.max_megapixels,
     )
-    result = estimate_poses(arguments.images, arguments.out, options)
+    with ProgressBar() as report:
+        result = estimate_poses(arguments.images, arguments.out, options, report)
     print(result.summary())
     print(f"next: dyngs data inspect {result.root} --picture cameras.png")
     print(f"      dyngs train configs/static.yaml data.root={result.root}")

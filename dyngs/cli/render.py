@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import frame_count, image_size, is_avatar_file, print_notes, scene_time, threads
+from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
@@ -147,12 +148,14 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
         torch.set_num_threads(arguments.threads)
     output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or 30.0)
     if not (arguments.source.is_file() or arguments.path or _has_fixed_camera(arguments)):
-        return write_split_images(arguments.source, arguments.split or "test", arguments.out, output)
+        with ProgressBar() as report:
+            return write_split_images(arguments.source, arguments.split or "test", arguments.out, output, report)
     job = _job(arguments)
     print_notes(job.notes, job.path.warnings)
     if not arguments.fps:
         output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, job.path.fps)
-    return write_job_images(job, arguments.out, output)
+    with ProgressBar() as report:
+        return write_job_images(job, arguments.out, output, report)
 
 
 def _job(arguments: argparse.Namespace) -> RenderJob:

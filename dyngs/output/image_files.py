@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.capture import Capture
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
@@ -46,13 +47,19 @@ class OutputOptions:
     fps: float = 30.0
 
 
-def write_job_images(job: RenderJob, out_dir: Path | None, output: OutputOptions = OutputOptions()) -> list[Path]:
+def write_job_images(
+    job: RenderJob,
+    out_dir: Path | None,
+    output: OutputOptions = OutputOptions(),
+    report: ReportProgress = report_nothing,
+) -> list[Path]:
     """Render a job to ``frame_0000.png`` and so on, and to a video if asked for; return the paths.
 
     Args:
         job: F >= 1 cameras and times, in the order of the video.
         out_dir: folder for the pictures; None writes only the video.
         output: depth, alpha, video. Depth colours share one range over the whole path.
+        report: is told of each frame.
 
     Raises:
         DyngsError: no cameras, nothing to write, or a file cannot be written.
@@ -69,10 +76,17 @@ def write_job_images(job: RenderJob, out_dir: Path | None, output: OutputOptions
     with _FrameWriter(out_dir, output, job.protected, limits) as writer:
         for i, frame in enumerate(job_frames(job)):
             writer.write(f"frame_{i:0{digits}d}", frame)
+            report("frames", i + 1, len(job.path))
     return writer.written
 
 
-def write_split_images(run_dir: Path, split: str, out_dir: Path, output: OutputOptions = OutputOptions()) -> list[Path]:
+def write_split_images(
+    run_dir: Path,
+    split: str,
+    out_dir: Path,
+    output: OutputOptions = OutputOptions(),
+    report: ReportProgress = report_nothing,
+) -> list[Path]:
     """Render a split of a run to ``NAME.png`` per view and ``sheet.png`` (truth, render, error); return the paths.
 
     The sheet shows at most 12 views, evenly spread, with their PSNR; masked pixels are black. The background is that
@@ -83,6 +97,7 @@ def write_split_images(run_dir: Path, split: str, out_dir: Path, output: OutputO
         split: "test", "val" or "train".
         out_dir: folder for the pictures, which are named after the views (``file_stems``).
         output: depth, alpha, video (views of one size only).
+        report: is told of each view.
 
     Raises:
         DyngsError: no such run or split, unreadable pictures, a file cannot be written.
@@ -101,6 +116,7 @@ def write_split_images(run_dir: Path, split: str, out_dir: Path, output: OutputO
             picture = loader[i]
             frame = render_frame(scene, scene.moment(picture.time), picture.cameras, options, background)
             writer.write(stem, frame)
+            report("views", i + 1, len(views))
             if i in shown:
                 truth = picture.composite(background)
                 label = f"{picture.name}  {psnr(torch.from_numpy(frame.rgb), truth, picture.mask):.2f} dB"

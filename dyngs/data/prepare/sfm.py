@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.pictures.images import read_header
 from dyngs.data.pictures.video import read_frames
+from dyngs.data.prepare.sfm_progress import sequential_pairs, watched
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import MAX_MEGAPIXELS, check_size, inside, pictures_up_to, staying_within
 from dyngs.files.picture_errors import any_text, picture_error
@@ -91,7 +93,9 @@ class SfmResult:
         return f"{line}\nno pose for {shown}"
 
 
-def estimate_poses(source: Path, out: Path, options: SfmOptions = SfmOptions()) -> SfmResult:
+def estimate_poses(
+    source: Path, out: Path, options: SfmOptions = SfmOptions(), report: ReportProgress = report_nothing
+) -> SfmResult:
     """Estimate poses of the pictures in ``source`` and write a COLMAP capture (``out/images``, ``out/sparse/0``).
 
     All work is done in a folder beside ``out`` which is renamed at the end, so ``out`` is whole or absent. SIFT
@@ -101,6 +105,7 @@ def estimate_poses(source: Path, out: Path, options: SfmOptions = SfmOptions()) 
         source: a folder of photos (subfolders included) or a video file.
         out: a folder that does not exist, or is empty.
         options: lens model, matching, effort.
+        report: is told of frames read from a video, of pictures with features, of pairs matched, of poses found.
 
     Raises:
         DyngsError: too few pictures, an ``out`` in use, or nothing could be registered, with advice.
@@ -112,7 +117,7 @@ def estimate_poses(source: Path, out: Path, options: SfmOptions = SfmOptions()) 
     work = temporary_folder_beside(out)
     try:
         with staying_within(source, options.follow_links or source.is_file()), pictures_up_to(options.max_megapixels):
-            result = _posed_in(work, source, options, out)
+            result = _posed_in(work, source, options, _To(out, report))
         work.chmod(0o755)
         if out.exists():
             out.rmdir()
@@ -124,16 +129,24 @@ def estimate_poses(source: Path, out: Path, options: SfmOptions = SfmOptions()) 
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _posed_in(work: Path, source: Path, options: SfmOptions, out: Path) -> SfmResult:
-    """Write the capture for ``out`` in the folder ``work`` and return the result."""
+@dataclass(frozen=True)
+class _To:
+    """Where the capture will be, and who is told how far it is."""
+
+    out: Path
+    report: ReportProgress
+
+
+def _posed_in(work: Path, source: Path, options: SfmOptions, to: _To) -> SfmResult:
+    """Write the capture for ``to.out`` in the folder ``work`` and return the result."""
     images, is_video = work / "images", source.is_file()
-    names = _extract_frames(source, images, options) if is_video else _gather_photos(source, images, out)
+    names = _extract_frames(source, images, options, to.report) if is_video else _gather_photos(source, images, to.out)
     if len(names) < 3:
         raise DyngsError(f"{source} has {len(names)} pictures; structure from motion needs at least 3, better 30")
-    return _run_colmap(work, names, is_video, options, out)
+    return _run_colmap(work, names, is_video, options, to)
 
 
-def _run_colmap(work: Path, names: list[str], is_video: bool, options: SfmOptions, out: Path) -> SfmResult:
+def _run_colmap(work: Path, names: list[str], is_video: bool, options: SfmOptions, to: _To) -> SfmResult:
     """Extract features, match and map in ``work``; write ``work/sparse/0`` and return the result."""
     import pycolmap
 
@@ -142,9 +155,14 @@ def _run_colmap(work: Path, names: list[str], is_video: bool, options: SfmOption
     try:
         database, models = work / "database.db", work / "models"
         models.mkdir()
-        _find_features(database, work / "images", names, is_video, options)
-        _match(database, len(names), is_video, options)
-        found = pycolmap.incremental_mapping(database, work / "images", models, _mapping_options(options))
+        with watched(database, "keypoints", len(names), to.report):
+            _find_features(database, work / "images", names, is_video, options)
+        sequential = _is_sequential(len(names), is_video, options)
+        every = len(names) * (len(names) - 1) // 2
+        pairs = min(every, sequential_pairs(len(names), options.overlap)) if sequential else every
+        with watched(database, "two_view_geometries", pairs, to.report):
+            _match(database, sequential, options)
+        found = _map(database, work / "images", models, _mapping_options(options), _PosesFound(len(names), to.report))
     except (RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()
         raise DyngsError(f"structure from motion failed: {reason[-1] if reason else error}") from error
@@ -164,7 +182,7 @@ def _run_colmap(work: Path, names: list[str], is_video: bool, options: SfmOption
     database.unlink()
     missing = tuple(name for name in names if name not in registered)
     points, error_px = best.num_points3D(), float(best.compute_mean_reprojection_error())
-    return SfmResult(out, len(names), len(registered), missing, points, error_px)
+    return SfmResult(to.out, len(names), len(registered), missing, points, error_px)
 
 
 def _find_features(database: Path, images: Path, names: list[str], is_video: bool, options: SfmOptions) -> None:
@@ -187,7 +205,35 @@ def _find_features(database: Path, images: Path, names: list[str], is_video: boo
     )  # fmt: skip
 
 
-def _match(database: Path, num_images: int, is_video: bool, options: SfmOptions) -> None:
+class _PosesFound:
+    """Callback of incremental mapping: a picture has got its pose."""
+
+    def __init__(self, total: int, report: ReportProgress) -> None:
+        self._total, self._report, self._done = total, report, 0
+
+    def __call__(self) -> None:
+        self._done = min(self._done + 1, self._total)
+        self._report("poses, pictures", self._done, self._total)
+
+
+def _map(
+    database: Path, images: Path, models: Path, options: pycolmap.IncrementalPipelineOptions, found: _PosesFound
+) -> dict[int, pycolmap.Reconstruction]:
+    """Return the models of incremental mapping; ``found`` is called for each picture that gets a pose."""
+    import pycolmap
+
+    found()  # the second one of the first pair is told by COLMAP
+    return pycolmap.incremental_mapping(
+        database, images, models, options, initial_image_pair_callback=found, next_image_callback=found
+    )
+
+
+def _is_sequential(num_images: int, is_video: bool, options: SfmOptions) -> bool:
+    """Whether only neighbours by name are compared."""
+    return options.matching == "sequential" or (options.matching == "auto" and (is_video or num_images > 60))
+
+
+def _match(database: Path, sequential: bool, options: SfmOptions) -> None:
     import pycolmap
 
     matching = pycolmap.FeatureMatchingOptions()
@@ -195,7 +241,6 @@ def _match(database: Path, num_images: int, is_video: bool, options: SfmOptions)
     matching.num_threads = options.num_threads or -1
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = options.seed
-    sequential = options.matching == "sequential" or (options.matching == "auto" and (is_video or num_images > 60))
     if sequential:
         pairing = pycolmap.SequentialPairingOptions()
         pairing.overlap = options.overlap
@@ -244,7 +289,7 @@ def _gather_photos(source: Path, images: Path, out: Path) -> list[str]:
     return names
 
 
-def _extract_frames(video: Path, images: Path, options: SfmOptions) -> list[str]:
+def _extract_frames(video: Path, images: Path, options: SfmOptions, report: ReportProgress) -> list[str]:
     """Pictures of a video: of ``num_frames`` equal windows the sharpest picture each; their names, in order.
 
     Two passes, so that only one picture is held in memory: the first one measures.
@@ -257,6 +302,7 @@ def _extract_frames(video: Path, images: Path, options: SfmOptions) -> list[str]
         if index in chosen:
             names.append(f"frame_{index:05d}.png")
             write_image(images / names[-1], rgb)
+            report("frames of the video", len(names), len(chosen))
     return names
 
 

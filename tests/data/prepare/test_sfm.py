@@ -50,7 +50,16 @@ def test_poses_of_the_demo_scene_are_found_from_a_video(tmp_path: Path) -> None:
             video.add(rgb)
     out = tmp_path / "capture"
     options = SfmOptions(max_features=2000, num_threads=1, num_frames=8, camera_model="SIMPLE_PINHOLE")
-    result = estimate_poses(tmp_path / "arc.mp4", out, options)
+    told: dict[str, tuple[int, int]] = {}
+    result = estimate_poses(
+        tmp_path / "arc.mp4", out, options, lambda what, done, total: told.update({what: (done, total)})
+    )
+    assert told == {
+        "frames of the video": (8, 8),
+        "features, pictures": (8, 8),
+        "matching, pairs": (28, 28),
+        "poses, pictures": (result.num_registered, 8),
+    }
     assert result.root == out
     assert result.num_images == 8
     assert result.num_registered >= 7, result.summary()

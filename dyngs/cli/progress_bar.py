@@ -1,0 +1,61 @@
+"""A progress bar for commands that take long and do not train."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from types import TracebackType
+from typing import IO, Any
+
+SECONDS_BETWEEN_LINES = 10.0
+"""Where there is no terminal, a line is printed this often."""
+
+
+class ProgressBar:
+    """Context manager that shows how far work has come, to be called as a ``ReportProgress``.
+
+    On a terminal, one bar for each kind of work; elsewhere plain lines, none for work that is soon done.
+
+    Args:
+        stream: where to; None: standard error.
+    """
+
+    def __init__(self, stream: IO[str] | None = None) -> None:
+        self._stream = sys.stderr if stream is None else stream
+        self._bars: Any = None
+        self._tasks: dict[str, Any] = {}
+        self._what = ""
+        self._since = self._last_line = time.monotonic()
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Show that ``done`` of ``total`` parts of ``what`` are done."""
+        if self._bars is not None:
+            if what not in self._tasks:
+                self._tasks[what] = self._bars.add_task(what, total=total)
+            self._bars.update(self._tasks[what], completed=done, total=total)
+            return
+        now = time.monotonic()
+        if what != self._what:
+            self._what, self._since = what, now
+        if now - self._last_line >= SECONDS_BETWEEN_LINES and 0 < done < total:
+            left = (now - self._since) / done * (total - done)
+            print(f"{what}: {done} of {total}, about {left:.0f} s left", file=self._stream, flush=True)
+            self._last_line = now
+
+    def __enter__(self) -> ProgressBar:
+        if self._stream.isatty() and os.environ.get("TERM") != "dumb":
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+            self._bars = Progress(*columns, console=Console(file=self._stream), refresh_per_second=4)
+            self._bars.start()
+        self._since = self._last_line = time.monotonic()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bars is not None:
+            self._bars.stop()
