@@ -31,12 +31,14 @@ class CameraPath:
         fps: frames per second.
         times: (F,) scene times in [0, 1], or None for a still scene.
         warnings: messages about changed input.
+        notes: messages about where the cameras were placed.
     """
 
     cameras: Cameras
     fps: float = 30.0
     times: tuple[float, ...] | None = None
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.cameras)

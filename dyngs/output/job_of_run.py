@@ -51,7 +51,9 @@ def job_of_run(run_dir: Path, options: RenderJobOptions) -> RenderJob:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     if fps is not None:
         path = replace(path, fps=fps)
-    return RenderJob(run.scene, path, render_options(run.config.model), background, notes, files_of(capture))
+    return RenderJob(
+        run.scene, path, render_options(run.config.model), background, path.notes + notes, files_of(capture)
+    )
 
 
 def cameras_for_paths(capture: Capture, data: DataConfig) -> Cameras:
@@ -117,7 +119,7 @@ def _placed_path(name: str, run: LoadedRun, capture: Capture, options: RenderJob
     up = None if options.up is None else np.asarray(axis(options.up))
     match name:
         case "orbit":
-            return CameraPath(orbit_path(cameras, frames, up), warnings=orbit_of(cameras, up).notes)
+            return CameraPath(orbit_path(cameras, frames, up), notes=orbit_of(cameras, up).notes)
         case "spiral":
             return CameraPath(spiral_path(cameras, frames, up))
         case _:

@@ -48,6 +48,22 @@ def test_time_runs_along_a_path_unless_told_otherwise(path: str, moving_run: Pat
     assert (still.path.times, still.notes) == (None, ())
 
 
+def test_a_clip_is_followed_in_its_own_time(moving_run: Path, still_run: Path) -> None:
+    job = job_of_run(moving_run, RenderJobOptions("along", 4))
+    assert job.path.times is not None
+    assert (job.path.times[0], job.path.times[-1]) == (min(TRAIN_TIMES), max(TRAIN_TIMES))
+    assert job_of_run(still_run, RenderJobOptions("along", 4)).path.times is None
+
+
+@pytest.mark.parametrize("path", ["orbit", "spiral", "along"])
+def test_up_counts_for_runs(path: str, moving_run: Path) -> None:
+    for name, up in (("y", [0.0, 1.0, 0.0]), ("-y", [0.0, -1.0, 0.0])):
+        rights = job_of_run(moving_run, RenderJobOptions(path, 3, up=name)).path.cameras.cam_from_world[:, 0, :3]
+        downs = job_of_run(moving_run, RenderJobOptions(path, 3, up=name)).path.cameras.cam_from_world[:, 1, :3]
+        torch.testing.assert_close(rights @ torch.tensor(up), torch.zeros(3), atol=1e-6, rtol=0)
+        assert (downs @ torch.tensor(up) < 0).all()
+
+
 def test_times_of_a_still_run_are_accepted_with_a_note(still_run: Path) -> None:
     job = job_of_run(still_run, RenderJobOptions("orbit", 3, times=(0.0, 0.5, 1.0)))
     assert len(job.path) == 3
