@@ -21,11 +21,13 @@ from dyngs.build import assemble
 from dyngs.config import Config, DynamicModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.config.still import as_still
+from dyngs.data.capture import View
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.pictures.images import area_downscale
 from dyngs.data.read import read_capture
 from dyngs.deform.evidence import Verdict
 from dyngs.deform.still_error import signed_errors
+from dyngs.errors import DyngsError
 from dyngs.metrics import psnr
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.folder import STILL_FOLDER, begin
@@ -53,15 +55,15 @@ def start(config: Config, folder: Path, train_still: Callable[[Config, Path], No
         train_still: trains the still model in a folder, or goes on with it, to its end.
 
     Raises:
-        DyngsError: a capture that cannot be read.
+        DyngsError: a capture that cannot be read, or one without times.
     """
     match config.model:
-        case DynamicModel() if config.model.compare_with_still:
-            pass
+        case DynamicModel():
+            views = read_capture(config.data).splits["train"]
+            _require_times(config, views)
         case _:
             return config
-    views = read_capture(config.data).splits["train"]
-    if len({view.time for view in views}) < 2:
+    if not config.model.compare_with_still:
         return config
     evidence = motion_evidence(config)
     if evidence.verdict is Verdict.STILL:
@@ -87,6 +89,15 @@ def start(config: Config, folder: Path, train_still: Callable[[Config, Path], No
         print("motion does not pay; trained as a still scene", flush=True)
         return still_instead(folder, config)
     return chosen.model_copy(update={"train": config.train.model_copy(update={"hold_out_every": every})})
+
+
+def _require_times(config: Config, views: Sequence[View]) -> None:
+    """Raise an error unless the views were taken at two times or more."""
+    if len({view.time for view in views}) < 2:
+        raise DyngsError(
+            f"{config.data.root}: the pictures have no times, so nothing can move; train configs/static.yaml, or add a "
+            "time to each picture (docs/formats.md), or give data.times=order if their names are in the order of time"
+        )
 
 
 def still_instead(folder: Path, config: Config) -> Config:

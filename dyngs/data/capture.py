@@ -163,6 +163,7 @@ class Capture:
         body: body parameters of each split, by frame number, for captures of people, else None.
         fps: frames per second of the recording, None where the capture does not say.
         span: first and last time as written in the files, which are 0 and 1 in the views; None without times.
+        in_seconds: times in the files are seconds.
         seconds: from time 0 to time 1, None where it is not known.
         tracks_path: 2D tracks, see ``data.tracks``; None without any.
         warnings: suspicious findings of the reader, one line each.
@@ -178,6 +179,7 @@ class Capture:
     body: dict[Split, BodyFrames] | None = None
     fps: float | None = None
     span: tuple[float, float] | None = None
+    in_seconds: bool = False
     seconds: float | None = None
     tracks_path: Path | None = None
     warnings: tuple[str, ...] = ()

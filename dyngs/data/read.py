@@ -11,6 +11,7 @@ from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, PointCloud, Splits, View, all_views
 from dyngs.data.frame_selection import select_frames
 from dyngs.data.geometry.recenter import recenter
+from dyngs.data.name_order import times_by_name
 from dyngs.data.pictures.frame_cache import decode_frames
 from dyngs.data.pictures.images import read_header
 from dyngs.data.prior_files import present_priors
@@ -121,9 +122,14 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
     if not splits.get("train"):
         raise DyngsError(f"{capture.root}: the {capture.format} capture has no training views; add posed pictures")
     new_poses = splits.pop("pose", None)
+    by_name: list[str] = []
+    if options.times == "order":
+        splits, line = times_by_name(capture.root, splits)
+        by_name, capture = [line], replace(capture, in_seconds=False)
     written = splits
     splits, notes = _timed(capture, splits, options.frames)
-    span, seconds = span_in_files(written, splits), clip_seconds(splits, capture.fps)
+    span = span_in_files(written, splits)
+    seconds = span[1] - span[0] if capture.in_seconds and span else clip_seconds(splits, capture.fps)
     if "test" not in splits:
         splits["train"], splits["test"] = hold_out(splits["train"], options.test_every)
         if not splits["train"]:
@@ -148,7 +154,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         has_alpha=_first_has_alpha(splits["train"]),
         span=span,
         seconds=seconds,
-        warnings=(*warnings, *notes, *more, *absent),
+        warnings=(*warnings, *by_name, *notes, *more, *absent),
     )
     return recenter(capture)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import signal
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from dyngs.config import Config, NetworkColour
 from dyngs.config.io import load_resolved
 from dyngs.config.still import as_still
 from dyngs.deform.evidence import Evidence, Verdict
+from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.folder import STILL_FOLDER
 from dyngs.training.trainer import StepReport, Trainer
@@ -33,6 +36,23 @@ def say(monkeypatch: pytest.MonkeyPatch, verdict: Verdict, *, pays: bool = True,
 
 def final_bytes(folder: Path) -> bytes:
     return checkpoint_paths(folder)[-1].read_bytes()
+
+
+def test_a_capture_without_times_is_refused_with_what_to_add(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = shutil.copytree(config.data.root, tmp_path / "without_times")
+    for file in root.glob("transforms_*.json"):
+        document = json.loads(file.read_text())
+        for frame in document["frames"]:
+            frame.pop("time", None)
+        file.write_text(json.dumps(document))
+    untimed = config.model_copy(update={"data": config.data.model_copy(update={"root": root})})
+    with pytest.raises(DyngsError, match=r"no times.*configs/static.yaml.*data\.times=order"):
+        train(untimed)
+    say(monkeypatch, Verdict.MOVES)
+    ordered = untimed.model_copy(update={"data": untimed.data.model_copy(update={"times": "order"})})
+    assert len(load_run(train(ordered)).scene.times) > 1
 
 
 def test_a_still_scene_is_trained_like_a_static_one(

@@ -31,6 +31,11 @@ class DataConfig(Section):
     frames: str | None = Field(
         default=None, description="start:stop:step over the capture's times, as a Python slice; null: all"
     )
+    times: Literal["files", "order"] = Field(
+        default="files",
+        description="when the pictures were taken; files: as the capture says; order: in the order of their names, by "
+        "the numbers that these end in",
+    )
     downscale: float = Field(default=1.0, ge=1.0, description="divide width and height of the pictures by this")
     longest_side: int | None = Field(
         default=None, ge=1, description="shrink pictures so that the longer side has at most this many px; null: do not"

@@ -104,6 +104,33 @@ def probe_video(path: Path) -> VideoInfo:
     return VideoInfo(width, height, count, fps if math.isfinite(fps) else 0.0)
 
 
+def frame_seconds(path: Path, num_frames: int) -> list[float]:
+    """Return the second at which each of the first ``num_frames`` frames is shown, the first one at 0.
+
+    Phones do not keep an even rate, so the time stamps of the file count. Where they are missing or too few, the mean
+    rate does, and 30 frames per second where the file names none either.
+
+    Raises:
+        DyngsError: as ``probe_video``.
+    """
+    from av.error import FFmpegError
+
+    stamps: list[float] = []
+    with _reading(path), _opened(path) as container:
+        stream = container.streams.video[0]
+        fps = float(stream.average_rate or 0) or 30.0
+        try:
+            for packet in container.demux(stream):
+                if packet.size > 0 and not packet.is_discard and packet.pts is not None and packet.time_base:
+                    stamps.append(float(packet.pts * packet.time_base))
+        except FFmpegError:
+            pass  # truncated: the frames up to there have their stamps
+    shown = sorted(stamps)[:num_frames]
+    if len(shown) < num_frames or len(set(shown)) < num_frames:
+        return [number / fps for number in range(num_frames)]
+    return [stamp - shown[0] for stamp in shown]
+
+
 def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterator[tuple[int, av.VideoFrame]]:
     """Yield number and frame, in order; damage is an error that names the frame.
 

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.data.frame_seconds import write_seconds
 from dyngs.data.pictures.images import read_header
-from dyngs.data.pictures.video import read_frames
+from dyngs.data.pictures.video import frame_seconds, read_frames
 from dyngs.data.prepare.sfm_progress import sequential_pairs, watched
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import MAX_MEGAPIXELS, check_size, inside, pictures_up_to, staying_within
@@ -292,7 +293,7 @@ def _gather_photos(source: Path, images: Path, out: Path) -> list[str]:
 def _extract_frames(video: Path, images: Path, options: SfmOptions, report: ReportProgress) -> list[str]:
     """Pictures of a video: of ``num_frames`` equal windows the sharpest picture each; their names, in order.
 
-    Two passes, so that only one picture is held in memory: the first one measures.
+    Two passes, so that only one picture is held in memory: the first one measures. Their seconds are written, too.
     """
     sharpness = np.array([_sharpness(rgb) for rgb in read_frames(video)])
     windows = np.array_split(np.arange(len(sharpness)), min(options.num_frames, max(len(sharpness), 1)))
@@ -303,6 +304,8 @@ def _extract_frames(video: Path, images: Path, options: SfmOptions, report: Repo
             names.append(f"frame_{index:05d}.png")
             write_image(images / names[-1], rgb)
             report("frames of the video", len(names), len(chosen))
+    seconds = frame_seconds(video, len(sharpness))
+    write_seconds(images.parent, {name: seconds[index] for name, index in zip(names, sorted(chosen), strict=True)})
     return names
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from dyngs.data.capture import Capture, Lens, PointCloud, View
+from dyngs.data.frame_seconds import read_seconds
 from dyngs.data.geometry.intrinsics import match_size, pinhole_matrix, rescale_warning
 from dyngs.data.geometry.poses import checked_pose, repair_warning
 from dyngs.data.pictures.images import SUFFIXES, header_if_readable
@@ -52,7 +53,7 @@ def is_colmap(root: Path) -> bool:
 
 
 def read_colmap(root: Path) -> Capture:
-    """Read a COLMAP model with pictures below ``images/`` and, if there are any, masks below ``masks/``.
+    """Read a COLMAP model with pictures below ``images/``, and with ``masks/`` and ``times.json`` where they are.
 
     All registered images become training views; distorted camera models are kept as ``View.lens``.
 
@@ -68,7 +69,7 @@ def read_colmap(root: Path) -> Capture:
         raise DyngsError(f"{root / 'images'}: no such folder; put the model's pictures there")
     with reading(folder, "names of images must be UTF-8; rename the pictures and export the model again"):
         posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
-    masks = _find_masks(root / "masks")
+    masks, seconds = _find_masks(root / "masks"), read_seconds(root)
     repaired: dict[str, float] = {}
     rescaled: list[str] = []
     views = []
@@ -84,9 +85,17 @@ def read_colmap(root: Path) -> Capture:
         if changed:
             rescaled.append(where)
         name, mask = view_name(path, root / "images"), _mask_of(image.name, masks)
-        views.append(View(name, path, pose, intrinsics, *size, lens, int(image.camera_id), mask_path=mask))
+        second = seconds.get(image.name)
+        views.append(View(name, path, pose, intrinsics, *size, lens, int(image.camera_id), mask_path=mask, time=second))
     warnings = repair_warning(repaired) + rescale_warning(rescaled) + _warnings(folder, model, views, bool(masks))
-    return Capture(root, "colmap", {"train": tuple(views)}, _points(model), warnings=tuple(warnings))
+    return Capture(
+        root,
+        "colmap",
+        {"train": tuple(views)},
+        _points(model),
+        in_seconds=bool(seconds),
+        warnings=tuple(warnings),
+    )
 
 
 def pinhole_and_lens(camera: pycolmap.Camera, where: str) -> tuple[np.ndarray, Lens]:

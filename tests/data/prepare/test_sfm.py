@@ -11,7 +11,9 @@ import pycolmap
 import pytest
 from skimage.transform import resize_local_mean
 
+from dyngs.data.capture import all_views
 from dyngs.data.prepare.sfm import SfmOptions, SfmResult, estimate_poses
+from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import orbit_cameras, render_scene, still_life
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
@@ -70,7 +72,13 @@ def test_poses_of_the_demo_scene_are_found_from_a_video(tmp_path: Path) -> None:
     # An arc of 49 degrees fixes the focal length, and with it the angle, to some 5%.
     assert _rotation_errors_deg(result, truth).max() < 4.0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["arc.mp4", "capture"]
-    assert sorted(p.name for p in out.iterdir()) == ["images", "sparse"]
+    assert sorted(p.name for p in out.iterdir()) == ["images", "sparse", "times.json"]
+    seconds = {view.name: view.time for view in all_views(read_capture(out).splits)}
+    registered = [i for i, name in enumerate(names) if name.removesuffix(".png") in seconds]
+    first, last = registered[0], registered[-1]
+    for i in registered:
+        assert seconds[names[i].removesuffix(".png")] == pytest.approx((i - first) / (last - first))
+    assert read_capture(out).seconds == pytest.approx(0.2 * (last - first)), "every second frame of 10 per second"
 
 
 def test_real_photos_register_and_repeat_bytewise(tmp_path: Path) -> None:

@@ -1,0 +1,71 @@
+"""Times of pictures by the order of their names: ``data.times=order``."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from dyngs.data.capture import Splits, View, all_views
+from dyngs.errors import DyngsError
+
+_NUMBERS = re.compile(r"(\d+)")
+
+
+def times_by_name(root: Path, splits: Splits) -> tuple[Splits, str]:
+    """Return the views with times by their names, and a line that says how.
+
+    Where the name of every picture ends in a number, and no two of a camera in the same, that number is the time:
+    frames that are missing leave gaps. Otherwise times are places in the order of the names, numbers in them read as
+    numbers. Pictures of one folder are from one camera; in another folder the same numbers, or places, are the same
+    times.
+
+    Args:
+        root: the capture, for messages.
+        splits: views; times that they have are replaced.
+
+    Raises:
+        DyngsError: fewer than two pictures, or folders with different numbers of pictures and names without numbers.
+    """
+    views = all_views(splits)
+    if len(views) < 2:
+        raise DyngsError(f"{root}: data.times=order needs two pictures or more, there is {len(views)}")
+    folders: dict[Path, list[View]] = defaultdict(list)
+    for view in views:
+        folders[view.image_path.parent].append(view)
+    numbers = {view.name: _last_number(view.image_path.stem) for view in views}
+    if all(_all_differ([numbers[view.name] for view in seen]) for seen in folders.values()):
+        times = {name: float(number or 0) for name, number in numbers.items()}
+        line = f"times are the numbers in the names of the pictures, from {min(times.values()):g} to "
+        line += f"{max(times.values()):g} (data.times=order)"
+    else:
+        lengths = {len(seen) for seen in folders.values()}
+        if len(lengths) > 1:
+            counts = f"{min(lengths)} to {max(lengths)}"
+            raise DyngsError(
+                f"{root}: data.times=order: folders hold {counts} pictures; end the names in the numbers of the frames"
+            )
+        orders = [sorted(seen, key=lambda view: _natural(view.image_path.name)) for seen in folders.values()]
+        times = {view.name: float(place) for order in orders for place, view in enumerate(order)}
+        line = f"times are the order of the names, {orders[0][0].name} first (data.times=order)"
+    timed: Splits = {
+        split: tuple(replace(view, time=times[view.name]) for view in kept) for split, kept in splits.items()
+    }
+    return timed, line
+
+
+def _last_number(stem: str) -> int | None:
+    """Return the number that a name ends in, if it has at most 15 digits."""
+    found = re.search(r"(\d{1,15})$", stem)
+    return int(found[1]) if found else None
+
+
+def _all_differ(numbers: Sequence[int | None]) -> bool:
+    return None not in numbers and len(set(numbers)) == len(numbers)
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Return a key by which 9 sorts before 10."""
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in _NUMBERS.split(name) if part]
