@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
@@ -43,11 +44,25 @@ def run(arguments: argparse.Namespace) -> int:
     config = parse_config(arguments.overrides, arguments.resume)
     from dyngs.api.train import train
 
+    if arguments.resume is None:
+        config = _with_poses(config)
     folder = train(config, resume_from=arguments.resume)
     for line in _about_motion(folder, config):
         print(line)
     print(f"trained: {folder}\n{_next(folder, config)}")
     return 0
+
+
+def _with_poses(config: Config) -> Config:
+    """Return the configuration with poses for photos or a video; people need a capture with body parameters."""
+    from dyngs.config.kinds import field_of, network_of, person_of
+    from dyngs.data.prepare.unposed import with_poses
+
+    if network_of(config) is not None or person_of(config) is not None:
+        return config
+    with ProgressBar() as report:
+        data = with_poses(config.data, needs_times=field_of(config) is not None, report=report)
+    return config.model_copy(update={"data": data})
 
 
 def _next(folder: Path, config: Config) -> str:

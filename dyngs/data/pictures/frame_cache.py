@@ -23,6 +23,7 @@ import numpy as np
 from dyngs.data.capture import VideoFrame
 from dyngs.data.pictures.video import VideoInfo, probe_video, read_numbered_frames
 from dyngs.errors import DyngsError, reading
+from dyngs.files.cache import CACHE_VARIABLE, cache_folder
 from dyngs.files.containment import inside
 from dyngs.files.picture_errors import picture_error
 from dyngs.files.write import atomic_file, write_text
@@ -32,7 +33,6 @@ try:
 except ImportError:  # Windows, where a folder with an open file in it cannot be renamed
     fcntl = None
 
-CACHE_VARIABLE = "DYNGS_CACHE_DIR"
 WHOLE_BYTES = 2**30
 """Larger videos are compared by samples and modification time only."""
 _MARK_NAME = "video.json"
@@ -59,16 +59,6 @@ class VideoFrames:
     paths: tuple[Path, ...]
 
 
-def cache_folder() -> Path:
-    """Return the folder of cached frames: in ``$DYNGS_CACHE_DIR``, else in the system's cache folder of the user."""
-    chosen = os.environ.get(CACHE_VARIABLE, "")
-    if chosen:
-        return Path(chosen).expanduser().absolute() / "frames"
-    from platformdirs import user_cache_path
-
-    return user_cache_path("dyngs", appauthor=False) / "frames"
-
-
 def planned_frames(video: Path) -> VideoFrames:
     """Return the frames of ``video`` and where they are cached; nothing is written.
 
@@ -84,7 +74,7 @@ def planned_frames(video: Path) -> VideoFrames:
     label = re.sub(r"[^A-Za-z0-9-]", "_", video.stem)[:40]
     # Two cameras may have filmed the same: the name keeps their frames apart.
     named = hashlib.sha256(os.fsencode(video.name) + b"\0" + digest).hexdigest()[:32]
-    folder = cache_folder() / f"{label}.{named}"
+    folder = cache_folder("frames") / f"{label}.{named}"
     info = _stored_info(folder) or probe_video(video)
     return VideoFrames(info, video, tuple(folder / f"frame_{number:06d}.png" for number in range(info.num_frames)))
 
@@ -216,7 +206,7 @@ class _DiskSpace:
         Raises:
             DyngsError: it is more than the limit, or than other processes or the disk leave.
         """
-        total, limit, cache = self._used + end, self._limit_mb * 1e6, cache_folder()
+        total, limit, cache = self._used + end, self._limit_mb * 1e6, cache_folder("frames")
         if total > limit:
             others = f", of which {self._used / 1e6:.4g} MB are there already" if self._used else ""
             raise DyngsError(
@@ -254,7 +244,7 @@ def _removed(kept: frozenset[Path], too_much: float) -> int:
 
 def _our_folders() -> list[Path]:
     """Folders of the cache that carry our mark and are no links."""
-    cache = cache_folder()
+    cache = cache_folder("frames")
     return [folder for folder in cache.iterdir() if _stored_info(folder)] if cache.is_dir() else []
 
 

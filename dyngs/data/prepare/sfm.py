@@ -270,13 +270,10 @@ def _mapping_options(options: SfmOptions) -> pycolmap.IncrementalPipelineOptions
 def _gather_photos(source: Path, images: Path, out: Path) -> list[str]:
     """Copy (hard-link where possible) all photos below ``source``; return their names below ``images``, sorted."""
     result = out.resolve()
-    photos = sorted(
-        path for path in source.rglob("*")
-        if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() and result not in path.resolve().parents
-        and not any(part.startswith(".") for part in path.relative_to(source).parts)
-    )  # fmt: skip
     names = []
-    for photo in photos:
+    for photo in photos_below(source):
+        if result in photo.resolve().parents:
+            continue
         header = read_header(inside(photo))
         check_size(photo, header.width, header.height, header.channels)
         name = photo.relative_to(source)
@@ -288,6 +285,15 @@ def _gather_photos(source: Path, images: Path, out: Path) -> list[str]:
             shutil.copyfile(photo, target)
         names.append(name.as_posix())
     return names
+
+
+def photos_below(folder: Path) -> list[Path]:
+    """Return all photos below the folder, sorted; hidden files and folders are left out."""
+    return sorted(
+        path for path in folder.rglob("*")
+        if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    )  # fmt: skip
 
 
 def _extract_frames(video: Path, images: Path, options: SfmOptions, report: ReportProgress) -> list[str]:

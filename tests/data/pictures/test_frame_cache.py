@@ -24,10 +24,11 @@ from tiny_captures import (
 from dyngs.config import DataConfig
 from dyngs.data.capture import VideoFrame
 from dyngs.data.pictures import frame_cache
-from dyngs.data.pictures.frame_cache import cache_folder, decode_frames, planned_frames
+from dyngs.data.pictures.frame_cache import decode_frames, planned_frames
 from dyngs.data.pictures.images import read_picture
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
+from dyngs.files.cache import cache_folder
 
 
 @pytest.fixture
@@ -60,15 +61,15 @@ def test_planning_writes_nothing(root: Path) -> None:
     frames = planned_frames(root / "cam00.mp4")
     assert (frames.info.width, frames.info.height, frames.info.num_frames, frames.info.fps) == (16, 12, 6, 30.0)
     assert len(set(frames.paths)) == 6
-    assert all(cache_folder() in path.parents for path in frames.paths)
+    assert all(cache_folder("frames") in path.parents for path in frames.paths)
     assert [path.name for path in root.iterdir()] == ["cam00.mp4"]
-    assert not cache_folder().exists()
+    assert not cache_folder("frames").exists()
 
 
 def test_only_wanted_frames_are_written_and_none_to_the_capture(root: Path) -> None:
     frames = plan(root / "cam00.mp4")
     decode_frames(root, some(frames, 4, 1), 10)
-    assert files(cache_folder()) == ["frame_000001.png", "frame_000004.png"]
+    assert files(cache_folder("frames")) == ["frame_000001.png", "frame_000004.png"]
     assert [path.name for path in root.iterdir()] == ["cam00.mp4"]
     for path, frame in some(frames, 4, 1).items():
         pixels = read_picture(path).numpy().astype(int)
@@ -191,12 +192,12 @@ def test_nothing_but_our_own_is_removed_from_the_cache(root: Path, tmp_path: Pat
     ours = next(iter(plan(root / "cam00.mp4"))).parent
     (ours / "letter.txt").write_text("dear")
     (ours / "link").symlink_to(tmp_path)
-    unmarked = cache_folder() / "cam00.0123"
+    unmarked = cache_folder("frames") / "cam00.0123"
     unmarked.mkdir()
     (unmarked / "frame_000000.png").write_text("mine")
     linked = tmp_path / "documents"
     shutil.copytree(ours, linked, symlinks=True)
-    (cache_folder() / "cam01.0123").symlink_to(linked)
+    (cache_folder("frames") / "cam01.0123").symlink_to(linked)
     shutil.copy(root / "cam00.mp4", root / "new.mp4")
     forget()
     size_mb = sum(path.stat().st_size for path in plan(root / "cam00.mp4")) / 1e6
@@ -231,7 +232,7 @@ def test_frames_that_an_older_version_left_in_the_capture_are_left_alone(root: P
     before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
     capture = read_capture(DataConfig(root=root, test_every=0))  # type: ignore[call-arg]
     assert {path: path.stat().st_mtime_ns for path in root.rglob("*")} == before
-    assert all(cache_folder() in view.image_path.parents for view in capture.splits["train"])
+    assert all(cache_folder("frames") in view.image_path.parents for view in capture.splits["train"])
 
 
 def test_a_full_disk_is_refused_at_once(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,12 +244,12 @@ def test_a_full_disk_is_refused_at_once(root: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_where_the_cache_lies(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    assert cache_folder() == Path(os.environ["DYNGS_CACHE_DIR"]) / "frames"
+    assert cache_folder("frames") == Path(os.environ["DYNGS_CACHE_DIR"]) / "frames"
     monkeypatch.delenv("DYNGS_CACHE_DIR")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     if sys.platform == "linux":
-        assert cache_folder() == tmp_path / "cache" / "dyngs" / "frames"
-    assert cache_folder().is_absolute()
+        assert cache_folder("frames") == tmp_path / "cache" / "dyngs" / "frames"
+    assert cache_folder("frames").is_absolute()
 
 
 def test_a_cache_that_cannot_be_written_is_one_line(
@@ -280,4 +281,4 @@ def test_a_truncated_video_is_named(root: Path) -> None:
     for path in frames:
         if path.is_file():
             assert read_picture(path).shape == (12, 16, 3)
-    assert not list(cache_folder().rglob(".frame*"))
+    assert not list(cache_folder("frames").rglob(".frame*"))
