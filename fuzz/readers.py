@@ -187,8 +187,8 @@ def read_a_motion(root: Path) -> object:
 
 def read_splats(root: Path) -> object:
     """Read a .ply of Gaussians and render it."""
-    from dyngs.export.ply import read_ply
     from dyngs.output.job_of_ply import splat_options
+    from dyngs.splats.ply import read_ply
 
     splat = read_ply(only(root))
     return splat, drawn(splat.gaussians, replace(splat_options(splat), nonfinite="skip"))

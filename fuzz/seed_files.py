@@ -21,13 +21,13 @@ from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.true_tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.export.avatar import _KIND as AVATAR_KIND
-from dyngs.export.ply import write_ply
 from dyngs.files.tensor_file import write_tensors
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.output.camera_paths import CameraPath, write_path
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.scene import Scene
+from dyngs.splats.ply import write_ply
 from dyngs.state import tensors_of
 from dyngs.storage.file import SceneInfo, encoded
 

@@ -23,7 +23,7 @@ from dyngs.cli import doctor, main
 from dyngs.cli.train import parse_config
 from dyngs.config.io import load_config, save_config
 from dyngs.errors import DyngsError, reading
-from dyngs.export.ply import read_ply
+from dyngs.splats.ply import read_ply
 
 VERBS = ("demo", "train", "prune", "eval", "render", "export", "data", "bench", "doctor", "predict", "tradeoff")
 ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"} | {

@@ -7,9 +7,10 @@ from pathlib import Path
 from dyngs.errors import DyngsError
 from dyngs.export.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.export.avatar import read_avatar
-from dyngs.export.ply import read_ply, splat_options
 from dyngs.runs.checkpoint import SCENE_FILE, load_run
 from dyngs.scene import Scene
+from dyngs.splats.ply import read_ply
+from dyngs.splats.splat_file import splat_options
 from dyngs.static.scene import StaticScene
 
 

@@ -8,6 +8,8 @@ import re
 import sys
 from pathlib import Path
 
+from dyngs.errors import DyngsError
+
 MAX_THREADS = 1024
 
 
@@ -49,6 +51,25 @@ def frame_count(text: str) -> int:
 def is_avatar_file(path: Path) -> bool:
     """Whether a path is an avatar file, as opposed to a run folder or a .ply."""
     return path.is_file() and path.suffix.lower() == ".safetensors"
+
+
+def run_of_scene_file(path: Path) -> Path:
+    """Return the run folder of a ``scene.dyngs``, and any other path as it is.
+
+    A run with checkpoints is drawn from those, which a note says.
+
+    Raises:
+        DyngsError: the file has another name.
+    """
+    if path.suffix.lower() != ".dyngs" or not path.is_file():
+        return path
+    from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
+
+    if path.name != SCENE_FILE:
+        raise DyngsError(f"{path}: must be called {SCENE_FILE}, with the config.yaml of its run beside it")
+    if checkpoint_paths(path.parent):
+        print_notes((f"{path.parent} has checkpoints: the newest one is drawn, not {SCENE_FILE}",))
+    return path.parent
 
 
 def print_notes(notes: tuple[str, ...], warnings: tuple[str, ...] = ()) -> None:

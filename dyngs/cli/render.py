@@ -1,4 +1,4 @@
-"""``dyngs render``: pictures and videos of a run, an avatar file, or any 3DGS .ply."""
+"""``dyngs render``: pictures and videos of a run, an avatar file, or any file of Gaussians."""
 
 from __future__ import annotations
 
@@ -6,7 +6,15 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import frame_count, image_size, is_avatar_file, print_notes, scene_time, threads
+from dyngs.cli.arguments import (
+    frame_count,
+    image_size,
+    is_avatar_file,
+    print_notes,
+    run_of_scene_file,
+    scene_time,
+    threads,
+)
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import DyngsError
 
@@ -23,6 +31,7 @@ examples:
   dyngs render runs/ann --motion walk.npz --video walk.mp4                 a person (model.kind=human) walks
   dyngs render runs/ann --pose rest --path orbit --video rest.mp4          the person in the rest pose of the template
   dyngs render ann.safetensors --motion walk.npz --video walk.mp4          an avatar file
+  dyngs render dance_export/scene.dyngs --path orbit --video orbit.mp4     what `export --format dyngs` wrote
   dyngs render splats.ply --path spiral --video spiral.mp4 --up=-y --size 1280x720
 """
 
@@ -31,7 +40,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``render`` to the commands."""
     parser = commands.add_parser(
         "render",
-        help="render pictures and videos of a run, an avatar or a .ply",
+        help="render pictures and videos of a run, an avatar or a file of Gaussians",
         description="Render the views of a split beside their ground truth, a camera path, or a fixed camera over "
         "time.",
         epilog=_EPILOG,
@@ -79,8 +88,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--up",
         choices=("x", "y", "z", "-x", "-y", "-z"),
-        help="up axis of the path (default: up for the cameras of a run, z for a .ply; --up=-y suits many COLMAP "
-        "captures)",
+        help="up axis of the path (default: up for the cameras of a run; of a file what it says, or what is usual for "
+        "its format)",
     )
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
     parser.set_defaults(run=run)
@@ -112,6 +121,7 @@ def _checked(arguments: argparse.Namespace) -> argparse.Namespace:
     Raises:
         DyngsError: nothing to render, nowhere to write, or an option that does not apply.
     """
+    arguments.source = run_of_scene_file(arguments.source)
     is_file = arguments.source.is_file()
     if is_file and arguments.split:
         raise DyngsError(f"{arguments.source}: a file has no splits; use --path orbit, spiral or FILE.json")
@@ -123,7 +133,7 @@ def _checked(arguments: argparse.Namespace) -> argparse.Namespace:
     if arguments.out is None and (arguments.video is None or not is_job):
         raise DyngsError("where to? Give --out DIR (or --video FILE.mp4 with --path, --time, --times or --view)")
     if not arguments.source.exists():
-        raise DyngsError(f"{arguments.source}: no such run or file; give a folder that `dyngs train` wrote, or a .ply")
+        raise DyngsError(f"{arguments.source}: no such run or file; give a folder that `dyngs train` wrote, or a file")
     if arguments.up and not (is_file or arguments.path):
         raise DyngsError("--up goes with --path orbit, spiral or along")
     unfit = [f"--{name}" for name in ("size", "background") if getattr(arguments, name)]

@@ -13,10 +13,10 @@ import torch
 
 from dyngs.colour.bake import with_harmonics
 from dyngs.errors import DyngsError
-from dyngs.export.ply import write_ply
 from dyngs.files.temporary import temporary_folder_beside
 from dyngs.runs.checkpoint import LoadedRun, load_run
 from dyngs.scene import Scene
+from dyngs.splats.ply import write_ply
 
 Part = Literal["all", "moving", "still"]
 

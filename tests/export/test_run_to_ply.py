@@ -11,9 +11,9 @@ from moving_scene import MOVING_ROWS, Sliding, moved_x, moving_scene, row_of_bal
 
 from dyngs.errors import DyngsError
 from dyngs.export import run_to_ply
-from dyngs.export.ply import read_ply
 from dyngs.export.run_to_ply import export_ply, frame_names, scene_part, write_run_ply, write_run_ply_sequence
 from dyngs.runs.checkpoint import LoadedRun, load_run
+from dyngs.splats.ply import read_ply
 
 ALL = (0, 1, 2, 3, 4)
 STILL_ROWS = (0, 2, 4)

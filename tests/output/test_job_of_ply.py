@@ -11,11 +11,12 @@ from two_balls import cameras_around, two_balls
 
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
-from dyngs.export.ply import SplatFile, read_ply, splat_options, write_ply
 from dyngs.gaussians import Gaussians
 from dyngs.output.job_of_ply import job_of_ply
 from dyngs.output.render_job import RenderJobOptions, render_frame
 from dyngs.rendering import RenderOptions
+from dyngs.splats.ply import read_ply, write_ply
+from dyngs.splats.splat_file import SplatFile, splat_options
 from dyngs.static.scene import StaticScene
 
 

@@ -50,12 +50,37 @@ class PlyHeader:
         elements: all elements in file order, up to and including ``vertex``.
         comments: comments of the header.
         data_start: offset of the first byte after the header.
+        later: the elements after ``vertex``.
     """
 
     byte_order: str | None
     elements: tuple[_Element, ...]
     comments: tuple[str, ...]
     data_start: int
+    later: tuple[_Element, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all elements, in file order."""
+        return tuple(element.name for element in (*self.elements, *self.later))
+
+    def read_element(self, file: BinaryIO, path: Path, name: str) -> np.ndarray:
+        """Read an element of a binary file as a structured array (N,).
+
+        Raises:
+            DyngsError: the file is ascii or truncated, or list properties hide where the element is.
+        """
+        index = self.names.index(name)
+        wanted, earlier = (*self.elements, *self.later)[index], (*self.elements, *self.later)[:index]
+        if self.byte_order is None or any(element.has_list for element in (*earlier, wanted)):
+            raise DyngsError(f"{path}: its element {name:.60} is ascii or has lists; export it again")
+        dtype = wanted.dtype(self.byte_order)
+        skipped = self.data_start + sum(e.count * e.dtype(self.byte_order).itemsize for e in earlier)
+        file.seek(0, os.SEEK_END)
+        if file.tell() < skipped + wanted.count * dtype.itemsize:
+            raise DyngsError(f"{path}: is truncated: the element {name:.60} ends at byte {file.tell()}")
+        file.seek(skipped)
+        return np.fromfile(file, dtype=dtype, count=wanted.count)
 
     @property
     def vertex_names(self) -> tuple[str, ...]:
@@ -137,8 +162,8 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
     if "vertex" not in names:
         raise DyngsError(f"{path}: has no vertices, so it is not a 3DGS .ply")
     upto = names.index("vertex") + 1
-    whole = (replace(e, properties=tuple(own.items())) for e, own in zip(elements[:upto], properties, strict=False))
-    return PlyHeader(byte_order, tuple(whole), tuple(comments), file.tell())
+    whole = [replace(e, properties=tuple(own.items())) for e, own in zip(elements, properties, strict=True)]
+    return PlyHeader(byte_order, tuple(whole[:upto]), tuple(comments), file.tell(), tuple(whole[upto:]))
 
 
 def _next_line(file: BinaryIO, path: Path) -> str:

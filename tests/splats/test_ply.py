@@ -13,8 +13,8 @@ from measured import cost_of
 
 from dyngs.conventions import RasterizeMode, num_sh_terms
 from dyngs.errors import DyngsError
-from dyngs.export.ply import read_ply, write_ply
 from dyngs.gaussians import Gaussians
+from dyngs.splats.ply import read_ply, write_ply
 
 PLAYBOT = Path(__file__).parents[2] / "../shared/data/splats/playbot_125k_sh2.ply"
 

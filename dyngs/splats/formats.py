@@ -1,0 +1,203 @@
+"""One reader and one writer for all files of Gaussians; the suffix names the format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+
+import torch
+
+from dyngs.conventions import RasterizeMode
+from dyngs.errors import DyngsError, reading, require_regular
+from dyngs.files.write import atomic_file
+from dyngs.gaussians import Gaussians
+from dyngs.splats.rotation import AXES, axis_of, product, turn_between, turned
+from dyngs.splats.splat_file import Nonfinite, SplatFile, drawable, unit_rotations, with_degree
+
+
+@dataclass(frozen=True)
+class Format:
+    """A file format of Gaussians.
+
+    Attributes:
+        name: as ``--format`` takes it.
+        suffixes: of its files, lower case; the first one is written.
+        up: axis that viewers of these files take for up.
+        max_degree: largest degree of the harmonics that it holds.
+        states_mode: whether it can say that the scene is antialiased.
+        home: module and the names of its reader and its writer.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    up: str
+    max_degree: int
+    states_mode: bool
+    home: tuple[str, str, str]
+
+    @property
+    def reader(self) -> Callable[[Path], SplatFile]:
+        """Return the function that reads it."""
+        return getattr(import_module(f"dyngs.splats.{self.home[0]}"), self.home[1])
+
+    @property
+    def writer(self) -> Callable[[Path, SplatFile], None]:
+        """Return the function that writes it."""
+        return getattr(import_module(f"dyngs.splats.{self.home[0]}"), self.home[2])
+
+
+FORMATS = (
+    Format("compressed-ply", (".compressed.ply",), "-y", 3, True, ("ply", "read_raw", "write_compressed")),
+    Format("ply", (".ply",), "-y", 4, True, ("ply", "read_raw", "write_raw")),
+    Format("spz", (".spz",), "y", 3, True, ("spz", "read_spz", "write_spz")),
+    Format("splat", (".splat",), "-y", 0, False, ("antimatter", "read_antimatter", "write_antimatter")),
+    Format("sog", (".sog",), "-y", 3, True, ("sog", "read_sog", "write_sog")),
+    Format("glb", (".glb",), "y", 3, False, ("gltf", "read_gltf", "write_gltf")),
+)
+"""All formats; a suffix that ends another one stands after it."""
+
+
+@dataclass(frozen=True)
+class Written:
+    """A file that was written.
+
+    Attributes:
+        path: of it.
+        splat: what it is meant to hold, before the format rounded it.
+        notes: a line about each thing that the format could not hold.
+    """
+
+    path: Path
+    splat: SplatFile
+    notes: tuple[str, ...] = ()
+
+
+def format_of(path: Path) -> Format:
+    """Return the format that the suffix of ``path`` names.
+
+    Raises:
+        DyngsError: none does; names all of them.
+    """
+    found = known_format(path)
+    if found is None:
+        given = f"the suffix {path.suffix!r} names" if path.suffix else "a name without a suffix names"
+        raise DyngsError(f"{path}: {given} no format of Gaussians; use one of {all_suffixes()}")
+    return found
+
+
+def known_format(path: Path) -> Format | None:
+    """Return the format that the suffix of ``path`` names, None if none does."""
+    name = path.name.lower()
+    for candidate in FORMATS:
+        if any(name.endswith(suffix) and name != suffix for suffix in candidate.suffixes):
+            return candidate
+    return None
+
+
+def format_named(name: str) -> Format:
+    """Return the format called ``name``. Raises DyngsError if there is none."""
+    for candidate in FORMATS:
+        if candidate.name == name:
+            return candidate
+    raise DyngsError(f"no format {name!r:.30} of Gaussians; use one of {', '.join(f.name for f in FORMATS)}")
+
+
+def all_suffixes() -> str:
+    """Return the suffixes of all formats, for messages."""
+    return ", ".join(suffix for found in FORMATS for suffix in found.suffixes)
+
+
+def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFile:
+    """Read a file of Gaussians; its suffix names the format.
+
+    Args:
+        path: the file.
+        nonfinite: "skip" leaves out Gaussians with NaN or Inf, with a note, "error" refuses the file. Infinite logits
+            (opacities of exactly 0 or 1) and sizes of 0 are brought to finite values, with a note.
+
+    Raises:
+        DyngsError: an unknown suffix, or not such a file, cut off, empty or non-finite; nothing large is allocated
+            before the numbers in the header have been compared with the size of the file and the limits.
+    """
+    path = Path(path)
+    own = format_of(path)
+    if not path.exists():
+        raise DyngsError(f"{path}: no such file")
+    require_regular(path)
+    with reading(path):
+        splat = own.reader(path)
+        if splat.up is None:
+            splat = replace(splat, up=own.up)
+        return drawable(splat, path, nonfinite)
+
+
+def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = None) -> Written:
+    """Write a file of Gaussians, atomically; its suffix names the format.
+
+    Args:
+        path: file to write; its folder is created.
+        splat: N >= 1 Gaussians and what the file is to say about them; any 3D filter must be fused into them already.
+        sh_degree: degree of the harmonics in the file: higher ones are left out, missing ones zero. None: as they are,
+            up to what the format holds.
+
+    Raises:
+        DyngsError: an unknown suffix, no Gaussians, non-finite values, a degree that the format does not hold, or the
+            file cannot be written.
+    """
+    path = Path(path)
+    own = format_of(path)
+    gaussians, notes = splat.gaussians.detach().to(device="cpu", dtype=torch.float32), []
+    if len(gaussians) == 0:
+        raise DyngsError(f"{path}: not written, there are no Gaussians")
+    bad = torch.stack([~x[:, None].flatten(1).isfinite().all(1) for x in gaussians.tensors().values()]).any(0)
+    if bool(bad.any()):
+        raise DyngsError(f"{path}: not written, {int(bad.sum())} of {len(gaussians)} Gaussians have non-finite values")
+    if sh_degree is not None and sh_degree > own.max_degree:
+        raise DyngsError(f"{path}: harmonics of degree {sh_degree}? {own.name} holds at most degree {own.max_degree}")
+    degree = min(gaussians.sh_degree, own.max_degree) if sh_degree is None else sh_degree
+    if degree < gaussians.sh_degree and bool(gaussians.sh[:, (degree + 1) ** 2 :].any()):
+        why = f"{own.name} holds no more" if sh_degree is None else "as asked for"
+        notes.append(f"harmonics above degree {degree} are left out: {why}")
+    if splat.mode is RasterizeMode.ANTIALIASED and not own.states_mode:
+        notes.append(f"the scene is antialiased, which {own.name} cannot say: viewers draw thin parts thicker")
+    whole = replace(splat, gaussians=_unit(with_degree(gaussians, degree)))
+    with atomic_file(path) as temporary:
+        try:
+            own.writer(temporary, whole)
+        except DyngsError as error:
+            raise DyngsError(f"{path}: not written: {error}") from error
+    return Written(path, whole, tuple(notes))
+
+
+def upright(splat: SplatFile, up: str | None, path: Path) -> SplatFile:
+    """Return the contents turned so that what points up in them points along the axis ``up`` of a file.
+
+    Args:
+        splat: unchanged where it does not say what points up.
+        up: axis such as "-y"; None: what viewers of the format of ``path`` take for up; "keep": nothing is turned.
+        path: file to be written.
+    """
+    if up == "keep" or splat.up is None:
+        return splat
+    wanted = format_of(path).up if up is None else up
+    return turned_file(splat, turn_between(axis_of(splat.up), axis_of(wanted)), wanted)
+
+
+def turned_file(splat: SplatFile, turn: tuple[float, float, float, float], up: str | None) -> SplatFile:
+    """Return the contents turned by a quaternion wxyz about the origin, ``up`` being what then points up."""
+    gaussians = turned(splat.gaussians, turn)
+    return replace(splat, gaussians=gaussians, up=up, turned=product(turn, splat.turned))
+
+
+def up_choices() -> tuple[str, ...]:
+    """Return what ``--up`` of a file that is written takes."""
+    return (*AXES, "keep")
+
+
+def _unit(gaussians: Gaussians) -> Gaussians:
+    norms = gaussians.quats.double().norm(dim=1, keepdim=True)
+    if bool(((norms - 1).abs() < 1e-6).all()):
+        return gaussians
+    return gaussians.replace(quats=unit_rotations(gaussians.quats))

@@ -1,0 +1,211 @@
+"""All formats through one reader and one writer: the same pictures, within what each format rounds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from splat_scenes import cameras_turned, cloud, psnr, seen
+
+from dyngs.conventions import RasterizeMode
+from dyngs.errors import DyngsError
+from dyngs.files.limits import VARIABLE
+from dyngs.gaussians import Gaussians
+from dyngs.splats.formats import (
+    FORMATS,
+    Format,
+    format_named,
+    format_of,
+    known_format,
+    read_splats,
+    upright,
+    write_splats,
+)
+from dyngs.splats.splat_file import SplatFile, splat_options
+
+LEAST_PSNR = {"ply": 99, "compressed-ply": 42, "spz": 36, "splat": 40, "sog": 35, "glb": 90}
+"""dB, of a scene whose harmonics are as strong as its base colours."""
+
+every = pytest.mark.parametrize("kind", FORMATS, ids=lambda f: f.name)
+
+
+def file_of(kind: Format, folder: Path) -> Path:
+    return folder / f"a{kind.suffixes[0]}"
+
+
+@every
+def test_a_file_shows_what_was_written(kind: Format, tmp_path: Path) -> None:
+    degree = min(3, kind.max_degree)
+    scene = cloud(degree=degree)
+    written = write_splats(file_of(kind, tmp_path), SplatFile(scene, eps2d=0.1))
+    assert written.notes == ()
+    back = read_splats(written.path)
+    assert len(back.gaussians) == len(scene)
+    assert back.gaussians.sh_degree == degree
+    assert psnr(seen(back.gaussians), seen(scene)) > LEAST_PSNR[kind.name]
+
+
+@every
+def test_what_pointed_up_points_up_in_the_viewers_of_the_format(kind: Format, tmp_path: Path) -> None:
+    scene = cloud(degree=min(3, kind.max_degree))
+    path = file_of(kind, tmp_path)
+    back = read_splats(write_splats(path, upright(SplatFile(scene, up="z"), None, path)).path)
+    assert back.up == kind.up
+    turn = upright(SplatFile(scene, up="z"), None, path).turned
+    assert psnr(seen(back.gaussians, cameras_turned(turn)), seen(scene)) > LEAST_PSNR[kind.name]
+    kept = read_splats(write_splats(path, upright(SplatFile(scene, up="z"), "keep", path)).path)
+    assert psnr(seen(kept.gaussians), seen(scene)) > LEAST_PSNR[kind.name]
+
+
+@every
+def test_what_the_format_cannot_say_is_said(kind: Format, tmp_path: Path) -> None:
+    written = write_splats(file_of(kind, tmp_path), SplatFile(cloud(30, 4), RasterizeMode.ANTIALIASED))
+    said = " ".join(written.notes)
+    assert (f"harmonics above degree {kind.max_degree} are left out" in said) == (kind.max_degree < 4)
+    assert ("antialiased" in said) == (not kind.states_mode)
+    if kind.states_mode:
+        assert splat_options(read_splats(written.path)).mode is RasterizeMode.ANTIALIASED
+
+
+@every
+def test_the_degree_that_is_asked_for(kind: Format, tmp_path: Path) -> None:
+    for degree in range(kind.max_degree + 1):
+        scene = cloud(30, 1)
+        back = read_splats(write_splats(file_of(kind, tmp_path), SplatFile(scene), sh_degree=degree).path)
+        assert back.gaussians.sh_degree == degree
+        if degree > 1:
+            assert float(back.gaussians.sh[:, 4:].abs().max()) < 0.04  # bytes around zero
+    if kind.max_degree < 4:
+        with pytest.raises(DyngsError, match=f"at most degree {kind.max_degree}"):
+            write_splats(file_of(kind, tmp_path), SplatFile(scene), sh_degree=4)
+
+
+@every
+def test_one_gaussian_exactly_opaque_and_one_exactly_transparent(kind: Format, tmp_path: Path) -> None:
+    scene = cloud(40, 0)
+    logits = torch.linspace(-3, 3, 40)
+    logits[0], logits[1] = 40.0, -200.0  # 1 and 0 in float32, or in 8 bits
+    scene = scene.replace(logit_opacities=logits)
+    back = read_splats(write_splats(file_of(kind, tmp_path), SplatFile(scene)).path)
+    assert len(back.gaussians) == 40
+    assert bool(back.gaussians.logit_opacities.isfinite().all())
+    found = back.gaussians.opacities.sort().values
+    assert float(found[0]) < 1e-6
+    assert float(found[-1]) > 1 - 1e-6
+    if kind.name != "ply":
+        assert "1 exactly opaque and 1 exactly transparent Gaussians" in back.notes[0]
+    assert psnr(seen(back.gaussians), seen(scene)) > LEAST_PSNR[kind.name]
+
+
+@every
+def test_one_gaussian_alone(kind: Format, tmp_path: Path) -> None:
+    scene = cloud(1, 0)
+    back = read_splats(write_splats(file_of(kind, tmp_path), SplatFile(scene)).path)
+    torch.testing.assert_close(back.gaussians.means, scene.means, rtol=1e-3, atol=1e-3)
+
+
+@every
+def test_every_truncation_is_an_error(kind: Format, tmp_path: Path) -> None:
+    path = file_of(kind, tmp_path)
+    data = write_splats(path, SplatFile(cloud(40, min(1, kind.max_degree)))).path.read_bytes()
+    for share in (0.0, 0.01, 0.1, 0.5, 0.9, 0.999):
+        path.write_bytes(data[: int(share * len(data)) - (kind.name == "splat")])  # a .splat ends after any row
+        with pytest.raises(DyngsError, match="a\\.") as refused:
+            read_splats(path)
+        assert "\n" not in str(refused.value)
+
+
+@every
+def test_what_cannot_be_written(kind: Format, tmp_path: Path) -> None:
+    path = file_of(kind, tmp_path)
+    scene = cloud(3, 0)
+    bad = scene.replace(means=torch.tensor([[0.0, 0, 0], [torch.nan, 0, 0], [1, 1, 1]]))
+    for broken in (bad, scene.select(torch.zeros(0, dtype=torch.long))):
+        with pytest.raises(DyngsError, match="not written"):
+            write_splats(path, SplatFile(broken))
+    assert not path.exists()
+
+
+def test_values_that_are_not_finite_are_counted(tmp_path: Path) -> None:
+    scene = cloud(10, 0)
+    means, logits = scene.means.clone(), scene.logit_opacities.clone()
+    path = write_splats(tmp_path / "a.ply", SplatFile(scene)).path
+    data = bytearray(path.read_bytes())
+    row = (len(data) - data.index(b"end_header\n") - 11) // 10
+    names = ["x", "y", "z", "nx", "ny", "nz", "dc", "dc", "dc", "opacity"]
+    start = data.index(b"end_header\n") + 11
+    for i, (name, value) in enumerate((("x", torch.nan), ("opacity", torch.inf), ("opacity", torch.nan))):
+        at = start + row * i + 4 * names.index(name)
+        data[at : at + 4] = torch.tensor(value).numpy().tobytes()
+    path.write_bytes(data)
+    with pytest.raises(DyngsError, match="2 of 10 Gaussians have non-finite values"):
+        read_splats(path)
+    back = read_splats(path, nonfinite="skip")
+    assert [note.split(" Gaussians")[0] for note in back.notes] == ["1 exactly opaque", "2 of 10"]
+    assert len(back.gaussians) == 8
+    assert (means.shape, logits.shape) == ((10, 3), (10,))
+
+
+def test_suffixes() -> None:
+    assert format_of(Path("a/b.PLY")).name == "ply"
+    assert format_of(Path("b.compressed.ply")).name == "compressed-ply"
+    assert known_format(Path("b.xyz")) is None
+    assert known_format(Path(".ply")) is None
+    for name in ("b", "b.xyz"):
+        with pytest.raises(
+            DyngsError, match=r"names no format of Gaussians; use one of \.compressed\.ply, \.ply, \.spz"
+        ):
+            format_of(Path(name))
+    assert [format_named(f.name) for f in FORMATS] == list(FORMATS)
+    with pytest.raises(DyngsError, match="no format 'xyz'"):
+        format_named("xyz")
+
+
+def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="no such file"):
+        read_splats(tmp_path / "a.spz")
+    (tmp_path / "b.spz").mkdir()
+    with pytest.raises(DyngsError, match=r"b\.spz"):
+        read_splats(tmp_path / "b.spz")
+
+
+def test_counts_beyond_the_file_cost_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import gzip
+    import struct
+
+    monkeypatch.delenv(VARIABLE, raising=False)
+    head = struct.pack("<4sIIBBBB", b"NGSP", 3, 4_000_000_000, 3, 12, 0, 0)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(head + bytes(1000)))
+    with pytest.raises(DyngsError, match="is truncated: 4,000,000,000 Gaussians"):
+        read_splats(tmp_path / "a.spz")
+    bomb = struct.pack("<4sIIBBBB", b"NGSP", 3, 10, 0, 12, 0, 0) + bytes(200 * 1000 * 1000)
+    (tmp_path / "b.spz").write_bytes(gzip.compress(bomb, 1))
+    assert len(read_splats(tmp_path / "b.spz").gaussians) == 10
+
+
+def test_the_original_place_is_known_from_a_ply(tmp_path: Path) -> None:
+    for name in ("a.ply", "a.compressed.ply"):
+        path = tmp_path / name
+        splat = SplatFile(cloud(20, 1), RasterizeMode.ANTIALIASED, 0.1, (1.0, 2.0, 3.0), ("mine",), "z")
+        back = read_splats(write_splats(path, upright(splat, None, path)).path)
+        assert (back.mode, back.eps2d, back.world_offset, back.up) == (splat.mode, 0.1, (1.0, 2.0, 3.0), "-y")
+        assert back.turned == pytest.approx(upright(splat, None, path).turned)
+        assert "mine" in back.comments
+
+
+def test_large_scenes_keep_their_place_in_spz(tmp_path: Path) -> None:
+    scene = cloud(50, 0)
+    far = scene.replace(means=scene.means * 1e5)
+    back = read_splats(write_splats(tmp_path / "a.spz", SplatFile(far)).path)
+    torch.testing.assert_close(back.gaussians.means, far.means, rtol=0, atol=0.1)
+    with pytest.raises(DyngsError, match=r"a\.spz: not written: a \.spz holds positions up to 8e6"):
+        write_splats(tmp_path / "a.spz", SplatFile(scene.replace(means=scene.means * 1e8)))
+
+
+def test_quaternions_need_not_be_of_unit_length(tmp_path: Path) -> None:
+    scene: Gaussians = cloud(50, 0)
+    for kind in FORMATS:
+        back = read_splats(write_splats(file_of(kind, tmp_path), SplatFile(replace(scene, quats=scene.quats * 3))).path)
+        assert psnr(seen(back.gaussians), seen(scene)) > LEAST_PSNR[kind.name]
