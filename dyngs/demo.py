@@ -15,7 +15,7 @@ from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import EvalReport, evaluate_run
-from dyngs.export.run_to_ply import export_ply
+from dyngs.export.run_to_splats import export_ply
 from dyngs.output.image_files import OutputOptions, write_job_images, write_split_images
 from dyngs.output.job_of_run import job_of_run
 from dyngs.output.render_job import RenderJobOptions

@@ -19,6 +19,7 @@ from fuzz.scenes import (
     ply_changed,
     safetensors_changed,
 )
+from fuzz.splats import sog_changed, spz_changed
 from fuzz.trees import json_changed, override_changed, yaml_changed
 
 Change = Callable[[bytes, Random], bytes]
@@ -40,6 +41,8 @@ CHANGES: Mapping[str, Change] = {
     ".mp4": video_changed,
     ".bin": colmap_changed,
     ".ply": ply_changed,
+    ".spz": spz_changed,
+    ".sog": sog_changed,
     ".bvh": bvh_changed,
     ".glb": glb_changed,
     ".hdf5": hdf5_changed,

@@ -186,11 +186,14 @@ def read_a_motion(root: Path) -> object:
 
 
 def read_splats(root: Path) -> object:
-    """Read a .ply of Gaussians and render it."""
-    from dyngs.output.job_of_ply import splat_options
-    from dyngs.splats.ply import read_ply
+    """Read a file of Gaussians, render it, and write it as another one."""
+    from dyngs.splats.formats import known_format, read_splats, write_splats
+    from dyngs.splats.splat_file import splat_options
 
-    splat = read_ply(only(root))
+    path = next((p for p in sorted(root.iterdir()) if known_format(p) is not None), root / "a.ply")
+    splat = read_splats(path)
+    read_splats(path, nonfinite="skip")
+    write_splats(root.parent / "out" / "b.ply", splat)
     return splat, drawn(splat.gaussians, replace(splat_options(splat), nonfinite="skip"))
 
 
@@ -325,6 +328,7 @@ CAPTURES: dict[str, dict[str, Seed]] = {
 }
 """Seeds of each capture format, by its name in ``dyngs.data.read.FORMATS``."""
 _NEEDS = {"people_snapshot": "h5py"}
+_PACKED = ("compressed-ply", "spz", "splat", "sog", "glb")
 _RUNS: dict[str, Seed] = {
     kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "control_nodes", "trajectory")
 }
@@ -350,6 +354,10 @@ READERS: dict[str, Reader] = {
     "bvh": Reader({"walk": files.write_walk_bvh}, read_a_motion),
     "gltf": Reader({"linear": files.write_walk_glb, "cubic": files.write_cubic_glb}, read_a_motion),
     "ply": Reader({"splats": files.write_splats}, read_splats),
+    **{
+        name: Reader({"splats": partial(files.write_packed, name)}, read_splats, needs=_NEEDS.get(name))
+        for name in _PACKED
+    },
     "checkpoints": Reader({"still": files.write_still_run, **_RUNS}, read_a_run),
     "scenes": Reader({"still": files.write_scene_file_still, "moving": files.write_scene_file_moving}, read_a_run),
     "avatars": Reader({"person": files.write_person}, read_a_person),

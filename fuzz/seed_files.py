@@ -27,7 +27,9 @@ from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.output.camera_paths import CameraPath, write_path
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.scene import Scene
+from dyngs.splats import formats
 from dyngs.splats.ply import write_ply
+from dyngs.splats.splat_file import SplatFile, with_degree
 from dyngs.state import tensors_of
 from dyngs.storage.file import SceneInfo, encoded
 
@@ -166,6 +168,13 @@ def write_cubic_glb(root: Path) -> None:
 def write_splats(root: Path) -> None:
     """Write a .ply of five Gaussians."""
     write_ply(root / "a.ply", row_of_balls(), world_offset=(1.0, 2.0, 3.0))
+
+
+def write_packed(name: str, root: Path) -> None:
+    """Write a file of Gaussians in the format called ``name``, with harmonics where it holds any."""
+    own = formats.format_named(name)
+    splat = SplatFile(with_degree(row_of_balls(), min(own.max_degree, 1)), up="y")
+    formats.write_splats(root / f"a{own.suffixes[0]}", splat)
 
 
 def write_still_run(root: Path) -> None:

@@ -25,7 +25,20 @@ from dyngs.config.io import load_config, save_config
 from dyngs.errors import DyngsError, reading
 from dyngs.splats.ply import read_ply
 
-VERBS = ("demo", "train", "prune", "eval", "render", "export", "data", "bench", "doctor", "predict", "tradeoff")
+VERBS = (
+    "demo",
+    "train",
+    "prune",
+    "eval",
+    "render",
+    "export",
+    "convert",
+    "data",
+    "bench",
+    "doctor",
+    "predict",
+    "tradeoff",
+)
 ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"} | {
     "PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])
 }
@@ -172,7 +185,7 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
         ("export nowhere --time 0 --times 0:1:2", "not allowed with"),
         ("export nowhere --static --dynamic", "not allowed with"),
         ("export nowhere --format tracks --static", "--static goes with --format ply"),
-        ("export nowhere --format spz", "invalid choice: 'spz'"),
+        ("export nowhere --format xyz", "invalid choice: 'xyz'"),
         ("data", "COMMAND"),
         ("data inspect nowhere", "nowhere"),
         ("data sfm nowhere out", "nowhere"),
@@ -458,7 +471,7 @@ def test_export_of_a_moving_run(moving_run: Path, tmp_path: Path, capsys: Captur
     every, moving, still = (0, 1, 2, 3, 4), (1, 3), (0, 2, 4)
     assert "note: this is time 0" in export()
     assert x_of(moving_run / "splats.ply") == pytest.approx(moved_x(every, 0.0).tolist())
-    assert "note" not in export("--time", 0.5, "--out", tmp_path / "middle.ply")
+    assert "this is time" not in export("--time", 0.5, "--out", tmp_path / "middle.ply")
     assert x_of(tmp_path / "middle.ply") == pytest.approx(moved_x(every, 0.5).tolist())
     assert "3 files" in export("--times", "0:1:3", "--out", tmp_path / "seq")
     assert x_of(tmp_path / "seq" / "frame_0002.ply") == pytest.approx(moved_x(every, 1.0).tolist())

@@ -1,4 +1,4 @@
-"""Load anything that dyngs writes, or any 3DGS ``.ply``, as a scene."""
+"""Load anything that dyngs writes, or any file of Gaussians, as a scene."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dyngs.export.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.export.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, load_run
 from dyngs.scene import Scene
-from dyngs.splats.ply import read_ply
+from dyngs.splats.formats import all_suffixes, known_format, read_splats
 from dyngs.splats.splat_file import splat_options
 from dyngs.static.scene import StaticScene
 
@@ -22,7 +22,7 @@ def load(path: Path | str) -> Scene:
 
     Args:
         path: a run folder (its newest checkpoint, or its ``scene.dyngs``), a ``scene.dyngs`` with the ``config.yaml``
-            of its run beside it, an avatar file (``.safetensors``) or a 3DGS ``.ply``.
+            of its run beside it, an avatar file (``.safetensors``), or a file of Gaussians such as a 3DGS ``.ply``.
 
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
@@ -34,11 +34,10 @@ def load(path: Path | str) -> Scene:
         raise DyngsError(f"{path}: no such file or folder")
     if path.name == SCENE_FILE:
         return load_run(path.parent).scene
-    match path.suffix.lower():
-        case ".ply":
-            splat = read_ply(path)
-            return StaticScene(gaussians=splat.gaussians, options=splat_options(splat))
-        case suffix if suffix == AVATAR_SUFFIX:
-            return read_avatar(path).scene
-        case _:
-            raise DyngsError(f"{path}: not a scene; give a run folder, a {SCENE_FILE}, an avatar or a .ply")
+    if path.suffix.lower() == AVATAR_SUFFIX:
+        return read_avatar(path).scene
+    if known_format(path) is None:
+        known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()})"
+        raise DyngsError(f"{path}: not a scene; give {known}")
+    splat = read_splats(path)
+    return StaticScene(gaussians=splat.gaussians, options=splat_options(splat))

@@ -1,4 +1,4 @@
-"""``dyngs export``: write a run as files: .ply, tracks, an avatar, or one small .dyngs file."""
+"""``dyngs export``: write a run as files: Gaussians in many formats, tracks, an avatar, or one small .dyngs file."""
 
 from __future__ import annotations
 
@@ -6,17 +6,21 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import is_avatar_file, print_notes, scene_time
+from dyngs.cli.arguments import is_avatar_file, print_notes, run_of_scene_file, scene_time
+from dyngs.cli.splats import SPLAT_FORMATS, add_axes, known_suffix, print_redrawn
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
-    from dyngs.export.run_to_ply import Part
+    from dyngs.export.run_to_splats import Part
     from dyngs.runs.checkpoint import LoadedRun
+
+_OTHER_SUFFIXES = {".npz": "tracks", ".safetensors": "avatar", ".dyngs": "dyngs"}
 
 _EPILOG = """\
 examples:
   dyngs export runs/bench                                         runs/bench/splats.ply
   dyngs export runs/dance --time 0.5 --out middle.ply             the scene at one time
+  dyngs export runs/bench --out bench.spz                         the suffix names the format: .glb, .sog, .usdz ...
   dyngs export runs/dance --times 0:1:30 --out frames             frame_0000.ply ... for players of sequences
   dyngs export runs/dance --static --out stage.ply                only the Gaussians that never move
   dyngs export runs/ann --motion walk.npz --out walk              a person (model.kind=human), one file per frame
@@ -30,9 +34,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``export`` to the commands."""
     parser = commands.add_parser(
         "export",
-        help="write a run as .ply, tracks, avatar or small .dyngs file",
-        description="Write the Gaussians of a run as standard 3DGS .ply files, which viewers and editors read, as "
-        "tracks of their centres, as one small .dyngs file, or a person as an avatar file.",
+        help="write a run as .ply, .spz, .glb and the like, tracks, avatar or small .dyngs file",
+        description="Write the Gaussians of a run as files that viewers and editors read, as tracks of their centres, "
+        "as one small .dyngs file, or a person as an avatar file.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -40,9 +44,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--format",
         type=_format,
-        choices=("ply", "tracks", "dyngs", "avatar"),
-        default="ply",
-        help="file format (default ply)",
+        choices=(*SPLAT_FORMATS, "tracks", "dyngs", "avatar"),
+        help="file format (default: what the suffix of --out names, else ply)",
     )
     parser.add_argument(
         "--out", type=Path, metavar="PATH", help="file, or folder of a sequence (default: splats... in RUN)"
@@ -60,6 +63,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="--format dyngs: largest root-mean-square change of the pictures, in grey levels of 255 "
         "(default: what lowers the PSNR of training views by 0.025 dB)",
     )
+    add_axes(parser)
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--static", action="store_true", help="only the Gaussians that never move")
     part.add_argument("--dynamic", action="store_true", help="only the Gaussians that move")
@@ -78,16 +82,22 @@ def run(arguments: argparse.Namespace) -> int:
     from dyngs.export.avatar import read_avatar
     from dyngs.runs.checkpoint import load_run
 
+    arguments.run_dir = run_of_scene_file(arguments.run_dir)
+    kind = _kind(arguments)
     is_file = is_avatar_file(arguments.run_dir)
-    if is_file and (arguments.out is None or arguments.format in ("dyngs", "avatar")):
-        raise DyngsError(f"{arguments.run_dir}: an avatar file is exported as --format ply or tracks, with --out PATH")
-    if arguments.format == "avatar":
+    if is_file and (arguments.out is None or kind in ("dyngs", "avatar")):
+        raise DyngsError(f"{arguments.run_dir}: an avatar file is exported as Gaussians or tracks, with --out PATH")
+    if kind in ("tracks", "avatar", "dyngs"):
+        unfit = [name for name in ("up", "from_up", "sh_degree") if getattr(arguments, name) is not None]
+        if unfit:
+            raise DyngsError(f"--{unfit[0].replace('_', '-')} goes with files of Gaussians, not with --format {kind}")
+    if kind == "avatar":
         return _export_avatar(arguments)
-    if arguments.format == "dyngs":
+    if kind == "dyngs":
         return _export_dyngs(arguments)
     if arguments.max_change is not None:
         raise DyngsError("--max-change goes with --format dyngs")
-    if arguments.format == "tracks" and arguments.static:
+    if kind == "tracks" and arguments.static:
         raise DyngsError("--static goes with --format ply; Gaussians that never move have no tracks")
     times = _times(arguments)
     loaded = (read_avatar if is_file else load_run)(arguments.run_dir)
@@ -98,12 +108,40 @@ def run(arguments: argparse.Namespace) -> int:
         times = loaded.scene.times if times is None else times
     if loaded.scene.is_still and times is not None:
         print_notes(("nothing moves in this run: it is the same at all times",))
-    write = _export_tracks if arguments.format == "tracks" else _export_ply
-    files = write(arguments, loaded, times)
+    if kind == "tracks":
+        files = _export_tracks(arguments, loaded, times)
+    else:
+        files = _export_splats(arguments, loaded, times, kind)
     size = sum(path.stat().st_size for path in files) / 1e6
     where = files[0] if len(files) == 1 else f"{len(files)} files, {files[0]} to {files[-1].name}"
     print(f"written: {where} ({size:.1f} MB)")
     return 0
+
+
+def _kind(arguments: argparse.Namespace) -> str:
+    """Return the name of the format: what --format says, else what the suffix of --out names, else ply.
+
+    Raises:
+        DyngsError: an unknown suffix, or one of another format than --format.
+    """
+    from dyngs.splats.formats import all_suffixes, known_format
+
+    out, given = arguments.out, arguments.format
+    if out is None or out.is_dir():
+        return given or "ply"
+    found = known_format(out)
+    named = _OTHER_SUFFIXES.get(out.suffix.lower()) if found is None else found.name
+    if given is None and named is None:
+        is_sequence = arguments.times is not None or (arguments.motion is not None and arguments.time is None)
+        if is_sequence and not out.suffix:
+            return "ply"
+        known = f"{all_suffixes()}, {', '.join(_OTHER_SUFFIXES)}"
+        raise DyngsError(f"{out}: which format? Give --format, or a name that ends in one of {known}")
+    if given is not None and named is not None and given != named:
+        raise DyngsError(f"{out}: --format {given} does not write files of that suffix, which is that of {named}")
+    if given is not None and named is None and out.suffix and given in SPLAT_FORMATS:
+        raise DyngsError(f"{out}: viewers do not know this suffix as {given}; use one of {all_suffixes()}")
+    return given or named or "ply"
 
 
 def _export_dyngs(arguments: argparse.Namespace) -> int:
@@ -162,26 +200,43 @@ def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     return inside
 
 
-def _export_ply(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...] | None) -> list[Path]:
+def _export_splats(
+    arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...] | None, kind: str
+) -> list[Path]:
     """Write a sequence if several times of a moving scene are asked for, else one file; return the paths."""
-    from dyngs.export.run_to_ply import write_run_ply, write_run_ply_sequence
+    from dyngs.export.run_to_splats import scene_part, write_run_sequence, write_run_splats
+    from dyngs.output.redrawn import compare_run
+    from dyngs.output.upright import writing_of
+    from dyngs.splats.formats import format_named
 
+    own = format_named(kind)
+    suffix = own.suffixes[0]
     if loaded.scene.colour is not None:
         print_notes(("the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",))
     part: Part = "still" if arguments.static else "moving" if arguments.dynamic else "all"
+    scene = scene_part(loaded.scene, part)
+    how, line = writing_of(loaded, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = arguments.times is not None or (arguments.motion is not None and arguments.time is None)
-    if not is_sequence or arguments.static:
-        if out is not None and out.suffix.lower() != ".ply" and (out.is_dir() or is_sequence):
-            out = out / f"{stem}.ply"
+    is_file = out is not None and known_suffix(out)
+    if is_sequence and is_file and not arguments.static:
+        raise DyngsError(f"{out}: a sequence is a folder of files; give --out DIR, or --time for one file")
+    print_notes((line,))
+    if is_sequence and not arguments.static:
+        moments = times or ()
+        written = write_run_sequence(loaded, out or arguments.run_dir / stem, moments, part, how, suffix)
+    else:
+        if out is not None and not is_file and (out.is_dir() or is_sequence):
+            out = out / f"{stem}{suffix}"
         if times is None and not arguments.static and not loaded.scene.is_still:
             print_notes(("this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence",))
-        time = 0.0 if times is None else times[0]
-        return [write_run_ply(loaded, out or arguments.run_dir / f"{stem}.ply", time, part)]
-    if out is not None and out.suffix.lower() == ".ply":
-        raise DyngsError(f"{out}: a sequence is a folder of files; give --out DIR, or --time for one file")
-    return write_run_ply_sequence(loaded, out or arguments.run_dir / stem, times or (), part)
+        moments = (0.0 if times is None else times[0],)
+        path = out or arguments.run_dir / f"{stem}{suffix}"
+        written = [write_run_splats(loaded, path, moments[0], part, how)]
+    shown = sorted({0, len(written) // 2, len(written) - 1})
+    print_redrawn(written[0].notes, [compare_run(loaded, scene, moments[i], written[i]) for i in shown])
+    return [one.path for one in written]
 
 
 def _export_tracks(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...] | None) -> list[Path]:

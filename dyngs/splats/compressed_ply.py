@@ -119,7 +119,7 @@ def write_compressed(path: Path, splat: SplatFile) -> None:
 
 def _header(splat: SplatFile, chunks: int, count: int, rest: int) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [f"comment {comment}" for comment in (*header_comments(splat), *splat.comments)]
+    lines += [f"comment {comment}" for comment in header_comments(splat)]
     lines.append(f"element chunk {chunks}")
     lines += [f"property float {name}" for names in _RANGES.values() for name in names]
     lines.append(f"element vertex {count}")

@@ -108,7 +108,7 @@ def write_raw(path: Path, splat: SplatFile) -> None:
     """Write a plain .ply, not atomically."""
     table = _table(splat.gaussians)
     with open(path, "wb") as file:
-        file.write(_header([*header_comments(splat), *splat.comments], len(table), splat.gaussians.sh.shape[1]))
+        file.write(_header(header_comments(splat), len(table), splat.gaussians.sh.shape[1]))
         file.write(table.data)
 
 

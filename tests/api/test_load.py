@@ -10,7 +10,7 @@ import torch
 import dyngs
 from dyngs.api.load import load
 from dyngs.export.avatar import write_avatar
-from dyngs.export.run_to_ply import export_ply
+from dyngs.export.run_to_splats import export_ply
 from dyngs.export.scene_file import write_scene_file
 from dyngs.runs.checkpoint import load_run
 

@@ -174,7 +174,7 @@ def test_the_command_line_takes_the_file_for_the_run(
     assert len(list((tmp_path / "splats").glob("*.ply"))) == 3
     capsys.readouterr()
     for wrong, line in (
-        (["export", str(file)], "is exported as --format ply or tracks, with --out PATH"),
+        (["export", str(file)], "is exported as Gaussians or tracks, with --out PATH"),
         (["render", str(file), "--out", "x", "--view", "3"], "holds no views"),
         (["export", str(run_dir), "--format", "avatar", "--time", "0.5"], "--time does not go with --format avatar"),
     ):

@@ -20,7 +20,7 @@ from dyngs.config.io import load_resolved
 from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.demo import unused_folder
 from dyngs.errors import DyngsError
-from dyngs.export.run_to_ply import write_run_ply_sequence
+from dyngs.export.run_to_splats import write_run_sequence
 from dyngs.export.scene_file import write_scene_file
 from dyngs.runs.checkpoint import KEEP_CHECKPOINTS, checkpoint_paths, latest_checkpoint, load_run, save_checkpoint
 from dyngs.runs.folder import default_folder, new_folder, tidy
@@ -79,7 +79,7 @@ COMMANDS: dict[str, Command] = {
     "export": lambda capture, run, out: write_scene_file(run, out),
     "resume": lambda capture, run, out: train(config_of(capture, out), resume_from=out),
     "synth": lambda capture, run, out: require_new_folder(out),
-    "sequence": lambda capture, run, out: write_run_ply_sequence(load_run(run), out, (0.0, 1.0)),
+    "sequence": lambda capture, run, out: write_run_sequence(load_run(run), out, (0.0, 1.0)),
     "demo": lambda capture, run, out: _require(unused_folder(out) == out),
 }
 

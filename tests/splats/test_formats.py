@@ -193,6 +193,8 @@ def test_the_original_place_is_known_from_a_ply(tmp_path: Path) -> None:
         assert (back.mode, back.eps2d, back.world_offset, back.up) == (splat.mode, 0.1, (1.0, 2.0, 3.0), "-y")
         assert back.turned == pytest.approx(upright(splat, None, path).turned)
         assert "mine" in back.comments
+        again = read_splats(write_splats(path, replace(back, comments=(*back.comments, "caf\xe9", "two\rlines"))).path)
+        assert again.comments == back.comments  # nothing twice, nothing that breaks the header
 
 
 def test_large_scenes_keep_their_place_in_spz(tmp_path: Path) -> None:

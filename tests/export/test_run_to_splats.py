@@ -10,8 +10,15 @@ import torch
 from moving_scene import MOVING_ROWS, Sliding, moved_x, moving_scene, row_of_balls, still_scene, write_moving_run
 
 from dyngs.errors import DyngsError
-from dyngs.export import run_to_ply
-from dyngs.export.run_to_ply import export_ply, frame_names, scene_part, write_run_ply, write_run_ply_sequence
+from dyngs.export import run_to_splats
+from dyngs.export.run_to_splats import (
+    Part,
+    export_ply,
+    frame_names,
+    scene_part,
+    write_run_sequence,
+    write_run_splats,
+)
 from dyngs.runs.checkpoint import LoadedRun, load_run
 from dyngs.splats.ply import read_ply
 
@@ -29,13 +36,17 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> LoadedRun:
     return load_run(write_moving_run(tmp_path_factory.mktemp("still"), moves=False))
 
 
+def written(run: LoadedRun, path: Path, time: float = 0.0, part: Part = "all") -> Path:
+    return write_run_splats(run, path, time, part).path
+
+
 def x_of(path: Path) -> torch.Tensor:
     return read_ply(path).gaussians.means[:, 0]
 
 
 @pytest.mark.parametrize("time", [0.0, 0.3, 1.0])
 def test_one_moment(moving: LoadedRun, time: float, tmp_path: Path) -> None:
-    splat = read_ply(write_run_ply(moving, tmp_path / "a.ply", time))
+    splat = read_ply(written(moving, tmp_path / "a.ply", time))
     torch.testing.assert_close(splat.gaussians.means[:, 0], moved_x(ALL, time))
     assert torch.equal(splat.gaussians.means[:, 1:], row_of_balls().means[:, 1:])
     assert f"dyngs time {time!r}" in splat.comments
@@ -44,10 +55,10 @@ def test_one_moment(moving: LoadedRun, time: float, tmp_path: Path) -> None:
 
 
 def test_a_still_run_has_no_time(still: LoadedRun, tmp_path: Path) -> None:
-    early, late = (write_run_ply(still, tmp_path / f"{time}.ply", time) for time in (0.0, 1.0))
+    early, late = (written(still, tmp_path / f"{time}.ply", time) for time in (0.0, 1.0))
     assert early.read_bytes() == late.read_bytes()
     assert not any("time" in comment for comment in read_ply(early).comments)
-    everything = write_run_ply(still, tmp_path / "still.ply", part="still")
+    everything = written(still, tmp_path / "still.ply", part="still")
     assert everything.read_bytes() == early.read_bytes()
 
 
@@ -58,8 +69,8 @@ def test_the_default_is_the_beginning(tmp_path: Path) -> None:
 
 def test_parts_together_are_the_whole(moving: LoadedRun, tmp_path: Path) -> None:
     for time in (0.0, 0.7):
-        moves = x_of(write_run_ply(moving, tmp_path / "moving.ply", time, "moving"))
-        stays = x_of(write_run_ply(moving, tmp_path / "still.ply", time, "still"))
+        moves = x_of(written(moving, tmp_path / "moving.ply", time, "moving"))
+        stays = x_of(written(moving, tmp_path / "still.ply", time, "still"))
         torch.testing.assert_close(moves, moved_x(MOVING_ROWS, time))
         torch.testing.assert_close(stays, moved_x(STILL_ROWS, time))
     assert not any("time" in comment for comment in read_ply(tmp_path / "still.ply").comments)
@@ -75,11 +86,12 @@ def test_empty_parts_are_refused() -> None:
 @pytest.mark.parametrize(("part", "rows"), [("all", ALL), ("moving", MOVING_ROWS)])
 def test_a_sequence(moving: LoadedRun, part, rows: tuple[int, ...], tmp_path: Path) -> None:
     times = (0.0, 0.25, 1.0)
-    written = write_run_ply_sequence(moving, tmp_path / "new" / "seq", times, part)
-    assert [p.name for p in written] == ["frame_0000.ply", "frame_0001.ply", "frame_0002.ply"]
-    assert sorted((tmp_path / "new" / "seq").iterdir()) == written
-    assert all(re.fullmatch(r"(.*?)(\d+)\.ply", p.name) for p in written)  # what players look for
-    for path, time in zip(written, times, strict=True):
+    files = write_run_sequence(moving, tmp_path / "new" / "seq", times, part)
+    paths = [one.path for one in files]
+    assert [p.name for p in paths] == ["frame_0000.ply", "frame_0001.ply", "frame_0002.ply"]
+    assert sorted((tmp_path / "new" / "seq").iterdir()) == paths
+    assert all(re.fullmatch(r"(.*?)(\d+)\.ply", p.name) for p in paths)  # what players look for
+    for path, time in zip(paths, times, strict=True):
         torch.testing.assert_close(x_of(path), moved_x(rows, time))
         assert f"dyngs time {time!r}" in read_ply(path).comments
 
@@ -95,16 +107,16 @@ def test_names_are_in_order_of_frames(count: int, last: str) -> None:
 
 def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(moving: LoadedRun, tmp_path: Path) -> None:
     folder = tmp_path / "seq"
-    write_run_ply_sequence(moving, folder, (0.0, 0.5))
+    write_run_sequence(moving, folder, (0.0, 0.5))
     (folder / "notes.txt").write_text("mine")
-    longer = write_run_ply_sequence(moving, folder, (1.0, 1.0, 1.0))
+    longer = [one.path for one in write_run_sequence(moving, folder, (1.0, 1.0, 1.0))]
     assert all(torch.equal(x_of(path), x_of(longer[0])) for path in longer)
     before = {p: p.read_bytes() for p in folder.iterdir()}
     with pytest.raises(DyngsError, match=r"holds other \.ply files \(frame_0002\.ply\)"):
-        write_run_ply_sequence(moving, folder, (0.0, 0.5))
+        write_run_sequence(moving, folder, (0.0, 0.5))
     assert {p: p.read_bytes() for p in folder.iterdir()} == before
     with pytest.raises(DyngsError, match="is a file, but a sequence needs a folder"):
-        write_run_ply_sequence(moving, folder / "notes.txt", (0.0, 0.5))
+        write_run_sequence(moving, folder / "notes.txt", (0.0, 0.5))
 
 
 @pytest.mark.parametrize("problem", [DyngsError("NaN"), OSError(28, "No space left on device"), KeyboardInterrupt()])
@@ -112,7 +124,7 @@ def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(moving
 def test_a_sequence_that_fails_leaves_nothing(
     moving: LoadedRun, problem: BaseException, exists: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, real, count = tmp_path / "seq", run_to_ply.write_ply, []
+    folder, real, count = tmp_path / "seq", run_to_splats.write_splats, []
     if exists:
         folder.mkdir()
         (folder / "notes.txt").write_text("mine")
@@ -123,8 +135,8 @@ def test_a_sequence_that_fails_leaves_nothing(
             raise problem
         return real(*arguments, **options)
 
-    monkeypatch.setattr(run_to_ply, "write_ply", failing)
+    monkeypatch.setattr(run_to_splats, "write_splats", failing)
     with pytest.raises(DyngsError if isinstance(problem, OSError) else type(problem)):
-        write_run_ply_sequence(moving, folder, (0.0, 0.25, 0.5, 0.75))
+        write_run_sequence(moving, folder, (0.0, 0.25, 0.5, 0.75))
     assert len(count) == 3
     assert [p.name for p in tmp_path.rglob("*")] == (["seq", "notes.txt"] if exists else [])

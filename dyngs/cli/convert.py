@@ -1,0 +1,55 @@
+"""``dyngs convert``: read a file of Gaussians and write it in another format."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from dyngs.cli.arguments import print_notes
+from dyngs.cli.splats import add_axes, print_redrawn
+
+_EPILOG = """\
+examples:
+  dyngs convert garden.ply garden.spz                 upright in viewers of either
+  dyngs convert garden.spz garden.ply --sh-degree 3   for programs that insist on degree 3
+  dyngs convert garden.ply room.glb --from-up=z       a .ply whose z points up
+"""
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``convert`` to the commands."""
+    parser = commands.add_parser(
+        "convert",
+        help="write a file of Gaussians in another format",
+        description="Read a file of Gaussians, of dyngs or of any other program, and write it in another format; the "
+        "suffixes name the formats.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("source", type=Path, metavar="IN", help="file to read, such as a .ply or .spz")
+    parser.add_argument("target", type=Path, metavar="OUT", help="file to write, such as a .glb or .sog")
+    add_axes(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Convert the file, and print how much that changes what it shows."""
+    from dataclasses import replace
+
+    from dyngs.errors import DyngsError
+    from dyngs.output.redrawn import compare_splats
+    from dyngs.splats.formats import format_of, read_splats, upright, write_splats
+
+    format_of(arguments.target)  # before a large file is read
+    splat = read_splats(arguments.source, nonfinite="skip")
+    if arguments.target.exists() and arguments.target.samefile(arguments.source):
+        raise DyngsError(f"{arguments.target}: is the file that is read; give another name")
+    if arguments.from_up is not None:
+        splat = replace(splat, up=arguments.from_up)
+    turned = upright(splat, arguments.up, arguments.target)
+    said = f"up is {turned.up} in the file" + (f", it was {splat.up}" if turned.up != splat.up else ", as it was")
+    print_notes((*splat.notes, f"{len(splat.gaussians):,} Gaussians; {said}"))
+    written = write_splats(arguments.target, turned, sh_degree=arguments.sh_degree)
+    print_redrawn(written.notes, [compare_splats(splat, written)])
+    print(f"written: {written.path} ({written.path.stat().st_size / 1e6:.1f} MB)")
+    return 0

@@ -1,0 +1,168 @@
+"""Runs as files of Gaussians: all Gaussians, only the moving or only the static ones; at one time or at many."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from dyngs.colour.bake import with_harmonics
+from dyngs.errors import DyngsError
+from dyngs.files.temporary import temporary_folder_beside
+from dyngs.runs.checkpoint import LoadedRun, load_run
+from dyngs.scene import Scene
+from dyngs.splats.formats import Written, turned_file, write_splats
+from dyngs.splats.splat_file import SplatFile
+
+Part = Literal["all", "moving", "still"]
+
+
+@dataclass(frozen=True)
+class Writing:
+    """How Gaussians are written.
+
+    Attributes:
+        turn: unit quaternion wxyz, from the axes of the capture to those of the file.
+        up: axis that then points up, such as "-y"; None: not known.
+        sh_degree: degree of the harmonics in the file; None: as they are, up to what the format holds.
+    """
+
+    turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    up: str | None = None
+    sh_degree: int | None = None
+
+
+AS_THEY_ARE = Writing()
+
+
+def export_ply(run_dir: Path, path: Path) -> Path:
+    """Write the newest checkpoint of a run as .ply, at time 0, in the axes of the capture. Return the path.
+
+    Raises:
+        DyngsError: no such run, no checkpoint, or the file cannot be written.
+    """
+    return write_run_splats(load_run(run_dir), path).path
+
+
+def write_run_splats(
+    run: LoadedRun, path: Path, time: float = 0.0, part: Part = "all", how: Writing = AS_THEY_ARE
+) -> Written:
+    """Write a run as a file of Gaussians; its suffix names the format.
+
+    A 3D filter is fused, and colours of a network become harmonics; the header, where the format has one, states the
+    render mode, and the time if something moves.
+
+    Args:
+        run: a trained model.
+        path: output file; an old one is replaced when the new one is complete.
+        time: scene time in [0, 1].
+        part: all Gaussians, or only the moving or static ones.
+        how: axes, degree of the harmonics.
+
+    Raises:
+        DyngsError: the part is empty, an unknown suffix, or the file cannot be written.
+    """
+    return _write(run, scene_part(run.scene, part), path, time, how)
+
+
+def write_run_sequence(
+    run: LoadedRun,
+    folder: Path,
+    times: Sequence[float],
+    part: Part = "all",
+    how: Writing = AS_THEY_ARE,
+    suffix: str = ".ply",
+) -> list[Written]:
+    """Write a sequence ``frame_0000.ply`` and so on, one file per time, for players.
+
+    All files are written into a hidden folder first and appear together, so that a failed export leaves no incomplete
+    sequence behind.
+
+    Args:
+        run: a trained model.
+        folder: output folder, created if missing. Files of an earlier sequence of the same length are replaced.
+        times: T >= 1 times in [0, 1].
+        part: as in ``write_run_splats``.
+        how: axes, degree of the harmonics.
+        suffix: of the files, names the format.
+
+    Raises:
+        DyngsError: the part is empty, the folder holds other such files, or the files cannot be written.
+    """
+    scene = scene_part(run.scene, part)
+    names = frame_names(len(times), suffix)
+    _require_no_others(folder, names, suffix)
+    is_new = not folder.exists()
+    staging = temporary_folder_beside(folder / "frames")
+    try:
+        written = [_write(run, scene, staging / name, time, how) for name, time in zip(names, times, strict=True)]
+        for name in names:
+            os.replace(staging / name, folder / name)
+        staging.rmdir()
+    except OSError as error:
+        raise DyngsError(f"cannot write the sequence {folder}: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+        if is_new:
+            with suppress(OSError):
+                folder.rmdir()  # only succeeds while it is empty
+    return [replace(one, path=folder / name) for one, name in zip(written, names, strict=True)]
+
+
+def frame_names(count: int, suffix: str = ".ply") -> list[str]:
+    """Return ``frame_0000.ply`` and so on, with at least four digits and names in the order of the frames."""
+    digits = max(4, len(str(count - 1)))
+    return [f"frame_{i:0{digits}d}{suffix}" for i in range(count)]
+
+
+def scene_part(scene: Scene, part: Part) -> Scene:
+    """Return a part of a scene. Raises DyngsError if it is empty."""
+    if part == "all":
+        return scene
+    found = scene.part(part)
+    if not len(found):
+        empty = "every Gaussian of this run moves: it has no still part"
+        raise DyngsError("nothing moves in this run: it has no dynamic part" if part == "moving" else empty)
+    return found
+
+
+def splats_at(run: LoadedRun, scene: Scene, time: float, how: Writing = AS_THEY_ARE) -> SplatFile:
+    """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked for."""
+    model = run.config.model
+    with torch.no_grad():
+        moment = scene.moment(time)
+    gaussians, shader = moment.gaussians, scene.shader(moment)
+    comments = [f"step: {run.step}"] if scene.is_still else [f"step: {run.step}", f"dyngs time {time!r}"]
+    if shader is not None:
+        baked = with_harmonics(gaussians, shader)
+        gaussians = baked.gaussians
+        comments.append(f"colours: harmonics fitted to a network, rms error {baked.error:.4f}")
+    x, y, z = run.info.world_offset
+    splat = SplatFile(gaussians.detach(), model.rasterize_mode, model.eps2d, (x, y, z), tuple(comments))
+    return turned_file(splat, how.turn, how.up)
+
+
+def _write(run: LoadedRun, scene: Scene, path: Path, time: float, how: Writing) -> Written:
+    return write_splats(path, splats_at(run, scene, time, how), sh_degree=how.sh_degree)
+
+
+def _require_no_others(folder: Path, names: Sequence[str], suffix: str) -> None:
+    """Check that the folder holds no files that players would take for frames.
+
+    Raises:
+        DyngsError: there is a file that is not among ``names``, or the folder is a file.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise DyngsError(f"{folder}: is a file, but a sequence needs a folder")
+    others = sorted(f.name for f in folder.glob(f"[!.]*{suffix}") if f.name not in names)
+    if others:
+        raise DyngsError(
+            f"{folder}: holds other {suffix} files ({others[0]}), which players would take for frames; give an empty "
+            "folder"
+        )
