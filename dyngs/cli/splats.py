@@ -12,7 +12,7 @@ from dyngs.cli.arguments import print_notes
 if TYPE_CHECKING:
     from dyngs.output.redrawn import Redrawn
 
-SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "splat", "sog", "glb")
+SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "splat", "sog", "glb", "usd")
 """Names of ``dyngs.splats.formats.FORMATS``, here so that ``--help`` need not import them."""
 _AXES = ("x", "y", "z", "-x", "-y", "-z")
 

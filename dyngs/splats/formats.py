@@ -55,6 +55,7 @@ FORMATS = (
     Format("splat", (".splat",), "-y", 0, False, ("antimatter", "read_antimatter", "write_antimatter")),
     Format("sog", (".sog",), "-y", 3, True, ("sog", "read_sog", "write_sog")),
     Format("glb", (".glb",), "y", 3, False, ("gltf", "read_gltf", "write_gltf")),
+    Format("usd", (".usdc", ".usd", ".usda"), "y", 4, False, ("usd", "read_usd", "write_usd")),
 )
 """All formats; a suffix that ends another one stands after it."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
 from dyngs.files.limits import require_at_most
+from dyngs.splats.similarity import Placement, placement_of
 from dyngs.splats.splat_file import MOST_GAUSSIANS
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -22,15 +22,6 @@ _MOST_DOCUMENT_BYTES = 1 << 24
 _MOST_DEPTH = 32
 _MOST_NUMBERS = 1 << 30
 """Limit on the numbers of all accessors together: 4 GB; each may be named many times."""
-
-
-@dataclass(frozen=True)
-class Placement:
-    """A similarity: rotated by a unit quaternion wxyz, scaled, shifted by (3,)."""
-
-    rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    scale: float = 1.0
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class GlbFile:
@@ -165,10 +156,7 @@ class GlbFile:
         return matrix
 
     def _placement(self, world: np.ndarray) -> Placement:
-        linear = world[:3, :3]
-        scale = float(np.cbrt(np.linalg.det(linear)))
-        if not scale > 1e-9 or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > 1e-3:
+        found = placement_of(world)
+        if found is None:
             raise self.error("a node distorts or mirrors its Gaussians; apply its transform before exporting")
-        x, y, z, w = Rotation.from_matrix(linear / scale).as_quat(canonical=True).tolist()
-        dx, dy, dz = world[:3, 3].tolist()
-        return Placement((w, x, y, z), scale, (dx, dy, dz))
+        return found

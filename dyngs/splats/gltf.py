@@ -16,7 +16,7 @@ import torch
 
 from dyngs.conventions import SH_C0, num_sh_terms
 from dyngs.gaussians import Gaussians
-from dyngs.splats.glb_file import GlbFile, Placement
+from dyngs.splats.glb_file import GlbFile
 from dyngs.splats.packing import logit
 from dyngs.splats.rotation import turned
 from dyngs.splats.splat_file import SplatFile, unit_rotations
@@ -35,7 +35,8 @@ def read_gltf(path: Path) -> SplatFile:
     file = GlbFile(path)
     found: list[Gaussians] = []
     for primitive, placement in file.primitives(EXTENSION):
-        found.append(_placed(_gaussians(file, primitive), placement))
+        own = _gaussians(file, primitive)
+        found.append(turned(own, placement.rotation, placement.scale, placement.shift_tensor))
     if not found:
         raise file.error(f"holds no Gaussians ({EXTENSION})")
     degree = min(g.sh_degree for g in found)
@@ -139,8 +140,3 @@ def _gaussians(file: GlbFile, primitive: dict[str, Any]) -> Gaussians:
         logit_opacities=torch.from_numpy(logit(opacities)),
         sh=torch.from_numpy(np.stack(terms, axis=1)),
     )
-
-
-def _placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
-    shift = torch.tensor(placement.shift, dtype=torch.float64, device="cpu")
-    return turned(gaussians, placement.rotation, placement.scale, shift if bool(shift.any()) else None)
