@@ -1,4 +1,4 @@
-"""``dyngs export``: write a run as files: Gaussians in many formats, tracks, an avatar, or one small .dyngs file."""
+"""``dyngs export``: write a run as files: Gaussians in many formats, tracks, an avatar, one small .dyngs file, or a page."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from dyngs.export.run_to_splats import Part
     from dyngs.runs.checkpoint import LoadedRun
 
-_OTHER_SUFFIXES = {".npz": "tracks", ".safetensors": "avatar", ".dyngs": "dyngs"}
+_OTHER_SUFFIXES = {".npz": "tracks", ".safetensors": "avatar", ".dyngs": "dyngs", ".html": "html"}
 
 _EPILOG = """\
 examples:
@@ -27,6 +27,7 @@ examples:
   dyngs export runs/ann --format avatar --out ann.safetensors     a person as one file, for `render` and `export`
   dyngs export runs/dance --format tracks --dynamic               positions of all moving Gaussians over time, as .npz
   dyngs export runs/dance --format dyngs --out dance_export       a small file, for `eval`, `render` and `export`
+  dyngs export runs/dance --out dance.html                        a page that plays in any browser, offline
 """
 
 
@@ -34,9 +35,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``export`` to the commands."""
     parser = commands.add_parser(
         "export",
-        help="write a run as .ply, .spz, .glb and the like, tracks, avatar or small .dyngs file",
+        help="write a run as .ply, .spz, .glb and the like, tracks, avatar, small .dyngs file or page",
         description="Write the Gaussians of a run as files that viewers and editors read, as tracks of their centres, "
-        "as one small .dyngs file, or a person as an avatar file.",
+        "as one small .dyngs file, as a page that plays by itself, or a person as an avatar file.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -44,7 +45,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--format",
         type=_format,
-        choices=(*SPLAT_FORMATS, "tracks", "dyngs", "avatar"),
+        choices=(*SPLAT_FORMATS, "tracks", "dyngs", "avatar", "html"),
         help="file format (default: what the suffix of --out names, else ply)",
     )
     parser.add_argument(
@@ -79,11 +80,14 @@ def _format(text: str) -> str:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the files and print where they are and how large."""
+    from dyngs.cli.export_html import export_page
     from dyngs.export.avatar import read_avatar
     from dyngs.runs.checkpoint import load_run
 
     arguments.run_dir = run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
+    if kind == "html":
+        return export_page(arguments)
     is_file = is_avatar_file(arguments.run_dir)
     if is_file and (arguments.out is None or kind in ("dyngs", "avatar")):
         raise DyngsError(f"{arguments.run_dir}: an avatar file is exported as Gaussians or tracks, with --out PATH")

@@ -176,7 +176,7 @@ class ControlNodes(NetworkField):
         """
         self.nodes_for(means)
         old, times = self.buffers["positions"], torch.linspace(0, 1, COMPARED_TIMES, device="cpu").tolist()
-        paths = torch.cat([old + self._at(time).means.detach() for time in times], dim=1)
+        paths = torch.cat([old + self.at(time).means.detach() for time in times], dim=1)
         kept = (
             spread_out(paths, nodes, paths[:0]).sort().values
             if nodes < len(old)
@@ -215,8 +215,8 @@ class ControlNodes(NetworkField):
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """See ``DeformationField.offsets``; differentiable in ``means``, which nodes turn about themselves."""
         if not len(means):  # whatever nodes there are
-            return self._at(time).select(slice(0))
-        nodes, now = self.nodes_for(means), self._at(time)
+            return self.at(time).select(slice(0))
+        nodes, now = self.nodes_for(means), self.at(time)
         others, binding = self.buffers.get("others"), self.parameters.get("binding")
         if rows is not None:
             nodes, means = nodes.followed_by(rows), means.index_select(0, rows)
@@ -237,7 +237,7 @@ class ControlNodes(NetworkField):
             bend = self.parameters["means"].diff(n=2, dim=1) / self.buffers["radii"][:, None, None]
             penalties["node acceleration"] = self.options.smoothness * bend.square().mean()
         if self.options.rigidity:
-            penalties["node rigidity"] = self.options.rigidity * self._strain(self._at(time))
+            penalties["node rigidity"] = self.options.rigidity * self._strain(self.at(time))
         if self.has_groups:
             penalties["node residuals"] = RESIDUALS * self._residual(self._local(time))
         return penalties
@@ -267,7 +267,7 @@ class ControlNodes(NetworkField):
         changed = self.parameters["means"].detach() + spline_changes(nodes, nodes.weights(means), seen, self.num_pieces)
         return self.with_parameters(self.parameters.restored(tensors_of(self.parameters.state()) | {"means": changed}))
 
-    def _at(self, time: float) -> Offsets:
+    def at(self, time: float) -> Offsets:
         """Return the nodes' offsets at ``time``."""
         local = self._local(time)
         if not self.has_groups:
@@ -333,7 +333,7 @@ class ControlNodes(NetworkField):
         nodes, pieces = self.nodes_for(means), round(GROUP_PIECES_PER_TIME * self.setup.num_times)
         num_points = min(max(self.num_pieces, pieces), MAX_KEY_TIMES) + SPAN - 1
         times = torch.linspace(0, 1, 2 * num_points, device="cpu")
-        now = [self._at(float(time)) for time in times]
+        now = [self.at(float(time)) for time in times]
         paths = nodes.positions.double() + torch.stack([x.means for x in now]).double()
         quats = torch.stack([x.quats for x in now if x.quats is not None]).double()
         counts = 1.0 + torch.bincount(nodes.followed[:, 0], minlength=len(nodes.positions)).double()

@@ -144,6 +144,11 @@ class DynamicScene(Scene):
         return _Part(gaussians.picked(active), std, means, asked, rows)
 
 
+def field_scene_of(scene: Scene) -> DynamicScene | None:
+    """Return ``scene`` if a deformation field moves it, None for any other scene."""
+    return scene if isinstance(scene, DynamicScene) and not scene.is_still else None
+
+
 @dataclass(frozen=True)
 class _Part:
     """Gaussians drawn around a time.

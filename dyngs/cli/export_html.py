@@ -1,0 +1,40 @@
+"""``dyngs export --format html``: a run as one page that plays in a browser by itself."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from dyngs.cli.arguments import is_avatar_file, print_notes
+from dyngs.errors import DyngsError
+
+_UNFIT = {
+    "times": "the page plays the whole clip",
+    "static": "the page shows the whole scene",
+    "dynamic": "the page shows the whole scene",
+    "max_change": "it goes with --format dyngs",
+}
+
+
+def export_page(arguments: argparse.Namespace) -> int:
+    """Write the page of a run or an avatar file, and print where it is and how large.
+
+    Raises:
+        DyngsError: an option that does not go with a page, no run there, or a file that cannot be written.
+    """
+    from dyngs.output.page_of_run import PageOptions, write_run_page
+
+    for name, reason in _UNFIT.items():
+        if getattr(arguments, name, None) not in (None, False):
+            raise DyngsError(f"--{name.replace('_', '-')} does not go with --format html: {reason}")
+    source: Path = arguments.run_dir
+    if arguments.out is None and is_avatar_file(source):
+        raise DyngsError(f"{source}: where to? Give --out FILE.html")
+    out: Path = arguments.out or source / "scene.html"
+    if out.suffix.lower() not in (".html", ".htm") or out.is_dir():
+        raise DyngsError(f"{out}: --format html writes one file; give --out {out.with_suffix('.html')}")
+    options = PageOptions(motion=arguments.motion, time=0.0 if arguments.time is None else arguments.time)
+    written, notes = write_run_page(source, out, options)
+    print_notes(notes)
+    print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); it plays in any browser with WebGL 2, offline")
+    return 0

@@ -1,0 +1,137 @@
+"""Motion as splines of a few drivers, which a program without dyngs can play.
+
+A driver is a control node that several Gaussians follow, or the own one of each Gaussian where a field has no nodes.
+
+Local letters: M moving Gaussians, S drivers, P control points, B drivers that one Gaussian follows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyngs.deform.control_nodes import ControlNodes
+from dyngs.deform.field import DeformationField, Offsets
+from dyngs.deform.lifetimes import SIZES
+from dyngs.deform.nodes import FOLLOWED
+from dyngs.deform.rigid_groups import is_alone
+from dyngs.deform.spline_fit import SPAN, spline_basis
+
+SAMPLES_PER_PIECE = 3
+"""Times per piece at which a motion is looked at."""
+FEWEST_PIECES, MOST_PIECES = 8, 256
+CHECKED = 0.99
+"""Quantile of the places' errors that a fit keeps within its tolerance."""
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Offsets of S drivers, uniform cubic B-splines over the clip, and who follows them.
+
+    Attributes:
+        heads: control points (S, P, size) by attribute of ``Offsets``; always "means".
+        pivots: (S, 3) places that drivers turn about; None: S = M, and each Gaussian has its own, about itself.
+        followed: (M, B) drivers of each Gaussian, B = 4, or 8 where some follow two rigid groups; None as above.
+        shares: (M, B) of theirs, rows sum to 1; None as above.
+        lives: (M, 5) velocity, world units per clip, middle and span of each Gaussian's time window; or None.
+        error: of a driver's place: the quantile ``CHECKED``, in world units.
+    """
+
+    heads: dict[str, Tensor]
+    pivots: Tensor | None = None
+    followed: Tensor | None = None
+    shares: Tensor | None = None
+    lives: Tensor | None = None
+    error: float = 0.0
+
+
+@torch.no_grad()
+def curves_of(field: DeformationField, means: Tensor, num_times: int, tolerance: float) -> Curves:
+    """Return the motion of ``means`` (M, 3) as splines.
+
+    Args:
+        field: that moves them.
+        means: (M, 3) canonical, of all moving Gaussians in order.
+        num_times: distinct training times.
+        tolerance: world units that the fit of a place may be off, where it is not exact.
+    """
+    match field:
+        case ControlNodes():
+            return _curves_of_nodes(field, means, tolerance)
+        case _:
+            heads, error = fitted_curves(lambda time: field.offsets(means, time), num_times, tolerance)
+            return Curves(heads, error=error)
+
+
+def fitted_curves(
+    offsets_at: Callable[[float], Offsets], num_times: int, tolerance: float
+) -> tuple[dict[str, Tensor], float]:
+    """Return control points (S, P, size), by attribute, of the splines nearest to offsets, and the error of places.
+
+    The number of pieces is doubled until the error is within ``tolerance``, or there are as many as training times.
+    """
+    pieces = FEWEST_PIECES
+    most = min(max(num_times - 1, FEWEST_PIECES), MOST_PIECES)
+    while True:
+        heads = _fit(offsets_at, pieces)
+        error = _error(heads["means"], offsets_at, pieces)
+        if error <= tolerance or pieces >= most:
+            return heads, error
+        pieces = min(2 * pieces, most)
+
+
+def _fit(offsets_at: Callable[[float], Offsets], pieces: int) -> dict[str, Tensor]:
+    """Return the least-squares fit with so many pieces."""
+    count = SAMPLES_PER_PIECE * pieces + 1
+    times = torch.linspace(0, 1, count, dtype=torch.float64, device="cpu")
+    solver = torch.linalg.pinv(spline_basis(times, pieces)).float()  # (P, count)
+    sums: dict[str, Tensor] = {}
+    for time, shares in zip(times.tolist(), solver.T, strict=True):
+        for name, x in vars(offsets_at(time)).items():
+            if x is not None:
+                rows = x.reshape(len(x), 1, -1)
+                sums.setdefault(name, rows.new_zeros(len(x), pieces + SPAN - 1, rows.shape[2]))
+                sums[name] += shares[:, None] * rows
+    return sums
+
+
+def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) -> float:
+    """Return the quantile ``CHECKED`` of the distances between the splines and the places, between fitted times."""
+    times = (torch.arange(pieces, dtype=torch.float64, device="cpu") + 0.5) / pieces
+    apart = [
+        (torch.einsum("p,spd->sd", shares.float(), points) - offsets_at(time).means).norm(dim=1)
+        for time, shares in zip(times.tolist(), spline_basis(times, pieces), strict=True)
+    ]
+    found = torch.stack(apart).amax(0)
+    return float(found.sort().values[int(CHECKED * (len(found) - 1))]) if len(found) else 0.0
+
+
+def _curves_of_nodes(field: ControlNodes, means: Tensor, tolerance: float) -> Curves:
+    """Return the splines of control nodes: exact, but where rigid groups carry them along, whose turns are fitted."""
+    nodes = field.nodes_for(means)
+    if field.has_groups:
+        heads, error = fitted_curves(field.at, 2 * MOST_PIECES, tolerance)
+    else:
+        heads, error = _fit(field.at, field.num_pieces), 0.0
+    followed, shares = _padded(nodes.followed, nodes.weights(means))
+    others, binding = field.buffers.get("others"), field.parameters.get("binding")
+    if others is not None and binding is not None:
+        torn = ~is_alone(binding)
+        second = torch.where(torn, torch.sigmoid(binding[:, 0]), 0.0)[:, None]
+        other, weights = _padded(others, replace(nodes, followed=others).weights(means))
+        followed = torch.cat([followed, other], dim=1)
+        shares = torch.cat([(1 - second) * shares, second * weights], dim=1)
+    lives = None
+    if field.has_lives:
+        center, log_span, velocity = (field.parameters[name] for name in SIZES)
+        lives = torch.cat([velocity, center, log_span.exp()], dim=1)
+    return Curves(heads, nodes.positions, followed, shares, lives, error)
+
+
+def _padded(followed: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
+    """Return both with ``FOLLOWED`` columns; shares of added ones are 0."""
+    more = FOLLOWED - followed.shape[1]
+    return torch.nn.functional.pad(followed, (0, more)), torch.nn.functional.pad(shares, (0, more))

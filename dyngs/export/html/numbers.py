@@ -1,0 +1,158 @@
+"""The numbers of a scene that its page draws: Gaussians, what moves them, and what colours them.
+
+Local letters: N Gaussians, M of them moving, J joints, F frames of a clip.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dyngs.colour.network import ColourNetwork
+from dyngs.deform.curves import Curves, curves_of, fitted_curves
+from dyngs.deform.field import Offsets
+from dyngs.deform.scene import DynamicScene, field_scene_of
+from dyngs.export.html.lists import Lists
+from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.posing import frame_pose, rest_offsets
+from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.scene import Scene
+from dyngs.storage.order import storage_order
+
+BONES = 8
+"""Bones that a Gaussian follows on the page."""
+MOST_LOGIT = 15.0
+"""Opacities beyond that of this logit are 1 to seven digits."""
+
+
+def add_scene(scene: Scene, lists: Lists, tolerance: float) -> dict[str, Any]:
+    """Add the numbers of a scene to ``lists`` and return what the page needs to know about them.
+
+    Args:
+        scene: N Gaussians.
+        lists: to be added to.
+        tolerance: world units that a place may be off where motion is fitted.
+    """
+    person, moved = avatar_of(scene), field_scene_of(scene)
+    if person is not None:
+        order = torch.from_numpy(storage_order(_numpy(scene.gaussians.means), np.arange(len(scene))))
+        gaussians, told = scene.gaussians.select(order), _add_person(person, order, lists, tolerance)
+    elif moved is not None:
+        order = torch.from_numpy(storage_order(_numpy(scene.gaussians.means), moved.moving.numpy()))
+        gaussians, told = scene.gaussians.select(order), _add_motion(moved, order, lists, tolerance)
+    else:
+        still = scene.at(None)
+        order = torch.from_numpy(storage_order(_numpy(still.means), np.zeros(0, dtype=np.int64)))
+        gaussians, told = still.select(order), {}
+    told |= _add_gaussians(gaussians.detach(), lists, with_rest=scene.colour is None)
+    if scene.colour is not None:
+        told["network"] = _add_network(scene.colour, lists)
+    return told | {"count": len(scene), "frames": len(scene.times), "moves": not scene.is_still}
+
+
+def _add_gaussians(gaussians: Gaussians, lists: Lists, *, with_rest: bool) -> dict[str, Any]:
+    unit = torch.nn.functional.normalize(gaussians.quats, dim=1)
+    unit = torch.where(unit[:, :1] < 0, -unit, unit)
+    lists.quantised("means", _numpy(gaussians.means), 16)
+    lists.quantised("quats", _numpy(unit), 8)
+    lists.quantised("log_scales", _numpy(gaussians.log_scales), 8)
+    lists.quantised("logit_opacities", _numpy(gaussians.logit_opacities.clamp(-MOST_LOGIT, MOST_LOGIT)[:, None]), 8)
+    lists.quantised("base", _numpy(gaussians.sh[:, 0]), 8)
+    degree = gaussians.sh_degree if with_rest else 0
+    if degree:
+        lists.quantised("rest", _numpy(gaussians.sh[:, 1:].flatten(1)), 8)
+    return {"degree": degree}
+
+
+def _add_motion(scene: DynamicScene, order: Tensor, lists: Lists, tolerance: float) -> dict[str, Any]:
+    """Add the motion of a scene whose Gaussians are stored in ``order``, moving ones first."""
+    if scene.field is None:
+        return {}
+    place = torch.full((len(scene),), -1, device="cpu")
+    place[scene.moving] = torch.arange(len(scene.moving), device="cpu")
+    mine = place[order[: len(scene.moving)]]
+    curves = curves_of(scene.field, scene.gaussians.means[scene.moving], len(scene.times), tolerance)
+    told: dict[str, Any] = {"curves": _add_curves(curves, mine, lists)}
+    if scene.filter_std is not None:
+        lists.quantised("filter_std", _numpy(scene.filter_std[order][:, None]), 8)
+        told["filtered"] = True
+    if scene.masks is not None:
+        masks = scene.masks.select(order)
+        lists.exact("masks", masks.bits.numpy())
+        told["masks"] = {"times": list(masks.times)}
+    return told
+
+
+def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
+    """Add splines of drivers, with the Gaussians that follow them, or their own ones, in ``order`` (M,)."""
+    for name, points in curves.heads.items():
+        own = points if curves.pivots is not None else points[order]
+        lists.quantised(f"curve_{name}", _numpy(own.flatten(1)), 16 if name in ("means", "quats") else 8)
+    if curves.pivots is not None and curves.followed is not None and curves.shares is not None:
+        lists.exact("pivots", _numpy(curves.pivots))
+        lists.exact("followed", curves.followed[order].numpy().astype(np.uint16))
+        lists.exact("shares", _shares(curves.shares[order]))
+    if curves.lives is not None:
+        lists.exact("lives", _numpy(curves.lives[order]))
+    count, points, _ = curves.heads["means"].shape
+    return {"count": count, "points": points, "moving": len(order), "error": curves.error}
+
+
+def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float) -> dict[str, Any]:
+    """Add the skeleton and the clip of a person, and what a pose changes at rest."""
+    from scipy.spatial.transform import Rotation
+
+    clip, skeleton = scene.moves_as, scene.learned_skeleton
+    top = scene.weights[order].topk(min(BONES, scene.weights.shape[1]), dim=1)
+    more = BONES - top.values.shape[1]
+    boned, shares = (torch.nn.functional.pad(x, (0, more)) for x in (top.indices, top.values))
+    quats = Rotation.from_rotvec(_numpy(clip.poses).reshape(-1, 3)).as_quat(canonical=True)
+    quats = np.roll(quats, 1, axis=1).astype(np.float32).reshape(len(clip), -1)
+    lists.exact("boned", boned.numpy().astype(np.uint16))
+    lists.exact("boned_shares", _shares(shares))
+    lists.exact("joints", _numpy(skeleton.joints))
+    lists.exact("clip_times", _numpy(clip.times[:, None]))
+    lists.exact("clip_places", _numpy(torch.cat([clip.trans, clip.scale[:, None]], dim=1)))
+    lists.quantised("clip_quats", quats, 16)
+    told: dict[str, Any] = {"bones": {"parents": list(skeleton.parents)}}
+    if scene.shapes is not None or scene.pose_dirs is not None:
+        heads, error = fitted_curves(lambda time: _rest_offsets(scene, time), len(clip), tolerance)
+        told["curves"] = _add_curves(Curves(heads, error=error), order, lists)
+    return told
+
+
+def _rest_offsets(scene: HumanScene, time: float) -> Offsets:
+    posing = frame_pose(scene.moves_as.at(time), 0)
+    found = rest_offsets(scene.anchors, scene.weights, posing, scene.shapes, scene.pose_dirs)
+    return Offsets(torch.zeros_like(scene.gaussians.means) if found is None else found)
+
+
+def _add_network(network: ColourNetwork, lists: Lists) -> dict[str, Any]:
+    """Add the rows of all layers, padded to four columns, each layer's biases after its weights."""
+    widest = max(max(layer.weight.shape) for layer in network.layers)
+    width = -(-widest // 4) * 4
+    first = -(-network.layers[0].weight.shape[1] // 4) * 4
+    parts: list[NDArray[np.float32]] = []
+    for i, layer in enumerate(network.layers):
+        rows = 3 if i == len(network.layers) - 1 else width
+        weight = np.zeros((rows, first if i == 0 else width), dtype=np.float32)
+        weight[: layer.weight.shape[0], : layer.weight.shape[1]] = _numpy(layer.weight.detach())
+        bias = np.zeros(-(-rows // 4) * 4, dtype=np.float32)
+        bias[: len(layer.bias)] = _numpy(layer.bias.detach())
+        parts += [weight.ravel(), bias]
+    lists.exact("network", np.concatenate(parts).reshape(-1, 4))
+    told = {"layers": len(network.layers), "width": width, "first": first, "box": network.box.flatten().tolist()}
+    return told | {"time": network.sees_time, "normals": network.sees_normals}
+
+
+def _shares(shares: Tensor) -> NDArray[np.uint8]:
+    """Return shares in [0, 1] as 8 bits; the page makes their sums 1 again."""
+    return (255 * shares).round().numpy().astype(np.uint8)
+
+
+def _numpy(x: Tensor) -> NDArray[np.float32]:
+    return x.detach().float().numpy()

@@ -1,0 +1,304 @@
+#version 300 es
+// One Gaussian a vertex, in the order of drawing: moved to the time, projected, coloured. What comes out are the
+// corners of its square: transform feedback captures them for splat.vert.glsl, so that a Gaussian is computed once and
+// not four times.
+precision highp float;
+precision highp int;
+precision highp sampler2D;
+precision highp usampler2D;
+
+in uint aIndex;
+
+// Lists, in textures ROW texels wide. Of each Gaussian:
+uniform sampler2D uGaussians;    // 4 texels: place, logit; quaternion wxyz; log scales, 3D filter; base harmonic
+uniform sampler2D uHarmonics;    // HARMONIC_TEXELS: the other harmonics, three colours a term
+uniform usampler2D uBoned;       // 2: its bones
+uniform sampler2D uBonedShares;  // 2: their shares
+// Of each Gaussian that moves:
+uniform usampler2D uDriven;      // SETS: its drivers
+uniform sampler2D uDrivenShares; // SETS: their shares
+uniform sampler2D uLives;        // 2: velocity and middle; span
+// Of each driver, each bone, and the network:
+uniform sampler2D uDrivers;      // 6: rows of the affine map; changes of quaternion; of log scales and logit; of colour
+uniform sampler2D uBones;        // 3: rows of the affine map
+uniform sampler2D uNetwork;      // rows of the layers' weights, four a texel, then the biases
+
+uniform mat4 uCamFromWorld;
+uniform vec4 uIntrinsics;  // fx fy cx cy, px
+uniform vec2 uSize;        // px
+uniform vec3 uEye;
+uniform vec4 uLimits;      // eps2d px^2, near, least alpha, 1 where opacities are compensated for eps2d
+uniform float uTime;
+uniform vec4 uBody;        // translation and scale of a body, applied after its bones
+uniform mat3 uTurn;        // of a body from rest to the world
+uniform vec3 uBox[2];      // centre and half sides of the network's box
+
+// Corners: place in clip space, and in standard deviations from the centre. Outside the picture where nothing is seen.
+out vec4 vCorner0;
+out vec4 vColor0;  // rgb, opacity
+out vec4 vCorner1;
+out vec4 vColor1;
+out vec4 vCorner2;
+out vec4 vColor2;
+out vec4 vCorner3;
+out vec4 vColor3;
+
+const float FARTHEST = 1e10;
+
+vec4 at(sampler2D list, int place) { return texelFetch(list, ivec2(place & (ROW - 1), place / ROW), 0); }
+uvec4 at(usampler2D list, int place) { return texelFetch(list, ivec2(place & (ROW - 1), place / ROW), 0); }
+
+mat3 matrixOf(vec4 q) {
+  float size = length(q);
+  q = size > 0.0 ? q / size : vec4(1.0, 0.0, 0.0, 0.0);
+  float w = q.x, x = q.y, y = q.z, z = q.w;
+  return mat3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
+              2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
+              2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
+}
+
+vec4 product(vec4 a, vec4 b) {
+  return vec4(a.x * b.x - dot(a.yzw, b.yzw), a.x * b.yzw + b.x * a.yzw + cross(a.yzw, b.yzw));
+}
+
+// The rotation nearest to a matrix: Newton's iteration for its polar factor (Higham 1986).
+mat3 nearestRotation(mat3 m) {
+  for (int i = 0; i < 4; ++i) m = 0.5 * (m + transpose(inverse(m)));
+  return m;
+}
+
+struct Gaussian {
+  vec3 mean;
+  float logit;
+  vec4 quat;
+  vec3 logScales;
+  float filterStd;
+  vec3 base;
+  vec3 rest;  // place before anything moves
+  mat3 map;   // that its axes go through
+  mat3 turn;  // that its colours follow
+};
+
+Gaussian stored(int i) {
+  vec4 a = at(uGaussians, 4 * i), b = at(uGaussians, 4 * i + 1), c = at(uGaussians, 4 * i + 2);
+  return Gaussian(a.xyz, a.w, b, c.xyz, c.w, at(uGaussians, 4 * i + 3).rgb, a.xyz, mat3(1.0), mat3(1.0));
+}
+
+#if SETS
+// Changes by the drivers of one set of four.
+void driveBy(int place, vec3 mean, out vec3 moved, out vec4 quat, out vec4 sizes, out vec3 color) {
+  uvec4 drivers = at(uDriven, place);
+  vec4 shares = at(uDrivenShares, place);
+  moved = vec3(0.0); quat = vec4(0.0); sizes = vec4(0.0); color = vec3(0.0);
+  for (int k = 0; k < 4; ++k) {
+    int d = 6 * int(drivers[k]);
+    float share = shares[k];
+    vec4 point = vec4(mean, 1.0);
+    for (int row = 0; row < 3; ++row) moved[row] += share * dot(at(uDrivers, d + row), point);
+    quat += share * at(uDrivers, d + 3);
+    sizes += share * at(uDrivers, d + 4);
+    color += share * at(uDrivers, d + 5).rgb;
+  }
+}
+
+void drive(int i, inout Gaussian g) {
+  vec3 moved, color;
+  vec4 quat, sizes;
+  driveBy(SETS * i, g.mean, moved, quat, sizes, color);
+#if SETS > 1  // of another rigid group: q and -q are one rotation
+  vec3 otherMoved, otherColor;
+  vec4 otherQuat, otherSizes;
+  driveBy(SETS * i + 1, g.mean, otherMoved, otherQuat, otherSizes, otherColor);
+  moved += otherMoved;
+  quat += dot(quat, otherQuat) < 0.0 ? -otherQuat : otherQuat;
+  sizes += otherSizes;
+  color += otherColor;
+#endif
+  g.mean = moved;
+  g.quat = product(quat, g.quat);
+  g.logScales += sizes.xyz;
+  g.logit += sizes.w;
+  g.base += color;
+#if LIVES
+  vec4 life = at(uLives, 2 * i);
+  float since = uTime - life.w, far = since / at(uLives, 2 * i + 1).x;
+  g.mean += life.xyz * since;
+  g.logit -= 0.5 * far * far;
+#endif
+}
+#endif
+
+#if BONES
+void bend(int i, inout Gaussian g) {
+  vec4 rows[3] = vec4[3](vec4(0.0), vec4(0.0), vec4(0.0));
+  for (int s = 0; s < 2; ++s) {
+    uvec4 bones = at(uBoned, 2 * i + s);
+    vec4 shares = at(uBonedShares, 2 * i + s);
+    for (int k = 0; k < 4; ++k)
+      for (int row = 0; row < 3; ++row) rows[row] += shares[k] * at(uBones, 3 * int(bones[k]) + row);
+  }
+  vec4 point = vec4(g.mean, 1.0);
+  g.mean = uBody.w * vec3(dot(rows[0], point), dot(rows[1], point), dot(rows[2], point)) + uBody.xyz;
+  g.map = transpose(mat3(rows[0].xyz, rows[1].xyz, rows[2].xyz));
+#if DEGREE || LAYERS
+  g.turn = nearestRotation(g.map);
+#endif
+  g.map *= uBody.w;
+}
+#endif
+
+vec3 harmonics(int i, vec3 base, vec3 d) {
+  vec3 color = 0.5 + 0.28209479177387814 * base;
+#if DEGREE > 0
+  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+  float basis[(DEGREE + 1) * (DEGREE + 1) - 1];
+  basis[0] = -0.4886025119029199 * y;
+  basis[1] = 0.4886025119029199 * z;
+  basis[2] = -0.4886025119029199 * x;
+#if DEGREE > 1
+  basis[3] = 1.0925484305920792 * x * y;
+  basis[4] = -1.0925484305920792 * y * z;
+  basis[5] = 0.31539156525252005 * (2.0 * zz - xx - yy);
+  basis[6] = -1.0925484305920792 * x * z;
+  basis[7] = 0.5462742152960396 * (xx - yy);
+#endif
+#if DEGREE > 2
+  basis[8] = -0.5900435899266435 * y * (3.0 * xx - yy);
+  basis[9] = 2.890611442640554 * x * y * z;
+  basis[10] = -0.4570457994644658 * y * (4.0 * zz - xx - yy);
+  basis[11] = 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy);
+  basis[12] = -0.4570457994644658 * x * (4.0 * zz - xx - yy);
+  basis[13] = 1.445305721320277 * z * (xx - yy);
+  basis[14] = -0.5900435899266435 * x * (xx - 3.0 * yy);
+#endif
+#if DEGREE > 3
+  basis[15] = 2.5033429417967046 * x * y * (xx - yy);
+  basis[16] = -1.7701307697799304 * y * z * (3.0 * xx - yy);
+  basis[17] = 0.9461746957575601 * x * y * (7.0 * zz - 1.0);
+  basis[18] = -0.6690465435572892 * y * z * (7.0 * zz - 3.0);
+  basis[19] = 0.10578554691520431 * (zz * (35.0 * zz - 30.0) + 3.0);
+  basis[20] = -0.6690465435572892 * x * z * (7.0 * zz - 3.0);
+  basis[21] = 0.47308734787878004 * (xx - yy) * (7.0 * zz - 1.0);
+  basis[22] = -1.7701307697799304 * x * z * (xx - 3.0 * yy);
+  basis[23] = 0.6258357354491761 * (xx * (xx - 3.0 * yy) - yy * (3.0 * xx - yy));
+#endif
+  const int COUNT = (DEGREE + 1) * (DEGREE + 1) - 1;
+  float values[4 * HARMONIC_TEXELS];
+  for (int t = 0; t < HARMONIC_TEXELS; ++t) {
+    vec4 texel = at(uHarmonics, HARMONIC_TEXELS * i + t);
+    for (int k = 0; k < 4; ++k) values[4 * t + k] = texel[k];
+  }
+  for (int k = 0; k < COUNT; ++k) color += basis[k] * vec3(values[3 * k], values[3 * k + 1], values[3 * k + 2]);
+#endif
+  return max(color, 0.0);
+}
+
+#if LAYERS
+// What the colour network adds to the base colour; see dyngs/ops/shading.py and dyngs/colour/network.py.
+vec3 shaded(Gaussian g, vec3 d) {
+  vec3 base = 0.5 + 0.28209479177387814 * g.base;
+  vec3 place = g.mean, normal;
+  mat3 axes = g.turn * matrixOf(g.quat);
+  normal = axes[0];
+  float least = g.logScales.x;
+  if (g.logScales.y < least) { least = g.logScales.y; normal = axes[1]; }
+  if (g.logScales.z < least) normal = axes[2];
+#if BONES
+  place = g.rest;
+  d = d * uTurn;
+  normal = normal * uTurn;
+#endif
+  place = (place - uBox[0]) / uBox[1];
+  float far = max(1.0, length(place));
+  place *= (2.0 - 1.0 / far) / far;
+  float now[WIDTH], next[WIDTH];
+  for (int k = 0; k < WIDTH; ++k) now[k] = 0.0;
+  for (int k = 0; k < 3; ++k) { now[k] = place[k]; now[3 + k] = d[k]; }
+  int count = 6;
+#if SEES_NORMALS
+  float cosine = dot(normal, d);
+  now[count++] = abs(cosine);
+  vec3 mirrored = d - 2.0 * cosine * normal;
+  for (int k = 0; k < 3; ++k) now[count++] = mirrored[k];
+#endif
+  for (int k = 0; k < 3; ++k) now[count++] = base[k] - 0.5;
+#if SEES_TIME
+  now[count] = 2.0 * uTime - 1.0;
+#endif
+  int place4 = 0;  // texel of the network
+  for (int layer = 0; layer < LAYERS; ++layer) {
+    int columns = layer == 0 ? FIRST : WIDTH, rows = layer == LAYERS - 1 ? 3 : WIDTH;
+    for (int row = 0; row < rows; ++row) {
+      vec4 sum = vec4(0.0);
+      for (int k = 0; k < columns; k += 4)
+        sum += at(uNetwork, place4++) * vec4(now[k], now[k + 1], now[k + 2], now[k + 3]);
+      next[row] = sum.x + sum.y + sum.z + sum.w;
+    }
+    for (int row = 0; row < rows; ++row) {
+      float value = next[row] + at(uNetwork, place4 + row / 4)[row & 3];
+      now[row] = layer == LAYERS - 1 ? value : max(value, 0.0);
+    }
+    place4 += (rows + 3) / 4;
+  }
+  return max(base + vec3(now[0], now[1], now[2]), 0.0);
+}
+#endif
+
+vec4 cornerAt(vec2 place, vec2 from) {
+  vec2 clip = place / uSize * 2.0 - 1.0;
+  return vec4(clip.x, -clip.y, from);
+}
+
+void main() {
+  gl_Position = vec4(0.0);
+  vCorner0 = vCorner1 = vCorner2 = vCorner3 = vec4(2.0, 2.0, 0.0, 0.0);
+  vColor0 = vColor1 = vColor2 = vColor3 = vec4(0.0);
+  int i = int(aIndex);
+  Gaussian g = stored(i);
+#if SETS
+  if (i < MOVING) drive(i, g);
+#endif
+#if BONES
+  bend(i, g);
+#endif
+  vec3 p = (uCamFromWorld * vec4(g.mean, 1.0)).xyz;
+  if (!(p.z > uLimits.y && p.z < FARTHEST)) return;
+  vec3 scales = exp(g.logScales);
+  float opacity = 1.0 / (1.0 + exp(-g.logit));
+#if FILTERED
+  vec3 wider = sqrt(scales * scales + g.filterStd * g.filterStd);
+  vec3 shares = scales / wider;
+  opacity *= shares.x * shares.y * shares.z;
+  scales = wider;
+#endif
+  vec2 f = uIntrinsics.xy, c = uIntrinsics.zw, margin = 0.15 * uSize / f;
+  vec2 tangent = clamp(p.xy / p.z, -c / f - margin, (uSize - c) / f + margin);
+  mat3 half3 = mat3(uCamFromWorld) * g.map * matrixOf(g.quat);
+  half3 = mat3(half3[0] * scales.x, half3[1] * scales.y, half3[2] * scales.z);
+  mat3 rows = transpose(half3);
+  vec3 u = f.x / p.z * (rows[0] - tangent.x * rows[2]), v = f.y / p.z * (rows[1] - tangent.y * rows[2]);
+  vec3 across = cross(u, v);
+  float bare = dot(across, across), a = dot(u, u), b = dot(u, v), d = dot(v, v), eps = uLimits.x;
+  float det = bare + eps * (a + d) + eps * eps;
+  if (uLimits.w > 0.5) opacity *= sqrt(bare / det);
+  if (!(opacity > uLimits.z)) return;
+  a += eps; d += eps;
+  float reach = 2.0 * log(opacity / uLimits.z);
+  vec2 center = f * p.xy / p.z + c, extent = ceil(sqrt(reach * vec2(a, d)));
+  if (any(lessThanEqual(center + extent, vec2(0.0))) || any(greaterThanEqual(center - extent, uSize))) return;
+  float longer = 0.5 * (a + d) + length(vec2(0.5 * (a - d), b));
+  vec2 along = abs(b) > 1e-6 * longer ? normalize(vec2(b, longer - a)) : (a >= d ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
+  vec3 toward = normalize(g.mean - uEye);
+#if LAYERS
+  vec3 color = shaded(g, toward);
+#else
+  vec3 color = harmonics(i, g.base, toward * g.turn);
+#endif
+  float radius = sqrt(reach);
+  vec2 far = radius * along * sqrt(longer), aside = radius * vec2(-along.y, along.x) * sqrt(det / longer);
+  vCorner0 = cornerAt(center - far - aside, vec2(-radius, -radius));
+  vCorner1 = cornerAt(center + far - aside, vec2(radius, -radius));
+  vCorner2 = cornerAt(center - far + aside, vec2(-radius, radius));
+  vCorner3 = cornerAt(center + far + aside, vec2(radius, radius));
+  vColor0 = vColor1 = vColor2 = vColor3 = vec4(color, opacity);
+}

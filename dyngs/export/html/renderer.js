@@ -1,0 +1,279 @@
+// Drawing with WebGL 2: project.glsl computes every Gaussian once, splat.*.glsl blends their squares far to near.
+
+const ROW = 2048; // texels of a texture that holds a list
+const BATCH = 16384; // squares of one call: their corners are numbered by 16 bits
+const CORNERS = [0, 1, 2, 3].flatMap((k) => [`vCorner${k}`, `vColor${k}`]);
+const CORNER_BYTES = 32;
+
+class Renderer {
+  constructor(canvas, scene, motion) {
+    const gl = canvas.getContext("webgl2", {
+      antialias: false, depth: false, alpha: false, powerPreference: "high-performance",
+    });
+    if (!gl) throw new Error("it needs WebGL 2, which this browser does not offer (is hardware acceleration off?)");
+    Object.assign(this, { canvas, gl, scene, motion });
+    // Eight bits are few for hundreds of layers: blended in half floats where they can be drawn to.
+    this.deep = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
+    this.order = new DepthOrder(scene.count);
+    this.limit = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    this.textures = [];
+    this.prepareLists();
+    this.project = this.program("project.glsl", null, CORNERS, this.definitions());
+    this.splat = this.program("splat.vert.glsl", "splat.frag.glsl");
+    this.copy = this.program("copy.vert.glsl", "copy.frag.glsl");
+    this.prepareBuffers();
+    this.view = null;
+    this.size = [0, 0];
+  }
+
+  definitions() {
+    const { scene, motion } = this, network = scene.network;
+    const terms = (scene.degree + 1) ** 2 - 1;
+    return {
+      ROW,
+      DEGREE: scene.degree,
+      HARMONIC_TEXELS: Math.ceil((3 * terms) / 4),
+      SETS: motion.drivers ? Math.ceil(motion.perGaussian / 4) : 0,
+      MOVING: motion.moving,
+      LIVES: motion.lives ? 1 : 0,
+      BONES: motion.bones ? 1 : 0,
+      FILTERED: scene.filtered ? 1 : 0,
+      LAYERS: network ? network.layers : 0,
+      WIDTH: network ? network.width : 0,
+      FIRST: network ? network.first : 0,
+      SEES_NORMALS: network && network.normals ? 1 : 0,
+      SEES_TIME: network && network.time ? 1 : 0,
+    };
+  }
+
+  // A program of the shaders in the page; `captured`: what transform feedback takes, with nothing drawn.
+  program(vertex, fragment, captured, definitions = {}) {
+    const { gl } = this, program = gl.createProgram();
+    const lines = Object.entries(definitions).map(([name, value]) => `#define ${name} ${value}\n`).join("");
+    const nothing = "#version 300 es\nprecision lowp float;\nout vec4 color;\nvoid main() { color = vec4(0.0); }";
+    const texts = [textOf(vertex).trim(), fragment ? textOf(fragment).trim() : nothing];
+    [gl.VERTEX_SHADER, gl.FRAGMENT_SHADER].forEach((kind, i) => {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, texts[i].replace("#version 300 es\n", "#version 300 es\n" + (i ? "" : lines)));
+      gl.compileShader(shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS))
+        throw new Error(`${i ? fragment : vertex}: ${gl.getShaderInfoLog(shader)}`);
+      gl.attachShader(program, shader);
+    });
+    if (captured) gl.transformFeedbackVaryings(program, captured, gl.INTERLEAVED_ATTRIBS);
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS))
+      throw new Error(`${vertex}: ${gl.getProgramInfoLog(program)}`);
+    const places = {};
+    return { program, at: (name) => (places[name] ??= gl.getUniformLocation(program, name)) };
+  }
+
+  // A list of four numbers each as a texture: "32F", "16F", or whole numbers, "16UI" and "32UI".
+  list(name, values, kind) {
+    const { gl } = this, texels = Math.max(Math.ceil(values.length / 4), 1), height = Math.ceil(texels / ROW);
+    if (height > this.limit) throw new Error(`this scene is too large for this device: ${this.scene.count} Gaussians`);
+    const padded = new values.constructor(4 * ROW * height);
+    padded.set(values);
+    const texture = gl.createTexture(), whole = kind.endsWith("UI");
+    const entry = { name, texture, unit: this.textures.length, kind, padded, height, texels };
+    this.textures.push(entry);
+    gl.activeTexture(gl.TEXTURE0 + entry.unit);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    this.unfiltered();
+    const format = whole ? gl.RGBA_INTEGER : gl.RGBA;
+    const type = { "16UI": gl.UNSIGNED_SHORT, "32UI": gl.UNSIGNED_INT }[kind] || gl.FLOAT;
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl["RGBA" + kind], ROW, height, 0, format, type, padded);
+    return entry;
+  }
+
+  unfiltered() {
+    const { gl } = this;
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+      gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
+  }
+
+  refill(entry, values) {
+    const { gl } = this;
+    entry.padded.set(values);
+    gl.activeTexture(gl.TEXTURE0 + entry.unit);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, entry.height, gl.RGBA, gl.FLOAT, entry.padded);
+  }
+
+  prepareLists() {
+    const { scene, motion } = this, { lists, count } = scene;
+    const packed = new Float32Array(16 * count);
+    for (let i = 0; i < count; ++i) {
+      const at = 16 * i;
+      for (let k = 0; k < 3; ++k) {
+        packed[at + k] = lists.means[3 * i + k];
+        packed[at + 8 + k] = lists.log_scales[3 * i + k];
+        packed[at + 12 + k] = lists.base[3 * i + k];
+      }
+      packed[at + 3] = lists.logit_opacities[i];
+      packed[at + 11] = lists.filter_std ? lists.filter_std[i] : 0;
+      for (let k = 0; k < 4; ++k) packed[at + 4 + k] = lists.quats[4 * i + k];
+    }
+    this.list("uGaussians", packed, "32F");
+    if (scene.degree) {
+      const columns = 3 * ((scene.degree + 1) ** 2 - 1), width = 4 * Math.ceil(columns / 4);
+      const rest = new Float32Array(width * count);
+      for (let i = 0; i < count; ++i)
+        for (let k = 0; k < columns; ++k) rest[width * i + k] = lists.rest[columns * i + k];
+      this.list("uHarmonics", rest, "16F");
+    }
+    if (motion.drivers) this.prepareDrivers();
+    if (motion.bones) {
+      this.bones = this.list("uBones", motion.bones.values, "32F");
+      this.list("uBoned", motion.boned, "16UI");
+      this.list("uBonedShares", motion.bonedShares, "32F");
+    }
+    if (scene.network) this.list("uNetwork", lists.network, "32F");
+  }
+
+  prepareDrivers() {
+    const { motion } = this;
+    this.drivers = this.list("uDrivers", motion.drivers.values, "32F");
+    if (motion.perGaussian === 1) {
+      const own = new Uint32Array(4 * motion.moving), ones = new Float32Array(4 * motion.moving);
+      for (let i = 0; i < motion.moving; ++i) {
+        own[4 * i] = i;
+        ones[4 * i] = 1;
+      }
+      this.list("uDriven", own, "32UI");
+      this.list("uDrivenShares", ones, "32F");
+    } else {
+      this.list("uDriven", motion.followed, "16UI");
+      this.list("uDrivenShares", motion.shares, "32F");
+    }
+    if (motion.lives) {
+      const lives = new Float32Array(8 * motion.moving);
+      for (let i = 0; i < motion.moving; ++i) lives.set(motion.lives.subarray(5 * i, 5 * i + 5), 8 * i);
+      this.list("uLives", lives, "32F");
+    }
+  }
+
+  prepareBuffers() {
+    const { gl, scene } = this;
+    this.indices = gl.createBuffer();
+    this.projected = gl.createBuffer();
+    this.reading = gl.createVertexArray();
+    this.drawing = gl.createVertexArray();
+    this.feedback = gl.createTransformFeedback();
+    gl.bindVertexArray(this.reading);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
+    gl.bufferData(gl.ARRAY_BUFFER, 4 * scene.count, gl.DYNAMIC_DRAW);
+    const index = gl.getAttribLocation(this.project.program, "aIndex");
+    gl.enableVertexAttribArray(index);
+    gl.vertexAttribIPointer(index, 1, gl.UNSIGNED_INT, 4, 0);
+    // Not drawn as instances of one square: some drivers make a call of each.
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.projected);
+    gl.bufferData(gl.ARRAY_BUFFER, 4 * CORNER_BYTES * scene.count, gl.DYNAMIC_COPY);
+    this.cornerPlaces = ["aCorner", "aColor"].map((name) => gl.getAttribLocation(this.splat.program, name));
+    gl.bindVertexArray(this.drawing);
+    for (const place of this.cornerPlaces) gl.enableVertexAttribArray(place);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    const corners = new Uint16Array(6 * BATCH);
+    for (let i = 0; i < BATCH; ++i) corners.set([0, 1, 2, 2, 1, 3].map((k) => 4 * i + k), 6 * i);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    gl.bindBuffer(gl.ARRAY_BUFFER, null);
+    gl.disable(gl.DEPTH_TEST);
+    if (this.deep) {
+      this.picture = gl.createTexture();
+      this.target = gl.createFramebuffer();
+    }
+  }
+
+  resize(width, height) {
+    const { gl, canvas } = this;
+    if (width === this.size[0] && height === this.size[1]) return;
+    this.size = [width, height];
+    canvas.width = width;
+    canvas.height = height;
+    if (!this.deep) return;
+    gl.activeTexture(gl.TEXTURE0 + this.textures.length);
+    gl.bindTexture(gl.TEXTURE_2D, this.picture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, gl.HALF_FLOAT, null);
+    this.unfiltered();
+    for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, axis, gl.CLAMP_TO_EDGE);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture, 0);
+    if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) this.deep = false;
+  }
+
+  // Draws the scene at `time` from a camera: camFromWorld (16 numbers, row by row), intrinsics [fx, fy, cx, cy] px.
+  draw({ camFromWorld, intrinsics, width, height, time }) {
+    const { gl, scene, motion, order } = this;
+    this.resize(width, height);
+    const moved = motion.update(time);
+    if (moved && this.drivers) this.refill(this.drivers, motion.drivers.values);
+    if (moved && this.bones) this.refill(this.bones, motion.bones.values);
+    const axis = Array.from(camFromWorld.slice(8, 12));
+    if (moved || !this.axis || axis.some((x, i) => x !== this.axis[i])) {
+      this.axis = axis;
+      motion.depths(axis, order.depths);
+      this.kept = order.sort(scene.near, motion.seen());
+      gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
+      gl.bufferSubData(gl.ARRAY_BUFFER, 0, order.order, 0, this.kept);
+      gl.bindBuffer(gl.ARRAY_BUFFER, null);
+    }
+    this.projectAll(camFromWorld, intrinsics, time);
+    this.blendAll();
+  }
+
+  projectAll(pose, intrinsics, time) {
+    const { gl, scene, motion, project } = this, { at } = project;
+    gl.useProgram(project.program);
+    for (const entry of this.textures) gl.uniform1i(at(entry.name), entry.unit);
+    gl.uniformMatrix4fv(at("uCamFromWorld"), true, new Float32Array(pose));
+    gl.uniform4fv(at("uIntrinsics"), intrinsics);
+    gl.uniform2fv(at("uSize"), this.size);
+    const eye = [0, 1, 2].map((k) => -(pose[k] * pose[3] + pose[4 + k] * pose[7] + pose[8 + k] * pose[11]));
+    gl.uniform3fv(at("uEye"), eye);
+    gl.uniform4f(at("uLimits"), scene.eps2d, scene.near, scene.alphaMin, scene.antialiased ? 1 : 0);
+    gl.uniform1f(at("uTime"), time);
+    if (motion.bones) {
+      gl.uniform4fv(at("uBody"), motion.bones.body);
+      gl.uniformMatrix3fv(at("uTurn"), true, new Float32Array(motion.bones.rootTurn));
+    }
+    if (scene.network) gl.uniform3fv(at("uBox[0]"), scene.network.box);
+    gl.bindVertexArray(this.reading);
+    gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, this.feedback);
+    gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, this.projected);
+    gl.enable(gl.RASTERIZER_DISCARD);
+    gl.beginTransformFeedback(gl.POINTS);
+    gl.drawArrays(gl.POINTS, 0, this.kept);
+    gl.endTransformFeedback();
+    gl.disable(gl.RASTERIZER_DISCARD);
+    gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, null);
+    gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, null);
+  }
+
+  blendAll() {
+    const { gl, scene } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.deep ? this.target : null);
+    gl.viewport(0, 0, ...this.size);
+    gl.clearColor(...scene.background, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.useProgram(this.splat.program);
+    gl.uniform2fv(this.splat.at("uSize"), this.size);
+    gl.uniform1f(this.splat.at("uLeast"), scene.alphaMin);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.bindVertexArray(this.drawing);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.projected);
+    for (let first = 0; first < this.kept; first += BATCH) {
+      this.cornerPlaces.forEach((place, i) =>
+        gl.vertexAttribPointer(place, 4, gl.FLOAT, false, CORNER_BYTES, 4 * CORNER_BYTES * first + 16 * i));
+      gl.drawElements(gl.TRIANGLES, 6 * Math.min(BATCH, this.kept - first), gl.UNSIGNED_SHORT, 0);
+    }
+    gl.disable(gl.BLEND);
+    gl.bindBuffer(gl.ARRAY_BUFFER, null);
+    gl.bindVertexArray(null);
+    if (!this.deep) return;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.useProgram(this.copy.program);
+    gl.uniform1i(this.copy.at("uPicture"), this.textures.length);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+}

@@ -1,0 +1,284 @@
+"""Pages in a browser: that they play by themselves, show what dyngs draws, and obey."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser import Browser, Page, needs_browser
+from moving_scene import camera, moving_scene, still_scene
+from numpy.typing import NDArray
+from PIL import Image
+from scene_kinds import KINDS, onlooker, scene_of_kind
+from tiny_fields import tiny_options
+
+from dyngs.camera import Cameras
+from dyngs.config import ControlNodesField
+from dyngs.conventions import RasterizeMode
+from dyngs.deform.control_nodes import ControlNodes
+from dyngs.deform.field import FieldSetup
+from dyngs.deform.fields import new_field
+from dyngs.deform.rigid_groups import ALONE, fitted_splines
+from dyngs.deform.scene import DynamicScene
+from dyngs.export.html.page import SCRIPTS, SHADERS, Staging, WrittenPage, write_page
+from dyngs.gaussians import Gaussians
+from dyngs.metrics import psnr, ssim
+from dyngs.ops.quaternions import rotate
+from dyngs.rendering import RenderOptions
+from dyngs.scene import Scene
+from dyngs.static.scene import StaticScene
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with Browser() as started:
+        yield started
+
+
+def write(
+    scene: Scene, path: Path, view: Cameras, title: str = "a scene", options: RenderOptions | None = None
+) -> WrittenPage:
+    staging = Staging(title, (view,), (0.0, 0.0, 0.0), (0.0, -1.0, 0.0), WHITE, seconds=2.0)
+    return write_page(scene, options or scene.options, staging, path)
+
+
+def opened(browser: Browser, path: Path, width: int = 320, height: int = 240) -> Page:
+    page = browser.open(path.as_uri(), width, height)
+    page.wait_for("window.dyngs !== undefined")
+    page.evaluate("dyngs.player.toggle(false)")
+    return page
+
+
+def shown(page: Page, view: Cameras, time: float) -> torch.Tensor:
+    """What the page draws, (H, W, 3)."""
+    ((fx, _, cx), (_, fy, cy), _) = view.intrinsics[0].tolist()
+    asked = {"camFromWorld": view.cam_from_world[0].flatten().tolist(), "intrinsics": [fx, fy, cx, cy]}
+    asked |= {"width": view.width, "height": view.height, "time": time}
+    address: str = page.evaluate("view => dyngs.show(view)", asked)
+    picture = Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGB")
+    return torch.from_numpy(np.asarray(picture).astype(np.float32) / 255)
+
+
+def assert_alike(page: Page, scene: Scene, view: Cameras, options: RenderOptions, least: float = 38.0) -> None:
+    for time in (0.0, 0.4, 1.0):
+        truth = scene.render(view, time, options=options, background=torch.ones(3)).rgb[0].detach()
+        found = shown(page, view, time)
+        assert ssim(found, truth) > 0.95
+        assert psnr(found, truth) > least
+
+
+def large(view: Cameras, factor: int = 4) -> Cameras:
+    """The same view with more pixels."""
+    scale = torch.tensor([factor, factor, 1.0])[:, None]
+    return Cameras(view.cam_from_world, view.intrinsics * scale, view.width * factor, view.height * factor)
+
+
+@needs_browser
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_page_shows_what_dyngs_draws(kind: str, browser: Browser, tmp_path: Path) -> None:
+    scene, view = scene_of_kind(kind), large(onlooker())
+    write(scene, tmp_path / "page.html", view)
+    page = opened(browser, tmp_path / "page.html")
+    assert_alike(page, scene, view, scene.options)
+    assert page.errors == []
+    assert page.requests == [(tmp_path / "page.html").as_uri()]
+    page.close()
+
+
+@needs_browser
+@pytest.mark.parametrize("mode", list(RasterizeMode))
+def test_harmonics_and_modes(mode: RasterizeMode, browser: Browser, tmp_path: Path) -> None:
+    generator = torch.Generator().manual_seed(0)
+    count = 60
+    gaussians = Gaussians(
+        torch.rand(count, 3, generator=generator) * 2 - 1,
+        torch.randn(count, 4, generator=generator),
+        torch.rand(count, 3, generator=generator) * 3 - 4.5,
+        torch.randn(count, generator=generator) * 2,
+        torch.randn(count, 25, 3, generator=generator) * 0.3,
+    )
+    scene, options = StaticScene(gaussians=gaussians), RenderOptions(mode=mode, eps2d=0.5)
+    view = large(camera(), 6)
+    write(scene, tmp_path / "page.html", view, options=options)
+    page = opened(browser, tmp_path / "page.html")
+    assert_alike(page, scene, view, options)
+    page.close()
+
+
+@needs_browser
+def test_two_rigid_groups_and_time_windows(browser: Browser, tmp_path: Path) -> None:
+    """Gaussians of two bodies that turn differently; some are between them, and some do not show all the time."""
+    scene, view = two_bodies(), large(camera(), 6)
+    write(scene, tmp_path / "page.html", view)
+    page = opened(browser, tmp_path / "page.html")
+    assert_alike(page, scene, view, scene.options)
+    page.close()
+
+
+@needs_browser
+def test_time_and_camera_obey(browser: Browser, tmp_path: Path) -> None:
+    scene, path = sliding_scene(), tmp_path / "page.html"
+    write(scene, path, large(camera(), 6), title="</script><b>& a 'scene' \"")
+    page = opened(browser, path)
+    assert page.evaluate("document.title") == "</script><b>& a 'scene' \""
+    assert page.evaluate("document.querySelector('#about h1').textContent") == "</script><b>& a 'scene' \""
+    page.evaluate("dyngs.player.seek(0)")
+    first = settled(page)
+    page.driven.fill("#time", "0.5")
+    later = settled(page)
+    assert changed(first, later)
+    page.press("ArrowLeft")
+    assert page.evaluate("dyngs.player.time") == pytest.approx(0.25)  # five training times: one frame back
+    page.press("ArrowRight")
+    page.drag((160, 120), (220, 120))
+    assert changed(later, turned := settled(page))
+    page.scroll((160, 120), 300)
+    assert changed(turned, nearer := settled(page))
+    page.press("r")
+    assert not changed(later, settled(page))
+    page.resize(240, 320)
+    page.driven.wait_for_timeout(300)
+    assert page.evaluate("[dyngs.canvas.clientWidth, dyngs.canvas.clientHeight]") == [240, 320]
+    assert changed(nearer, settled(page))
+    page.press("Space")
+    page.wait_for("dyngs.player.playing && dyngs.player.time > 0.05 && dyngs.player.time < 0.9")
+    assert page.errors == []
+    page.close()
+
+
+@needs_browser
+def test_fingers_turn_and_zoom(browser: Browser, tmp_path: Path) -> None:
+    write(still_scene(), tmp_path / "page.html", large(camera(), 6))
+    page = browser.open((tmp_path / "page.html").as_uri(), 320, 240, touch=True)
+    page.wait_for("window.dyngs !== undefined")
+    assert page.evaluate("document.getElementById('bar').hidden")
+    before = page.evaluate("[dyngs.camera.yaw, dyngs.camera.distance]")
+    session = page.driven.context.new_cdp_session(page.driven)
+
+    def touch(kind: str, *places: tuple[int, int]) -> None:
+        points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(places)]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    touch("touchStart", (100, 100))
+    touch("touchMove", (140, 100))
+    touch("touchEnd")
+    yaw, distance = page.evaluate("[dyngs.camera.yaw, dyngs.camera.distance]")
+    assert yaw < before[0]
+    assert distance == before[1]
+    touch("touchStart", (100, 100), (140, 100))
+    touch("touchMove", (80, 100), (160, 100))
+    touch("touchEnd")
+    assert page.evaluate("dyngs.camera.distance") < 0.7 * distance
+    assert page.errors == []
+    page.close()
+
+
+@needs_browser
+def test_nothing_is_upside_down(browser: Browser, tmp_path: Path) -> None:
+    """What lies toward `up` is in the upper half, also where the first camera is rolled."""
+    gaussians = replace(still_scene().gaussians, means=torch.tensor([[0.0, -0.7, 0]]).repeat(5, 1))
+    rolled = camera(120, 84).cam_from_world.clone()
+    rolled[0, :2] *= -1  # upside down
+    view = Cameras(rolled, large(camera(), 6).intrinsics, 120, 84)
+    write(StaticScene(gaussians=gaussians), tmp_path / "page.html", view)
+    page = opened(browser, tmp_path / "page.html")
+    rows = np.argwhere((page.screenshot("#canvas")[:, 90:230] < 200).all(-1))[:, 0]
+    assert len(rows) > 20
+    assert rows.mean() < 110
+    page.close()
+
+
+@needs_browser
+def test_a_browser_without_webgl_is_told(tmp_path: Path, browser: Browser) -> None:
+    write(still_scene(), tmp_path / "page.html", camera())
+    page = browser.open(None)
+    page.driven.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page.driven.goto((tmp_path / "page.html").as_uri())
+    page.driven.wait_for_function("document.getElementById('message').textContent.includes('WebGL 2')")
+    page.close()
+
+
+def test_a_page_names_no_host_and_allows_none(tmp_path: Path) -> None:
+    write(still_scene(), tmp_path / "page.html", camera())
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert not re.findall(r"(?:https?:)?//[\w.-]+\.\w+|\bsrc=|@import|\burl\(", text)
+    policy = re.findall(r'Content-Security-Policy" content="([^"]+)"', text)[0]
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert "unsafe" not in policy
+    assert json.loads(text.split('id="header">')[1].split("</script>")[0])["count"] == 5
+
+
+def test_all_parts_of_the_page_are_in_it(tmp_path: Path) -> None:
+    folder = Path(write_page.__code__.co_filename).parent
+    found = {file.name for file in folder.iterdir() if file.suffix in (".js", ".glsl")}
+    assert found == {*SCRIPTS, *SHADERS}
+    for name in found:
+        lines = (folder / name).read_text(encoding="utf-8").splitlines()
+        assert len(lines) <= 500, name
+        assert max(len(line) for line in lines) <= 120, name
+
+
+def settled(page: Page) -> NDArray[np.uint8]:
+    """The canvas once it is drawn with all pixels, without what lies over it."""
+    page.driven.wait_for_timeout(50)
+    page.evaluate("dyngs.drawNow(1)")
+    page.driven.wait_for_timeout(50)
+    return page.screenshot("#canvas")[62:138]
+
+
+def changed(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> bool:
+    return a.shape != b.shape or bool(np.abs(a.astype(int) - b).max() > 40)
+
+
+def two_bodies() -> Scene:
+    """Two bodies of 40 Gaussians: one turns, one goes; some follow both, and none shows all the time."""
+    generator = torch.Generator().manual_seed(3)
+    means = torch.rand(80, 3, generator=generator) * 1.2 - torch.tensor([1.2, 0.6, 0.6])
+    means[40:, 0] += 1.2
+    setup = FieldSetup(torch.zeros(3), torch.ones(3), 12, len(means), 1.0)
+    options = ControlNodesField(nodes=30, pieces=4, rigid_groups="always", lifetimes="always")
+    field = ControlNodes(options, setup, generator)
+    field.offsets(means, 0.0)
+    positions, times = field.buffers["positions"], torch.linspace(0, 1, 20)
+    angles = (1.5 * times)[:, None]
+    turned = torch.stack([angles.cos(), 0 * angles, 0 * angles, angles.sin()], dim=-1)
+    first = (positions[:, 0] < 0)[None, :, None]
+    quats = torch.where(first, turned, torch.tensor([1.0, 0, 0, 0]))
+    goes = (times[:, None, None] - 0.5) * torch.tensor([0.0, 1, 0])
+    shifts = torch.where(first, rotate(quats, positions.expand(20, -1, 3)) - positions, goes)
+    for name, values in (("means", shifts), ("quats", quats - torch.tensor([1.0, 0, 0, 0]))):
+        field.parameters[name].data[:] = fitted_splines(times, values, field.num_points).float()
+    grouped = field.with_groups(means)
+    assert grouped is not None
+    lives = grouped.with_lifetimes(means)
+    assert lives is not None
+    lives.parameters["life_centers"].data[:, 0] = torch.rand(80, generator=generator)
+    lives.parameters["life_log_spans"].data[:] = -1.2
+    lives.parameters["life_velocities"].data[:] = 0.2 * torch.randn(80, 3, generator=generator)
+    assert int((lives.parameters["binding"] > 0.5 * ALONE).sum()) > 3
+    gaussians = Gaussians(
+        means,
+        torch.randn(80, 4, generator=generator),
+        torch.rand(80, 3, generator=generator) - 3.5,
+        torch.full((80,), 2.0),
+        torch.randn(80, 4, 3, generator=generator),
+    )
+    return DynamicScene(gaussians=gaussians, seen_at=tuple(times.tolist()), field=lives, moving=torch.arange(80))
+
+
+def sliding_scene() -> Scene:
+    """Five balls of which two go along x."""
+    options = tiny_options("trajectory", everything=False)
+    field = new_field(options, FieldSetup(torch.zeros(3), torch.ones(3), 5, 2, 1.0), torch.Generator())
+    field.parameters["means"].data[:, 0, 0] = 0.5
+    return moving_scene(field)
