@@ -13,6 +13,8 @@ _UNFIT = {
     "static": "the page shows the whole scene",
     "dynamic": "the page shows the whole scene",
     "max_change": "it goes with --format dyngs",
+    "up": "the page turns with the scene; --from-up names its axis",
+    "sh_degree": "the page has the colours of the run",
 }
 
 
@@ -33,7 +35,11 @@ def export_page(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out or source / "scene.html"
     if out.suffix.lower() not in (".html", ".htm") or out.is_dir():
         raise DyngsError(f"{out}: --format html writes one file; give --out {out.with_suffix('.html')}")
-    options = PageOptions(motion=arguments.motion, time=0.0 if arguments.time is None else arguments.time)
+    options = PageOptions(
+        motion=arguments.motion,
+        time=0.0 if arguments.time is None else arguments.time,
+        up=getattr(arguments, "from_up", None),
+    )
     written, notes = write_run_page(source, out, options)
     print_notes(notes)
     print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); it plays in any browser with WebGL 2, offline")

@@ -21,7 +21,7 @@ from dyngs.output.animation import with_motion
 from dyngs.output.job_of_avatar import job_of_avatar
 from dyngs.output.job_of_run import cameras_for_paths, view_to_show
 from dyngs.output.orbit import frame_orbit_for_points
-from dyngs.output.render_job import RenderJobOptions
+from dyngs.output.render_job import RenderJobOptions, axis
 from dyngs.runs.checkpoint import LoadedRun, load_run
 
 MOST_VIEWS = 24
@@ -40,11 +40,13 @@ class PageOptions:
         motion: motion file for a person; None: that of training.
         title: None: the name of the run's folder, or of the file.
         time: to begin with.
+        up: axis that points up, such as "z" or "-y"; None: the direction that is up for the cameras or the person.
     """
 
     motion: Path | None = None
     title: str | None = None
     time: float = 0.0
+    up: str | None = None
 
 
 def write_run_page(
@@ -64,28 +66,29 @@ def write_run_page(
         animated = with_motion(run, options.motion)
         run = animated.run
         seconds = len(run.scene.times) / animated.fps
-    staging, notes = _staging(run, title, seconds)
+    staging, notes = _staging(run, title, seconds, options.up)
     written = write_page(run.scene, render_options(run.config.model), replace(staging, time=options.time), path)
     return written, notes
 
 
-def _staging(run: LoadedRun, title: str, seconds: float | None) -> tuple[Staging, tuple[str, ...]]:
+def _staging(run: LoadedRun, title: str, seconds: float | None, up: str | None) -> tuple[Staging, tuple[str, ...]]:
     """Return where the capture's cameras stood; around the Gaussians, with a message, where it cannot be read."""
     try:
         capture = read_capture(run.config.data)
     except DyngsError as error:
-        notes = (f"without the capture ({error}) the page begins with a view from outside, z up",)
-        return _around(run, title, seconds), notes
+        notes = (f"without the capture ({error}) the page begins with a view from outside, {up or 'z'} up",)
+        return _around(run, title, seconds, up or "z"), notes
     cameras, person = cameras_for_paths(capture, run.config.data), avatar_of(run.scene)
     first = view_to_show(capture)
     _, background = evaluation_background(run.config.data.background, capture.has_alpha)
     chosen = tuple(training_cameras([view], run.config.data)[0] for view in (first, *_some(capture)))
     red, green, blue = (0.0, 0.0, 0.0) if background is None else background.tolist()
+    found = up_direction(cameras) if person is None else up_of_clip(person.clip).numpy()
     staging = Staging(
         title=title,
         views=chosen,
         target=_triple(look_at_point(cameras)),
-        up=_triple(up_direction(cameras) if person is None else up_of_clip(person.clip).numpy()),
+        up=_triple(found) if up is None else axis(up),
         background=(red, green, blue),
         seconds=_seconds(run, capture.seconds, seconds),
     )
@@ -104,15 +107,15 @@ def _some(capture: Capture) -> list[View]:
     return [views[i] for i in rows]
 
 
-def _around(run: LoadedRun, title: str, seconds: float | None) -> Staging:
+def _around(run: LoadedRun, title: str, seconds: float | None, up: str) -> Staging:
     means = run.scene.at(None).means.numpy()
-    cameras = frame_orbit_for_points(means, 8)
+    cameras = frame_orbit_for_points(means, 8, up=axis(up))
     white = run.info.background == "white"
     return Staging(
         title=title,
         views=tuple(cameras.select(i) for i in range(len(cameras))),
         target=_triple(np.median(means, axis=0)),
-        up=(0.0, 0.0, 1.0),
+        up=axis(up),
         background=(1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0),
         seconds=_seconds(run, None, seconds),
     )
@@ -126,7 +129,7 @@ def _avatar_page(source: Path, path: Path, options: PageOptions) -> WrittenPage:
         title=options.title or "",
         views=tuple(cameras.select(i) for i in range(len(cameras))),
         target=_triple(look_at_point(cameras)),
-        up=_triple(up_direction(cameras)),
+        up=_triple(up_direction(cameras)) if options.up is None else axis(options.up),
         background=(red, green, blue),
         seconds=max(len(job.scene.times) / job.path.fps, SHORTEST),
         time=options.time,

@@ -30,6 +30,8 @@ def test_a_page_begins_at_a_camera_of_the_capture(moving_run: Path, tmp_path: Pa
     assert header["up"] == pytest.approx([0, 0, 1], abs=0.3)
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "<title>run</title>" in text
+    written, _ = write_run_page(moving_run, tmp_path / "a.html", PageOptions(up="-y"))
+    assert written.header["up"] == [0.0, -1.0, 0.0]
 
 
 def test_without_the_capture_a_page_begins_outside(tmp_path: Path) -> None:
