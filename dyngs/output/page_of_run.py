@@ -123,11 +123,12 @@ def _around(run: LoadedRun, title: str, seconds: float | None, up: str) -> Stagi
 
 def _avatar_page(source: Path, path: Path, options: PageOptions) -> WrittenPage:
     job = job_of_avatar(source, RenderJobOptions(path="orbit", motion=options.motion, num_frames=8))
+    front = job_of_avatar(source, RenderJobOptions(path=None, motion=options.motion, times=(0.0,))).path.cameras
     red, green, blue = (0.0, 0.0, 0.0) if job.background is None else job.background.tolist()
     cameras: Cameras = job.path.cameras
     staging = Staging(
         title=options.title or "",
-        views=tuple(cameras.select(i) for i in range(len(cameras))),
+        views=(front, *(cameras.select(i) for i in range(len(cameras)))),
         target=_triple(look_at_point(cameras)),
         up=_triple(up_direction(cameras)) if options.up is None else axis(options.up),
         background=(red, green, blue),
