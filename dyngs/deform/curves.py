@@ -23,8 +23,8 @@ from dyngs.deform.spline_fit import SPAN, spline_basis
 SAMPLES_PER_PIECE = 3
 """Times per piece at which a motion is looked at."""
 FEWEST_PIECES, MOST_PIECES = 8, 256
-CHECKED = 0.99
-"""Quantile of the places' errors that a fit keeps within its tolerance."""
+CHECKED = 0.95
+"""Quantile of the places' errors, root mean squares over time, that a fit keeps within its tolerance."""
 
 
 @dataclass(frozen=True)
@@ -99,13 +99,13 @@ def _fit(offsets_at: Callable[[float], Offsets], pieces: int) -> dict[str, Tenso
 
 
 def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) -> float:
-    """Return the quantile ``CHECKED`` of the distances between the splines and the places, between fitted times."""
+    """Return the quantile ``CHECKED`` of the splines' distances from the places, root mean squares over the pieces."""
     times = (torch.arange(pieces, dtype=torch.float64, device="cpu") + 0.5) / pieces
     apart = [
         (torch.einsum("p,spd->sd", shares.float(), points) - offsets_at(time).means).norm(dim=1)
         for time, shares in zip(times.tolist(), spline_basis(times, pieces), strict=True)
     ]
-    found = torch.stack(apart).amax(0)
+    found = torch.stack(apart).square().mean(0).sqrt()
     return float(found.sort().values[int(CHECKED * (len(found) - 1))]) if len(found) else 0.0
 
 

@@ -68,6 +68,10 @@ def write_run_page(
         seconds = len(run.scene.times) / animated.fps
     staging, notes = _staging(run, title, seconds, options.up)
     written = write_page(run.scene, render_options(run.config.model), replace(staging, time=options.time), path)
+    curves = written.header.get("curves", {})
+    if curves.get("error"):
+        fit = f"{curves['points']} control points for each of {curves['count']:,}, off by {curves['error']:.2g}"
+        notes += (f"splines are fitted to the motion ({fit} world units)",)
     return written, notes
 
 

@@ -21,7 +21,8 @@ def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_page_begins_at_a_camera_of_the_capture(moving_run: Path, tmp_path: Path) -> None:
     written, notes = write_run_page(moving_run, tmp_path / "a.html", PageOptions(time=0.25))
     header = written.header
-    assert notes == ()
+    assert len(notes) == 1
+    assert "splines are fitted to the motion" in notes[0]
     assert written.num_bytes == (tmp_path / "a.html").stat().st_size
     assert (header["moves"], header["time"], header["background"]) == (True, 0.25, [1.0, 1.0, 1.0])
     assert header["seconds"] >= 1.0

@@ -25,6 +25,8 @@ from dyngs.storage.order import storage_order
 
 BONES = 8
 """Bones that a Gaussian follows on the page."""
+FINE = ("means", "quats")
+"""Splines of nodes that are stored in 16 bits."""
 MOST_LOGIT = 15.0
 """Opacities beyond that of this logit are 1 to seven digits."""
 
@@ -90,8 +92,9 @@ def _add_motion(scene: DynamicScene, order: Tensor, lists: Lists, tolerance: flo
 def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
     """Add splines of drivers, with the Gaussians that follow them, or their own ones, in ``order`` (M,)."""
     for name, points in curves.heads.items():
-        own = points if curves.pivots is not None else points[order]
-        lists.quantised(f"curve_{name}", _numpy(own.flatten(1)), 16 if name in ("means", "quats") else 8)
+        has_nodes = curves.pivots is not None  # few, each of which moves many
+        own = points if has_nodes else points[order]
+        lists.quantised(f"curve_{name}", _numpy(own.flatten(1)), 16 if has_nodes and name in FINE else 8)
     if curves.pivots is not None and curves.followed is not None and curves.shares is not None:
         lists.exact("pivots", _numpy(curves.pivots))
         lists.exact("followed", curves.followed[order].numpy().astype(np.uint16))
