@@ -1,8 +1,8 @@
 """Pilot runs: settings of a moving scene that are tried in small, short runs, and taken where held-out views gain.
 
-Things that travel want their motion followed outwards from the middle of the clip, things that stay in place want all
-times at once; light that changes wants colours that a network makes from direction and time. No capture says which it
-is. Small runs do, though not always: what pays in small pictures need not pay in large ones (docs/benchmarks.md).
+Light that changes wants colours that a network makes from direction and time, texture wants its motion looked for, bodies
+want to stay rigid. No capture says which it is. Small runs do, though not always: what pays in small pictures need not
+pay in large ones (docs/benchmarks.md). Settings that only begin faster (``model.time_window=1``) cannot be asked so.
 """
 
 from __future__ import annotations
@@ -88,14 +88,6 @@ def _scores(config: Config, every: int, steps: int) -> list[float]:
     return held_out_scores(trainer.scene, trainer.pictures, trainer.held_out, trainer.options, background)
 
 
-def _all_times_at_once(config: Config) -> Config | None:
-    match config.model, _usual(config).model:
-        case DynamicModel() as model, DynamicModel() as usual if model.time_window == usual.time_window < 1:
-            return config.model_copy(update={"model": model.model_copy(update={"time_window": 1.0})})
-        case _:
-            return None
-
-
 def _colour_network(config: Config) -> Config | None:
     return config.model_copy(update={"colour": NetworkColour()}) if config.colour == _usual(config).colour else None
 
@@ -135,7 +127,6 @@ def _usual(config: Config) -> Config:
 
 
 CHOICES = (
-    Choice("model.time_window=1", _all_times_at_once),
     Choice("model.deform.block_matching=true", _block_matching),
     Choice("colour.kind=network", _colour_network),
     Choice("model.deform.move_opacities=true", _moving_opacities),

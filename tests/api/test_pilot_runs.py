@@ -10,7 +10,7 @@ from tiny_fields import busy_config
 
 from dyngs.api import pilot_runs
 from dyngs.api.pilot_runs import pilot_steps, with_choices
-from dyngs.config import AutoColour, BudgetConfig, Config, DynamicModel, NetworkColour, ShColour
+from dyngs.config import AutoColour, BudgetConfig, Config, ControlNodesField, DynamicModel, NetworkColour, ShColour
 from dyngs.config.io import load_config, packaged_preset
 
 EVERY = 3
@@ -33,29 +33,29 @@ def score_by(monkeypatch: pytest.MonkeyPatch, score: Callable[[Config], float]) 
     return tried
 
 
-def window_of(config: Config) -> float:
+def matches_blocks(config: Config) -> bool:
     match config.model:
-        case DynamicModel():
-            return config.model.time_window
+        case DynamicModel(deform=ControlNodesField(block_matching=matches)):
+            return matches
         case _:
             raise AssertionError
 
 
-@pytest.mark.parametrize("wide", [True, False])
+@pytest.mark.parametrize("blocks", [True, False])
 @pytest.mark.parametrize("network", [True, False])
 def test_settings_that_win_are_taken(
-    moving: Path, wide: bool, network: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    moving: Path, blocks: bool, network: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def score(config: Config) -> float:
-        gains = (window_of(config) == 1) == wide, (config.colour == NetworkColour()) == network
+        gains = matches_blocks(config) == blocks, (config.colour == NetworkColour()) == network
         return 20.0 + sum(gains)
 
     score_by(monkeypatch, score)
     chosen = with_choices(preset(moving), EVERY, None)
     assert chosen is not None
-    assert (window_of(chosen) == 1) is wide
+    assert matches_blocks(chosen) is blocks
     assert chosen.colour == (NetworkColour() if network else ShColour())
-    line = f"{20 + wide + (not network):.2f} dB: model.time_window=1, {'' if wide else 'not '}taken"
+    line = f"{20 + blocks + (not network):.2f} dB: model.deform.block_matching=true, {'' if blocks else 'not '}taken"
     assert line in capsys.readouterr().out
 
 
@@ -71,7 +71,6 @@ def test_what_was_asked_for_stays(moving: Path, monkeypatch: pytest.MonkeyPatch)
         moving,
         "model.deform.move_opacities=true",
         "model.deform.block_matching=true",
-        "model.time_window=0.3",
         "colour.kind=auto",
         "model.deform.rigid_groups=auto",
     )
