@@ -1,8 +1,9 @@
 """Pilot runs: settings of a moving scene that are tried in small, short runs, and taken where held-out views gain.
 
-Light that changes wants colours that a network makes from direction and time, texture wants its motion looked for, bodies
-want to stay rigid. No capture says which it is. Small runs do, though not always: what pays in small pictures need not
-pay in large ones (docs/benchmarks.md). Settings that only begin faster (``model.time_window=1``) cannot be asked so.
+Light that changes wants colours that a network makes from direction and time, texture wants its motion looked for,
+bodies want to stay rigid. No capture says which it is. Small runs do, though not always: what pays in small pictures
+need not pay in large ones (docs/benchmarks.md). Settings that only begin faster (``model.time_window=1``) cannot be
+asked so.
 """
 
 from __future__ import annotations
