@@ -21,7 +21,21 @@ from contextlib import suppress
 from typing import NoReturn, TextIO
 
 from dyngs import __version__
-from dyngs.cli import bench, convert, data, demo, doctor, evaluate, export, predict, prune, render, tradeoff, train
+from dyngs.cli import (
+    bench,
+    convert,
+    data,
+    demo,
+    doctor,
+    evaluate,
+    export,
+    predict,
+    prune,
+    render,
+    tradeoff,
+    train,
+    view,
+)
 from dyngs.errors import DyngsError, printable, require_name
 
 EXIT_ERROR = 2
@@ -117,7 +131,7 @@ def _add_commands(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for module in (demo, train, prune, predict, evaluate, render, export, convert, tradeoff, data, bench, doctor):
+    for module in (demo, train, prune, predict, evaluate, render, view, export, convert, tradeoff, data, bench, doctor):
         module.add_parser(commands)
     return parser
 

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli.progress_bar import ProgressBar
+from dyngs.cli.view import add_serving_arguments
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
     from dyngs.config import Config
+    from dyngs.view.training import TrainingView
 
 _EPILOG = """\
 examples:
   dyngs train configs/static.yaml data.root=scans/bench
   dyngs train configs/static.yaml data.root=scans/bench train.steps=30000 run.dir=runs/bench run.threads=8
   dyngs train --resume runs/bench
+  dyngs train configs/static.yaml data.root=scans/bench --view
 
 CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip, dynamic,
 human, human_predictor.
@@ -36,21 +40,38 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument("overrides", nargs="*", metavar="CONFIG key=value", help="preset or YAML file, and overrides")
     parser.add_argument("--resume", type=Path, metavar="RUN", help="continue an interrupted run")
+    parser.add_argument("--view", action="store_true", help="show the scene in a browser while it trains")
+    add_serving_arguments(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Train and print the next commands."""
     config = parse_config(arguments.overrides, arguments.resume)
+    if arguments.port is not None and not arguments.view:
+        raise DyngsError("--port goes with --view")
     from dyngs.api.train import train
 
-    if arguments.resume is None:
-        config = _with_poses(config)
-    folder = train(config, resume_from=arguments.resume)
+    with ExitStack() as stack:
+        listeners = [stack.enter_context(_view(arguments, config))] if arguments.view else []
+        if arguments.resume is None:
+            config = _with_poses(config)
+        folder = train(config, resume_from=arguments.resume, listeners=listeners)
     for line in _about_motion(folder, config):
         print(line)
     print(f"trained: {folder}\n{_next(folder, config)}")
     return 0
+
+
+def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
+    """Return the listener that serves the page."""
+    from dyngs.view.server import require_viser
+
+    require_viser()
+    from dyngs.view.server import Serving
+    from dyngs.view.training import TrainingView
+
+    return TrainingView(config, Serving(arguments.host, arguments.port), lambda line: print(line, flush=True))
 
 
 def _with_poses(config: Config) -> Config:

@@ -1,0 +1,91 @@
+"""The cameras of a capture in the page, as frusta with their pictures."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dyngs.files.write import to_uint8
+from dyngs.view.cameras import pose_of
+from dyngs.view.recording import fov_of
+from dyngs.view.viewed import Viewed
+
+if TYPE_CHECKING:
+    from dyngs.view.server import Browsing
+
+MOST = 120
+"""Frusta that are shown at most, spread evenly over the cameras."""
+_SIZE = 0.05
+"""Depth of a frustum relative to the distance of the cameras."""
+
+
+class Frusta:
+    """Frusta of one browser."""
+
+    def __init__(self, browsing: Browsing) -> None:
+        self._browsing = browsing
+        self._handles: list[Any] = []
+        self._generation = 0
+
+    def show(self, viewed: Viewed) -> None:
+        """Add the frusta, picture by picture, as the thread that draws finds time."""
+        self.remove()
+        generation = self._generation
+        places = distinct(viewed.footage.poses)
+        for index in (places[i] for i in spread(len(places), MOST)):
+            self._browsing.session.ask(lambda index=index: self._add(viewed, index, generation))
+
+    def remove(self) -> None:
+        """Remove all frusta."""
+        self._generation += 1
+        handles, self._handles = self._handles, []
+        for handle in handles:
+            handle.remove()
+
+    def _add(self, viewed: Viewed, index: int, generation: int) -> None:
+        if generation != self._generation:
+            return
+        camera = viewed.footage.cameras[index]
+        wxyz, position = pose_of(camera)
+        handle = self._browsing.client.scene.add_camera_frustum(
+            f"/cameras/{index}",
+            fov=fov_of(camera),
+            aspect=camera.width / camera.height,
+            scale=_SIZE * viewed.extent,
+            thickness=0.002 * viewed.extent,
+            color=(230, 160, 30),
+            image=thumbnail(viewed, index),
+            format="jpeg",
+            wxyz=wxyz,
+            position=position,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        handle.on_click(lambda _: self._go(index))
+        self._handles.append(handle)
+
+    def _go(self, index: int) -> None:
+        time = self._browsing.session.viewed.footage.times[index]
+        self._browsing.go_to(index)
+        if time is not None and not self._browsing.session.viewed.is_still:
+            self._browsing.session.set_time(time)
+            if self._browsing.time_slider is not None:
+                self._browsing.time_slider.value = round(time, 3)
+
+
+def spread(count: int, most: int) -> list[int]:
+    """Return at most ``most`` indices, evenly spread over ``count``."""
+    return sorted(set(np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist())) if count else []
+
+
+def distinct(poses: np.ndarray) -> list[int]:
+    """Return the indices of the first view from each pose of (V, 4, 4), ascending: a standing camera is shown once."""
+    _, first = np.unique(poses.round(6).reshape(len(poses), -1), axis=0, return_index=True)
+    return sorted(first.tolist())
+
+
+def thumbnail(viewed: Viewed, index: int) -> np.ndarray | None:
+    """Return the small picture (h, w, 3) uint8 of a view, None where there is none."""
+    loader = viewed.footage.thumbnails
+    return None if loader is None else to_uint8(loader[index].composite(viewed.background).clamp(0, 1).numpy())

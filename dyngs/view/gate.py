@@ -1,0 +1,153 @@
+"""Who may open the viewer's page: this machine alone, or whoever has the token of the link."""
+
+from __future__ import annotations
+
+import errno
+import hmac
+import http
+import ipaddress
+import secrets
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from dyngs.errors import DyngsError
+
+DEFAULT_PORT = 8080
+COOKIE = "dyngs_view"
+_LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Decision on requests by their headers.
+
+    Attributes:
+        token: that a request has to bring, in the link or as the cookie that the link gives; None: requests must be
+            addressed to this machine, so that pages of others cannot reach the viewer through a browser that runs here.
+    """
+
+    token: str | None = None
+
+    def refusal(self, path: str, headers: Mapping[str, str]) -> str | None:
+        """Return why a request is refused, or None.
+
+        Args:
+            path: of the request, with its query.
+            headers: of the request, of HTTP or of a websocket.
+        """
+        host = headers.get("Host", "")
+        origin = headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+            return "a page of another site asks for it"
+        if self.token is None:
+            return None if _name_of(host) in _LOCAL_NAMES else "only for requests to localhost"
+        given = (*parse_qs(urlsplit(path).query).get("token", ()), _cookie(headers))
+        if any(hmac.compare_digest(word.encode(), self.token.encode()) for word in given):
+            return None
+        return "the token is missing or wrong; open the link that `dyngs view` printed"
+
+    def cookie(self, path: str) -> str | None:
+        """Return the header ``Set-Cookie`` for a request that brings the token in the link; None: it needs none."""
+        if self.token is None or "token" not in parse_qs(urlsplit(path).query):
+            return None
+        return f"{COOKIE}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+
+
+def gate_for(host: str) -> Gate:
+    """Return the gate of a server on ``host``: with a new token unless that is this machine alone."""
+    return Gate() if is_loopback(host) else Gate(secrets.token_urlsafe(24))
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a server on ``host`` can be reached from this machine only."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def free_port(host: str, port: int | None) -> int:
+    """Return the port to listen on.
+
+    Args:
+        host: address to listen on.
+        port: that is wanted; None: 8080, or the next that is free.
+
+    Raises:
+        DyngsError: the port is taken or not allowed, or ``host`` is not an address of this machine.
+    """
+    tried = [port] if port is not None else [*range(DEFAULT_PORT, DEFAULT_PORT + 50), 0]
+    for candidate in tried:
+        try:
+            return _bound(host, candidate)
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE and candidate != tried[-1]:
+                continue
+            if error.errno == errno.EADDRINUSE:
+                raise DyngsError(f"--port {port}: taken; choose another, or leave it out to get a free one") from error
+            if error.errno == errno.EACCES:
+                raise DyngsError(f"--port {port}: not allowed for this user; choose one above 1023") from error
+            raise DyngsError(f"--host {host}: cannot listen there ({error.strerror or error})") from error
+    raise AssertionError("the last candidate returns or raises")
+
+
+@contextmanager
+def guarded(gate: Gate) -> Iterator[None]:
+    """Let the servers that viser starts meanwhile ask ``gate`` first: about pages and websockets alike.
+
+    viser has no setting for this; it starts its server by ``websockets.asyncio.server.serve``.
+    """
+    from websockets.asyncio import server
+
+    original = server.serve
+
+    def serve(*args: Any, process_request: Any, **options: Any) -> Any:
+        def checked(connection: Any, request: Any) -> Any:
+            refusal = gate.refusal(request.path, request.headers)
+            if refusal is not None:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"dyngs view: {refusal}\n")
+            response = process_request(connection, request)
+            cookie = gate.cookie(request.path)
+            if response is not None and cookie is not None:
+                response.headers["Set-Cookie"] = cookie
+            return response
+
+        return original(*args, process_request=checked, **options)
+
+    server.serve = serve  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        server.serve = original
+
+
+def _bound(host: str, port: int) -> int:
+    """Return the port of a socket that could be bound. Raises OSError where it could not."""
+    family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind(address)
+        return probe.getsockname()[1]
+
+
+def _name_of(host: str) -> str:
+    """Return the name in a header ``Host``, without its port."""
+    try:
+        return (urlsplit(f"//{host}").hostname or "").lower()
+    except ValueError:
+        return ""
+
+
+def _cookie(headers: Mapping[str, str]) -> str:
+    try:
+        found = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
+    except CookieError:
+        return ""
+    return "" if found is None else found.value

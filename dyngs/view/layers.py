@@ -1,0 +1,181 @@
+"""Pictures of a scene for the viewer: colours, depth, opacity, motion, and the error against the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dyngs.camera import Cameras
+from dyngs.conventions import SH_C0
+from dyngs.files.write import to_uint8
+from dyngs.output.contact_sheet import color_map, depth_to_rgb
+from dyngs.output.render_job import resize_cameras
+from dyngs.rendering import Rendering
+from dyngs.scene import Moment, Scene
+from dyngs.view.viewed import Viewed
+
+Layer = Literal["colour", "depth", "alpha", "motion", "error"]
+Part = Literal["all", "moving", "still"]
+LAYERS: tuple[Layer, ...] = get_args(Layer)
+PARTS: tuple[Part, ...] = get_args(Part)
+
+ERROR_GAIN = 4.0
+"""Factor of the mean absolute error before it is coloured, as in contact sheets."""
+_MOTION_TIMES = 12
+_LINE = (255, 200, 0)
+"""Colour of the line between render and truth."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture to draw.
+
+    Attributes:
+        camera: one camera, of the size of the picture.
+        time: of the scene; None: the first.
+        layer: what is shown; "error" needs ``view``.
+        part: which Gaussians are drawn.
+        view: the view of the capture whose camera, time and truth are shown instead; None: no truth.
+        divide: share of the width that shows the render; the truth is on the right of it.
+    """
+
+    camera: Cameras
+    time: float | None = None
+    layer: Layer = "colour"
+    part: Part = "all"
+    view: int | None = None
+    divide: float = 1.0
+
+
+def draw(viewed: Viewed, shot: Shot) -> np.ndarray:
+    """Return the picture (H, W, 3) uint8 of a shot."""
+    camera, time = shot.camera, shot.time
+    if shot.view is not None:
+        camera = resize_cameras(viewed.footage.cameras[shot.view], camera.width, camera.height)
+        time = viewed.footage.times[shot.view]
+    with torch.no_grad():
+        rgb = _layer(viewed, shot, camera, time)
+        if shot.view is None:
+            return rgb
+        truth = truth_in_window(viewed, shot.view, (camera.width, camera.height))
+    if truth is None:
+        return rgb
+    if shot.layer == "error":
+        return _error(rgb, truth)
+    return _divided(rgb, np.where(np.isnan(truth), rgb, to_uint8(np.nan_to_num(truth))).astype(np.uint8), shot.divide)
+
+
+def truth_in_window(viewed: Viewed, view: int, size: tuple[int, int]) -> np.ndarray | None:
+    """Return the true picture of a view as large as it fits into a window, (H, W, 3), NaN beside it; None without one.
+
+    Args:
+        viewed: with a capture.
+        view: index of the view.
+        size: width and height of the window, px.
+    """
+    footage = viewed.footage
+    if footage.pictures is None:
+        return None
+    picture = footage.pictures[view].composite(viewed.background)
+    high, wide = picture.shape[:2]
+    width, height = size
+    scale = min(width / wide, height / high)
+    own = max(1, round(scale * high)), max(1, round(scale * wide))
+    shown = functional.interpolate(
+        picture.permute(2, 0, 1)[None], own, mode="bilinear", align_corners=False, antialias=scale < 1
+    )
+    window = np.full((height, width, 3), np.nan, np.float32)
+    top, left = (height - own[0]) // 2, (width - own[1]) // 2
+    window[top : top + own[0], left : left + own[1]] = shown[0].permute(1, 2, 0).clamp(0, 1).numpy()
+    return window
+
+
+def motion_colours(viewed: Viewed) -> Tensor:
+    """Return (N, 3) colours of how far each Gaussian moves over all times: dark blue is not at all, red is far.
+
+    Red begins where 99% of those that move are left behind.
+    """
+    return viewed.once("motion", lambda: _motion_colours(viewed.scene))
+
+
+def _layer(viewed: Viewed, shot: Shot, camera: Cameras, time: float | None) -> np.ndarray:
+    """Return one layer (H, W, 3) uint8; for the error it is the colours."""
+    match shot.layer:
+        case "colour" | "error":
+            return to_uint8(_rendering(viewed, shot.part, camera, time).rgb[0].clamp(0, 1).numpy())
+        case "alpha":
+            alpha = to_uint8(_rendering(viewed, shot.part, camera, time).alpha[0].clamp(0, 1).numpy())
+            return np.repeat(alpha[..., None], 3, axis=2)
+        case "depth":
+            made = _rendering(viewed, shot.part, camera, time, with_depth=True)
+            depth = np.zeros(0) if made.depth is None else made.depth[0].numpy()
+            return depth_to_rgb(depth, made.alpha[0].numpy())
+        case "motion":
+            return _motion(viewed, shot.part, camera, time)
+
+
+def _rendering(viewed: Viewed, part: Part, camera: Cameras, time: float | None, with_depth: bool = False) -> Rendering:
+    scene = _part(viewed, part)
+    options = replace(viewed.options, depth="expected") if with_depth else viewed.options
+    return scene.render(camera, viewed.moment(part, scene, time), options=options, background=viewed.background)
+
+
+def _part(viewed: Viewed, part: Part) -> Scene:
+    """Return the scene, or only what moves of it, or only what does not."""
+    match part:
+        case "all":
+            return viewed.scene
+        case "moving" | "still":
+            return viewed.once(part, lambda: viewed.scene.part(part))
+
+
+def _motion(viewed: Viewed, part: Part, camera: Cameras, time: float | None) -> np.ndarray:
+    """Return the picture of the motion (H, W, 3) uint8, on black."""
+    scene, colours = viewed.scene.unmasked(), motion_colours(viewed)
+    gaussians = scene.at(time)
+    coloured = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None].to(gaussians.means))
+    if part != "all":
+        moves = torch.zeros(len(scene), dtype=torch.bool, device=colours.device)
+        if not scene.is_still:
+            moves[scene.rows] = True
+        coloured = coloured.select(moves if part == "moving" else ~moves)
+    plain = replace(scene, colour=None, background=None)
+    made = plain.render(camera, Moment(coloured, time), options=replace(viewed.options, sh_degree=0))
+    return to_uint8(made.rgb[0].clamp(0, 1).numpy())
+
+
+def _motion_colours(scene: Scene) -> Tensor:
+    far = torch.zeros(len(scene), device=scene.gaussians.means.device)
+    if not scene.is_still:
+        whole = scene.unmasked()
+        times = np.linspace(0, 1, _MOTION_TIMES).tolist()
+        low = high = whole.at(times[0]).means
+        for time in times[1:]:
+            means = whole.at(time).means
+            low, high = torch.minimum(low, means), torch.maximum(high, means)
+        far = (high - low).norm(dim=1)
+        moves = far[scene.rows]
+        far = far / (torch.quantile(moves[:: max(1, len(moves) // 100_000)], 0.99).clamp_min(1e-12))
+    coloured = color_map(far.clamp(0, 1).cpu().numpy()[None], "turbo")[0]
+    return torch.from_numpy(coloured.astype(np.float32) / 255.0)
+
+
+def _error(rgb: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return the mean absolute error as colours (H, W, 3) uint8, black beside the true picture."""
+    difference = np.abs(rgb.astype(np.float32) / 255.0 - truth).mean(axis=2)
+    return color_map(np.nan_to_num(ERROR_GAIN * difference), "magma")
+
+
+def _divided(left: np.ndarray, right: np.ndarray, divide: float) -> np.ndarray:
+    """Return ``left`` up to the share ``divide`` of the width, a line, and ``right`` beyond it."""
+    width = left.shape[1]
+    column = round(min(max(divide, 0.0), 1.0) * width)
+    made = np.concatenate([left[:, :column], right[:, column:]], axis=1)
+    if 0 < column < width:
+        made[:, max(column - 1, 0) : column + 1] = _LINE
+    return made

@@ -1,0 +1,105 @@
+"""A person in the viewer: played motions, the rest pose, and poses by the angles of the main joints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from dyngs.errors import DyngsError
+from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.motion.placement import rest_clip
+from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.output.animation import with_motion
+from dyngs.view.viewed import Viewed
+
+AS_CAPTURED, AT_REST, BY_SLIDERS = "as captured", "rest pose", "pose by sliders"
+MAIN_JOINTS = (
+    *("pelvis", "spine1", "spine3", "neck", "head", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow"),
+    *("left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle"),
+)
+"""Joints with sliders."""
+MOTION_SUFFIXES = (".npz", ".bvh", ".glb", ".gltf")
+_MOST_MOTIONS = 500
+
+Angles = Mapping[str, tuple[float, float, float]]
+"""Degrees about x, y and z, in this order, of joints by name; those that are missing are at rest."""
+
+
+def motion_files(path: Path | None) -> dict[str, Path]:
+    """Return the motion files in a folder, or the file itself, by name; empty for None.
+
+    Raises:
+        DyngsError: no such file or folder, or none in it.
+    """
+    if path is None:
+        return {}
+    if path.is_file():
+        return {path.name: path}
+    if not path.is_dir():
+        raise DyngsError(f"--motion {path}: no such file or folder")
+    found = sorted(file for file in path.rglob("*") if file.suffix.lower() in MOTION_SUFFIXES and file.is_file())
+    if not found:
+        raise DyngsError(f"--motion {path}: no motion files there ({', '.join(MOTION_SUFFIXES)})")
+    return {str(file.relative_to(path)): file for file in found[:_MOST_MOTIONS]}
+
+
+def person_in(viewed: Viewed) -> HumanScene | None:
+    """Return the person that is viewed, None for other scenes."""
+    return avatar_of(viewed.scene)
+
+
+def in_motion(viewed: Viewed, choice: str, files: Mapping[str, Path], angles: Angles) -> Viewed:
+    """Return the person of ``viewed``, as it was loaded, in one of the motions.
+
+    Args:
+        viewed: a person in the motion of the capture.
+        choice: ``AS_CAPTURED``, ``AT_REST``, ``BY_SLIDERS`` or the name of a file.
+        files: by name.
+        angles: of the sliders.
+
+    Raises:
+        DyngsError: the file cannot be read.
+    """
+    if choice == AS_CAPTURED:
+        return viewed
+    if choice in files and viewed.run is not None:
+        animated = with_motion(viewed.run, files[choice])
+        scene = animated.run.scene
+        return _elsewhere(viewed).showing(scene, max(len(scene.times) - 1, 1) / animated.fps)
+    return posed(viewed, angles if choice == BY_SLIDERS else {})
+
+
+def posed(viewed: Viewed, angles: Angles) -> Viewed:
+    """Return the person of ``viewed`` in the rest pose with joints turned by ``angles``."""
+    person = person_in(viewed)
+    if person is None:
+        raise ValueError("only a person can be posed")
+    clip = rest_clip(person.clip, person.skeleton.joints, person.skeleton.parents)
+    poses = clip.poses.clone()
+    for name, turns in angles.items():
+        row = joint_row(name, poses.shape[1])
+        poses[0, row] = _composed(poses[0, row], turns)
+    return _elsewhere(viewed).showing(person.playing(replace(clip, poses=poses)))
+
+
+def joint_row(name: str, count: int) -> int:
+    """Return the row of a joint of a body with ``count`` joints."""
+    return SMPLX_ROWS[count].index(JOINT_NAMES.index(name))
+
+
+def _elsewhere(viewed: Viewed) -> Viewed:
+    """Return the same without the pictures, which show the person in another pose."""
+    return replace(viewed, footage=replace(viewed.footage, pictures=None))
+
+
+def _composed(rest: torch.Tensor, degrees: tuple[float, float, float]) -> torch.Tensor:
+    """Return the axis-angle (3,) of ``rest`` (3,) after turns about x, y and z."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_euler("xyz", [math.radians(value) for value in degrees])
+    whole = Rotation.from_rotvec(rest.double().cpu().numpy()) * turn
+    return torch.from_numpy(whole.as_rotvec()).to(rest)

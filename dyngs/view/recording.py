@@ -1,0 +1,110 @@
+"""Camera paths recorded in the viewer, in the format that ``dyngs render --path`` reads (docs/camera_paths.md)."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from dyngs.camera import Cameras
+from dyngs.output.keyframes import Keyframes, interpolate_keyframes
+from dyngs.splats.rotation import with_scene
+from dyngs.view.cameras import camera_at, pose_of
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """One camera, the time of the scene it shows, and the seconds until the next one."""
+
+    camera: Cameras
+    time: float | None
+    seconds: float = 1.0
+
+    @property
+    def camera_size(self) -> tuple[int, int]:
+        """Width and height of the window that it was recorded in, px."""
+        return self.camera.width, self.camera.height
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Keyframes in their order; ``loops``: the camera returns to the first one at the end."""
+
+    keyframes: tuple[Keyframe, ...] = ()
+    loops: bool = False
+
+    def __len__(self) -> int:
+        return len(self.keyframes)
+
+    @property
+    def duration(self) -> float:
+        """Seconds of the path; those after the last keyframe count only in a loop."""
+        return sum(key.seconds for key in self.keyframes[: None if self.loops else -1])
+
+    def added(self, keyframe: Keyframe) -> Recording:
+        """Return the recording with one more keyframe at the end."""
+        return replace(self, keyframes=(*self.keyframes, keyframe))
+
+    def without_last(self) -> Recording:
+        """Return the recording without its last keyframe."""
+        return replace(self, keyframes=self.keyframes[:-1])
+
+    def turned_back(self, rotation: tuple[float, float, float, float]) -> Recording:
+        """Return the path as it is seen before a scene was turned by ``rotation``, wxyz."""
+        w, x, y, z = rotation
+        keys = (replace(key, camera=with_scene(key.camera, (w, -x, -y, -z))) for key in self.keyframes)
+        return replace(self, keyframes=tuple(keys))
+
+    def starts(self) -> list[float]:
+        """Return the second of each keyframe."""
+        return np.concatenate([[0.0], np.cumsum([key.seconds for key in self.keyframes[:-1]])]).tolist()
+
+    def document(self, size: tuple[int, int], fps: float, world_offset: np.ndarray) -> str:
+        """Return the path as JSON, in the coordinates of the capture's files.
+
+        Args:
+            size: width and height of the pictures, px; focal lengths follow the height.
+            fps: frames per second.
+            world_offset: (3,) as ``Capture.world_offset``.
+        """
+        width, height = size
+        keys: list[dict[str, Any]] = []
+        for key, start in zip(self.keyframes, self.starts(), strict=True):
+            pose = key.camera.cam_from_world[0].double().cpu().numpy().copy()
+            pose[:3, 3] -= pose[:3, :3] @ world_offset
+            focal = float(key.camera.intrinsics[0, 1, 1]) * height / key.camera.height
+            entry: dict[str, Any] = {"at": start, "cam_from_world": pose.tolist(), "fl_x": focal}
+            keys.append(entry if key.time is None else entry | {"time": key.time})
+        document = {"width": width, "height": height, "fps": fps, "loop": self.loops, "keyframes": keys}
+        if self.loops:
+            document["seconds"] = self.duration
+        return json.dumps(document, indent=1) + "\n"
+
+    def at(self, seconds: float) -> tuple[Cameras, float | None]:
+        """Return the camera and the time of the scene after ``seconds`` of the path, of at least one keyframe."""
+        first = self.keyframes[0].camera
+        has_times = all(key.time is not None for key in self.keyframes)
+        keys = Keyframes(
+            np.stack([key.camera.cam_from_world[0].double().cpu().numpy() for key in self.keyframes]),
+            np.stack([key.camera.intrinsics[0].double().cpu().numpy() for key in self.keyframes]),
+            np.array(self.starts()),
+            np.array([key.time for key in self.keyframes], np.float64) if has_times else None,
+            self.duration if self.loops and len(self) > 1 else None,
+        )
+        made = interpolate_keyframes(keys, np.array([seconds]))
+        pose, matrix = (first.cam_from_world.new_tensor(x) for x in (made.cam_from_world, made.intrinsics))
+        camera = replace(first, cam_from_world=pose, intrinsics=matrix)
+        return camera, None if made.times is None else float(made.times[0])
+
+
+def fov_of(camera: Cameras) -> float:
+    """Return the vertical field of view of one camera, rad."""
+    return 2 * float(np.arctan(0.5 * camera.height / float(camera.intrinsics[0, 1, 1])))
+
+
+def in_window(camera: Cameras, size: tuple[int, int]) -> Cameras:
+    """Return one camera as a window of ``size`` shows it: the same pose and vertical field of view."""
+    wxyz, position = pose_of(camera)
+    return camera_at(wxyz, position, fov_of(camera), size)

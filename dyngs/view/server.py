@@ -1,0 +1,252 @@
+"""The server of the viewer's page: viser shows the page, dyngs draws what is behind it."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dyngs.errors import DyngsError
+from dyngs.view.cameras import fitting_fov, look_point, pose_of
+from dyngs.view.drawer import Drawer
+from dyngs.view.gate import free_port, gate_for, guarded, is_loopback
+from dyngs.view.pace import Pace
+from dyngs.view.session import Eye, Sent, Session
+from dyngs.view.source import Source
+from dyngs.view.viewed import Viewed
+
+if TYPE_CHECKING:
+    import viser
+
+MOVING_QUALITY, STILL_QUALITY = 75, 95
+"""JPEG qualities."""
+_STATUS_EVERY = 0.5
+"""Seconds between two changes of the line about the pictures, and of the time slider while it plays."""
+
+
+@dataclass(frozen=True)
+class Serving:
+    """How the page is served.
+
+    Attributes:
+        host: address to listen on.
+        port: that is asked for; None: 8080 or the next that is free.
+        motions: motion files for people, by name.
+        target: seconds that a picture may take while something moves.
+        longest: seconds that any picture may take.
+        in_thread: pictures are drawn in a thread of the server; else by whoever calls ``drawer.draw_one``.
+    """
+
+    host: str = "127.0.0.1"
+    port: int | None = None
+    motions: Mapping[str, Path] = field(default_factory=dict)
+    target: float = 1 / 14
+    longest: float = math.inf
+    in_thread: bool = True
+
+
+class Browsing:
+    """One browser: its connection, its session, and the pictures that went to it.
+
+    Args:
+        client: viser's handle of it.
+        viewed: what it looks at first.
+        pace: how large its pictures are.
+    """
+
+    def __init__(self, client: viser.ClientHandle, viewed: Viewed, pace: Pace) -> None:
+        self.client = client
+        self.loaded = viewed
+        self.session = Session(viewed, self.send, pace)
+        self.status: viser.GuiMarkdownHandle | None = None
+        self.time_slider: viser.GuiSliderHandle | None = None
+        self.num_sent = 0
+        self._told_at, self._since_told = 0.0, 0
+
+    def send(self, sent: Sent) -> None:
+        """Pass a picture to the browser."""
+        quality = STILL_QUALITY if sent.is_refined else MOVING_QUALITY
+        self.client.scene.set_background_image(sent.picture, format="jpeg", jpeg_quality=quality)
+        self.num_sent += 1
+        self._since_told += 1
+        now = time.monotonic()
+        if now - self._told_at >= _STATUS_EVERY or sent.is_refined:
+            self._tell(sent, now)
+        self.client.flush()
+
+    def camera_moved(self) -> None:
+        """Take over the camera of the browser."""
+        camera = self.client.camera
+        size = (max(16, int(camera.image_width)), max(16, int(camera.image_height)))
+        self.session.move(Eye(tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov), size))
+
+    def go_to(self, index: int | None) -> None:
+        """Move the browser's camera to a view of the capture; None: to where it began."""
+        viewed, handle = self.session.viewed, self.client.camera
+        camera = viewed.start if index is None else viewed.footage.cameras[index]
+        wxyz, position = pose_of(camera)
+        with self.client.atomic():
+            handle.fov = fitting_fov(camera, handle.aspect)
+            handle.position = position
+            handle.look_at = look_point(camera, viewed.center, viewed.extent)
+            handle.wxyz = wxyz
+        self.camera_moved()
+
+    def _tell(self, sent: Sent, now: float) -> None:
+        height, width = sent.picture.shape[:2]
+        rate = self._since_told / max(now - self._told_at, 1e-6)
+        shown = "still" if sent.is_refined else f"{rate:.0f} pictures/s"
+        view = self.session.shown_view
+        truth = "" if view is None else f", truth: {self.session.viewed.footage.names[view]}"
+        if self.status is not None:
+            self.status.content = f"{width} x {height} px, {1000 * sent.seconds:.0f} ms, {shown}{truth}"
+        if self.time_slider is not None and self.session.timeline.playing:
+            self.time_slider.value = round(self.session.time, 3)
+        self._told_at, self._since_told = now, 0
+
+
+class Viewer:
+    """A page that shows scenes to any number of browsers, each with its own camera, time and settings.
+
+    A context manager: the page is there from ``__enter__`` on.
+
+    Args:
+        source: scenes to choose from.
+        first: the scene that a new browser sees.
+        serving: how the page is served.
+
+    Raises:
+        DyngsError: viser is not installed, or the port cannot be had.
+    """
+
+    def __init__(self, source: Source, first: Viewed, serving: Serving = Serving()) -> None:
+        require_viser()
+        self.source, self.first, self.serving = source, first, serving
+        self.drawer = Drawer(self._tell_error)
+        self._browsing: dict[int, Browsing] = {}
+        self._lock = threading.Lock()
+        gate = gate_for(serving.host)
+        self._token = gate.token
+        port = free_port(serving.host, serving.port)
+        import viser
+
+        with guarded(gate), quiet():
+            self.server = viser.ViserServer(host=serving.host, port=port, verbose=False)
+        if serving.port is not None and self.server.get_port() != serving.port:
+            self.server.stop()
+            raise DyngsError(f"--port {serving.port}: taken; choose another, or leave it out to get a free one")
+        self._prepare()
+
+    @property
+    def link(self) -> str:
+        """Address of the page, with the token if there is one."""
+        host, port = self.serving.host, self.server.get_port()
+        shown = "localhost" if is_loopback(host) else _name_of_machine() if host in ("0.0.0.0", "::") else host
+        return f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/" + (
+            f"?token={self._token}" if self._token else ""
+        )
+
+    @property
+    def browsing(self) -> tuple[Browsing, ...]:
+        """All browsers that are connected."""
+        with self._lock:
+            return tuple(self._browsing.values())
+
+    def __enter__(self) -> Viewer:
+        if self.serving.in_thread:
+            self.drawer.start()
+        self.server.on_client_connect(self._connected)
+        self.server.on_client_disconnect(self._gone)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """Close the page; browsers that show it say so."""
+        for browsing in self.browsing:
+            self.drawer.remove(browsing.session)
+        self.drawer.stop()
+        with quiet():
+            self.server.stop()
+
+    def _prepare(self) -> None:
+        """Set what all browsers share: the theme, the first camera, the up direction."""
+        from viser import _messages
+
+        server, first = self.server, self.first
+        for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
+            server._websock_server.unregister_handler(kind)  # it would pass the page through a host of others
+        server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+        server.gui.main_panel.dock_right()  # beside the picture, not over it
+        _, position = pose_of(first.start)
+        server.scene.set_up_direction(tuple(first.up))
+        camera = server.initial_camera
+        camera.position, camera.look_at = position, look_point(first.start, first.center, first.extent)
+        camera.up, camera.fov = first.up, fitting_fov(first.start, first.start.width / first.start.height)
+        camera.near, camera.far = 1e-3 * first.extent, 1e3 * first.extent
+
+    def _connected(self, client: viser.ClientHandle) -> None:
+        from dyngs.view.controls import add_controls
+
+        browsing = Browsing(client, self.first, Pace(self.serving.target, self.serving.longest))
+        with self._lock:
+            self._browsing[client.client_id] = browsing
+        add_controls(browsing, self.source, self.serving)
+
+        async def moved(_: viser.CameraHandle) -> None:
+            browsing.camera_moved()
+
+        client.camera.on_update(moved)
+        self.drawer.add(browsing.session)
+        browsing.go_to(None)
+        if client.client_id not in self.server.get_clients():  # it went while all this was made
+            self._gone(client)
+
+    def _gone(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            browsing = self._browsing.pop(client.client_id, None)
+        if browsing is not None:
+            self.drawer.remove(browsing.session)
+
+    def _tell_error(self, session: Session, message: str) -> None:
+        for browsing in self.browsing:
+            if browsing.session is session:
+                notify(browsing.client, "Error", message)
+
+
+def notify(client: viser.ClientHandle, title: str, body: str) -> None:
+    """Show a message in a browser for some seconds."""
+    client.add_notification(title, body, auto_close_seconds=12.0)
+
+
+def require_viser() -> None:
+    """Raise DyngsError where viser is not installed."""
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise DyngsError(f"the viewer needs viser ({error}); install it with: pip install 'dyngs[view]'") from error
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep viser from printing its own lines."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
+
+
+def _name_of_machine() -> str:
+    import socket
+
+    return socket.gethostname() or "localhost"

@@ -1,0 +1,287 @@
+"""What one browser looks at, and which picture it gets next. Knows neither viser nor threads of its own."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from dyngs.camera import Cameras
+from dyngs.view.cameras import camera_at, nearest_camera
+from dyngs.view.layers import Layer, Part, Shot, draw
+from dyngs.view.pace import STILL_AFTER, Pace, size_within
+from dyngs.view.recording import Recording, in_window
+from dyngs.view.timeline import Timeline
+from dyngs.view.viewed import Viewed
+
+_SHORTEST = 1 / 30
+"""Seconds between two pictures at least."""
+_DEFAULT_LONGEST = 1600
+
+
+@dataclass(frozen=True)
+class Eye:
+    """The camera of a browser: wxyz and position as in ``camera_at``, vertical field of view in rad, window in px."""
+
+    wxyz: tuple[float, ...]
+    position: tuple[float, ...]
+    fov: float
+    size: tuple[int, int]
+
+    def camera(self, size: tuple[int, int] | None = None) -> Cameras:
+        """Return the camera for pictures of ``size``; None: that of the window."""
+        return camera_at(self.wxyz, self.position, self.fov, size or self.size)
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is shown.
+
+    Attributes:
+        layer, part: as in ``Shot``.
+        comparing: show the truth beside the render.
+        view: index of the view that is compared with; None: the nearest.
+        divide: share of the width that shows the render.
+        longest: most pixels of the longer side of a picture.
+    """
+
+    layer: Layer = "colour"
+    part: Part = "all"
+    comparing: bool = False
+    view: int | None = None
+    divide: float = 0.5
+    longest: int = _DEFAULT_LONGEST
+
+
+@dataclass(frozen=True)
+class Sent:
+    """A picture for the browser: (H, W, 3) uint8, whether it is a refined one, and the seconds that it took."""
+
+    picture: np.ndarray
+    is_refined: bool
+    seconds: float
+
+
+class Session:
+    """One browser's view of a scene.
+
+    Several threads tell it what has changed; one thread calls ``draw_next``, and gets the newest state.
+
+    Args:
+        viewed: scene to look at.
+        send: passes a picture to the browser.
+        pace: how large pictures are; None: fourteen a second while something moves, whole when all is still.
+        clock: monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        viewed: Viewed,
+        send: Callable[[Sent], None],
+        pace: Pace | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._lock = threading.RLock()
+        self._send, self._clock = send, clock
+        self._pace = pace or Pace(1 / 14)
+        self._jobs: deque[tuple[str | None, Callable[[], None]]] = deque()
+        self._changed_at = self._drawn_at = -1e9
+        self._is_stale = True
+        self._drawn_area: float | None = None
+        self._is_refined = False
+        self._preview: tuple[Recording, float] | None = None
+        self.on_change: Callable[[], None] = lambda: None
+        self.on_play: Callable[[bool], None] = lambda playing: None
+        self.viewed, self.eye, self.look = viewed, None, Look()
+        self.timeline = Timeline(seconds=viewed.seconds)
+        self.closed = False
+
+    eye: Eye | None
+
+    def move(self, eye: Eye) -> None:
+        """The browser's camera is now ``eye``."""
+        with self._lock:
+            if eye == self.eye:
+                return
+            self.eye = eye
+        self._note_change()
+
+    def change(self, **changes: Any) -> None:
+        """Show something else: attributes of ``Look``."""
+        with self._lock:
+            self.look = replace(self.look, **changes)
+        self._note_change()
+
+    def set_time(self, time: float) -> None:
+        """Show another time."""
+        with self._lock:
+            self.timeline = self.timeline.moved(time, self._clock())
+        self._note_change()
+
+    def change_timeline(self, **changes: bool | float) -> None:
+        """Play, pause, loop or change the speed: attributes of ``Timeline``."""
+        with self._lock:
+            self.timeline = self.timeline.changed(self._clock(), **changes)
+        self.on_play(self.timeline.playing)
+        self._note_change()
+
+    def show(self, viewed: Viewed) -> None:
+        """Look at another scene, at the same time."""
+        with self._lock:
+            self.viewed = viewed
+            self.timeline = self.timeline.changed(self._clock(), seconds=viewed.seconds)
+            if self.look.view is not None and self.look.view >= len(viewed.footage):
+                self.look = replace(self.look, view=None)
+        self._note_change()
+
+    def preview(self, recording: Recording | None) -> None:
+        """Show a recorded path once; None: end that."""
+        with self._lock:
+            self._preview = (recording, self._clock()) if recording is not None and len(recording) else None
+        self._note_change()
+
+    def take(self, viewed: Viewed, *, refreshes: bool) -> None:
+        """Look at another state of the same scene; a picture that is refined stays as large, and is drawn again.
+
+        Args:
+            viewed: the newest state.
+            refreshes: draw it even if nothing else has changed.
+        """
+        with self._lock:
+            self.viewed = viewed
+            self._is_stale = self._is_stale or refreshes
+
+    def ask(self, job: Callable[[], None], kind: str | None = None) -> None:
+        """Have ``job`` run by the thread that draws, before the next picture, instead of waiting ones of its kind."""
+        with self._lock:
+            if kind is not None:
+                self._jobs = deque(entry for entry in self._jobs if entry[0] != kind)
+            self._jobs.append((kind, job))
+        self.on_change()
+
+    def close(self) -> None:
+        """The browser is gone: nothing is drawn any more."""
+        with self._lock:
+            self.closed = True
+            self._jobs.clear()
+
+    @property
+    def time(self) -> float:
+        """The time that is shown, in [0, 1]."""
+        return self.timeline.at(self._clock())
+
+    @property
+    def shown_view(self) -> int | None:
+        """Index of the view whose truth is shown; None without any."""
+        with self._lock:
+            look, eye, viewed = self.look, self.eye, self.viewed
+        if eye is None or not len(viewed.footage) or not (look.comparing or look.layer == "error"):
+            return None
+        if look.view is not None:
+            return look.view
+        footage, time = viewed.footage, None if viewed.is_still else self.time
+        return nearest_camera(eye.camera(), time, footage.poses, footage.times, viewed.extent)
+
+    def due(self) -> float | None:
+        """Return in how many seconds something is to be drawn; 0: now, None: not before something changes."""
+        with self._lock:
+            if self.closed or self.eye is None:
+                return None
+            if self._jobs:
+                return 0.0
+            now = self._clock()
+            soonest = max(0.0, self._drawn_at + _SHORTEST - now)
+            if self._is_moving or self._is_stale:
+                return soonest
+            if self._drawn_area is None or not self._is_refined or self._drawn_area < 0.99 * self._refined_area:
+                return max(soonest, self._changed_at + STILL_AFTER - now)
+            return None
+
+    def draw_next(self) -> None:
+        """Do what is due: a job, or the next picture."""
+        with self._lock:
+            job = self._jobs.popleft()[1] if self._jobs and not self.closed else None
+        if job is not None:
+            job()
+            return
+        with self._lock:
+            if self.closed or self.eye is None:
+                return
+            is_moving = self._is_moving or self._clock() < self._changed_at + STILL_AFTER
+            area = self._pace.next_area(int(self._refined_area), None if is_moving else self._drawn_area or 1.0)
+            if self._is_stale and not is_moving:
+                area = max(area, self._drawn_area or 0.0)
+            shot = self.shot(size_within(self._full_size, area))
+            viewed, version = self.viewed, self._changed_at
+            self._is_stale = False
+            self._drawn_area, self._is_refined = self._full_area, True  # if it fails, it is not tried again
+        start = self._clock()
+        picture = draw(viewed, shot)
+        pixels = picture.shape[0] * picture.shape[1]
+        if not self.closed:
+            self._send(Sent(picture, not is_moving, self._clock() - start))
+        end = self._clock()
+        with self._lock:
+            self._pace.observe(pixels, end - start, is_refined=not is_moving)
+            self._drawn_at, self._is_refined = start, not is_moving
+            self._drawn_area = area if version == self._changed_at else None
+            self._end_of_play()
+
+    def shot(self, size: tuple[int, int] | None = None) -> Shot:
+        """Return what is shown now as a picture of ``size``; None: that of the window."""
+        with self._lock:
+            if self.eye is None:
+                raise ValueError("there is no camera yet")
+            size = size or self._full_size
+            camera, time, view = self.eye.camera(size), self.time, self.shown_view
+            if self._preview is not None:
+                recording, since = self._preview
+                camera, recorded = recording.at(self._clock() - since)
+                camera, view = in_window(camera, size), None
+                time = time if recorded is None else recorded
+            look, viewed = self.look, self.viewed
+        layer = "colour" if look.layer == "error" and view is None else look.layer
+        return Shot(
+            camera, None if viewed.is_still else time, layer, look.part, view, look.divide if look.comparing else 1.0
+        )
+
+    @property
+    def _is_moving(self) -> bool:
+        is_playing = self.timeline.playing and not self.viewed.is_still
+        return is_playing or self._preview is not None
+
+    @property
+    def _full_size(self) -> tuple[int, int]:
+        size = (640, 480) if self.eye is None else self.eye.size
+        scale = min(1.0, self.look.longest / max(size))
+        return max(16, round(size[0] * scale)), max(16, round(size[1] * scale))
+
+    @property
+    def _full_area(self) -> float:
+        width, height = self._full_size
+        return float(width * height)
+
+    @property
+    def _refined_area(self) -> float:
+        """Pixels of the picture that is shown when all is still."""
+        return min(self._full_area, self._pace.largest)
+
+    def _end_of_play(self) -> None:
+        now = self._clock()
+        if self.timeline.is_over(now):
+            self.timeline = self.timeline.changed(now, playing=False)
+            self.on_play(False)
+            self._changed_at, self._is_stale = now, True
+        if self._preview is not None and now - self._preview[1] > self._preview[0].duration:
+            self._preview = None
+            self._changed_at, self._is_stale = now, True
+
+    def _note_change(self) -> None:
+        with self._lock:
+            self._changed_at, self._is_stale, self._drawn_area = self._clock(), True, None
+        self.on_change()

@@ -1,0 +1,143 @@
+"""The page that shows a scene while it is trained: a listener of the events that the progress bar listens to."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+
+import torch
+
+from dyngs.config import Config
+from dyngs.config.kinds import network_of
+from dyngs.errors import DyngsError
+from dyngs.scene import Scene
+from dyngs.training.background import evaluation_background
+from dyngs.training.events import Event, StepDone
+from dyngs.training.trainer import Trainer
+from dyngs.view.drawer import Drawer
+from dyngs.view.gate import free_port
+from dyngs.view.server import Serving, Viewer, require_viser
+from dyngs.view.source import Source
+from dyngs.view.viewed import Viewed, viewed_training
+
+SHARE = 0.2
+"""Most of the time of training that pictures for browsers may take."""
+REFRESH_SECONDS = 1.0
+"""Seconds between two pictures of a browser in which nothing moves but the scene."""
+
+
+class DrawnBetweenSteps:
+    """Draws for browsers in the thread that trains, between two steps, since steps change the scene in place.
+
+    Without browsers a step costs one look at an empty list. Pictures change nothing of the training: they are drawn
+    from a copy of the scene's shell, with caches of its own, and without gradients or random numbers.
+
+    Args:
+        drawer: of the browsers.
+        share: of the time that pictures may take.
+        clock: seconds.
+    """
+
+    def __init__(self, drawer: Drawer, share: float = SHARE, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._drawer, self._share, self._clock = drawer, share, clock
+        self._not_before = 0.0
+        self._refreshed_at = -1e9
+
+    def after_step(self, scene: Scene) -> float:
+        """Draw one picture if one is due and time for it is left; return the seconds that it took.
+
+        Args:
+            scene: that is trained.
+        """
+        sessions = self._drawer.sessions
+        if not sessions:
+            return 0.0
+        start = self._clock()
+        if start < self._not_before:
+            return 0.0
+        refreshes = start >= self._refreshed_at + REFRESH_SECONDS
+        if refreshes:
+            self._refreshed_at = start
+        with torch.no_grad():
+            shell = replace(scene)  # with caches of its own
+            for session in sessions:
+                session.take(session.viewed.showing(shell), refreshes=refreshes)
+            while self._drawer.draw_one():
+                if self._clock() - start > REFRESH_SECONDS * self._share:
+                    break
+        took = self._clock() - start
+        self._not_before = start + took / self._share
+        return took
+
+
+class TrainingView:
+    """Listener that serves a page with the scene of a training; a context manager.
+
+    Args:
+        config: of the run.
+        serving: how the page is served.
+        say: is told the link.
+
+    Raises:
+        DyngsError: a network is trained, which has no scene, viser is missing, or the port cannot be had.
+    """
+
+    def __init__(self, config: Config, serving: Serving, say: Callable[[str], None]) -> None:
+        if network_of(config) is not None:
+            raise DyngsError("--view shows scenes, and a network has none; `dyngs view RUN` shows what it predicts")
+        require_viser()
+        free_port(serving.host, serving.port)  # now, not after reading the capture
+        self._say = say
+        self._serving = replace(serving, in_thread=False, target=0.05, longest=0.3)
+        self._viewer: Viewer | None = None
+        self._drawn: DrawnBetweenSteps | None = None
+        self._stack = ExitStack()
+
+    def __enter__(self) -> TrainingView:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def __call__(self, event: Event) -> None:
+        """Draw what browsers ask for, after a step."""
+        match event:
+            case StepDone():
+                if self._drawn is None:
+                    start = time.perf_counter()
+                    self._drawn = self._begin(event)
+                    took = time.perf_counter() - start
+                else:
+                    took = self._draw(event, self._drawn)
+                if took:
+                    event.loop.watch.pause(took)
+
+    def _draw(self, event: StepDone, drawn: DrawnBetweenSteps) -> float:
+        match event.loop.trainer:
+            case Trainer() as trainer:
+                return drawn.after_step(trainer.scene)
+            case _:
+                return 0.0
+
+    def _begin(self, event: StepDone) -> DrawnBetweenSteps:
+        """Serve the page, now that there is a scene."""
+        match event.loop.trainer:
+            case Trainer() as trainer:
+                first = _first(trainer)
+            case _:
+                raise ValueError("what is trained has no scene")
+        viewer = Viewer(Source((first.name,), lambda _: first), first, self._serving)
+        self._viewer = self._stack.enter_context(viewer)
+        self._say(f"viewing: {self._viewer.link} (until the training ends)")
+        return DrawnBetweenSteps(self._viewer.drawer)
+
+
+def _first(trainer: Trainer) -> Viewed:
+    """Return the scene of a trainer with the views that it is trained on."""
+    config = trainer.config
+    choice = config.data.background if config.data.background != "auto" else trainer.background
+    _, background = evaluation_background(choice, has_alpha=False)
+    with torch.no_grad():
+        return viewed_training(config.run.name, config, replace(trainer.scene), trainer.pictures, background)

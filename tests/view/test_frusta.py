@@ -1,0 +1,16 @@
+import numpy as np
+import pytest
+
+from dyngs.view.frusta import distinct, spread
+
+
+@pytest.mark.parametrize(("count", "most", "chosen"), [(0, 5, []), (3, 5, [0, 1, 2]), (11, 3, [0, 5, 10]), (1, 1, [0])])
+def test_frusta_are_spread_over_the_cameras(count: int, most: int, chosen: list[int]) -> None:
+    assert spread(count, most) == chosen
+
+
+def test_a_standing_camera_is_shown_once() -> None:
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[[1, 3], 0, 3] = 1.0
+    poses[5, 2, 3] = 2.0
+    assert distinct(poses) == [0, 1, 5]

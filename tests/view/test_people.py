@@ -1,0 +1,60 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from moving_scene import camera
+from scene_kinds import scene_of_kind
+
+from dyngs.errors import DyngsError
+from dyngs.view.people import AS_CAPTURED, AT_REST, BY_SLIDERS, MAIN_JOINTS, in_motion, joint_row, motion_files, posed
+from dyngs.view.viewed import Viewed
+
+
+@pytest.fixture
+def viewed() -> Viewed:
+    scene = scene_of_kind("human")
+    return Viewed("person", scene, scene.options, torch.ones(3), camera(), np.zeros(3), 4.0, np.array([0.0, 1, 0]))
+
+
+def test_sliders_at_zero_are_the_rest_pose(viewed: Viewed) -> None:
+    rest = in_motion(viewed, AT_REST, {}, {"neck": (90.0, 0, 0)})  # sliders do not count
+    zero = in_motion(viewed, BY_SLIDERS, {}, {"neck": (0.0, 0, 0)})
+    assert rest.is_still
+    assert torch.allclose(rest.scene.at(None).means, zero.scene.at(None).means, atol=1e-6)
+    assert in_motion(viewed, AS_CAPTURED, {}, {}) is viewed
+
+
+def test_a_turned_joint_moves_some_of_the_person(viewed: Viewed) -> None:
+    rest, turned = (posed(viewed, angles).scene.at(None).means for angles in ({}, {"pelvis": (0.0, 90.0, 0.0)}))
+    assert float((turned - rest).norm(dim=1).max()) > 1e-3
+    back = posed(viewed, {"pelvis": (0.0, 360.0, 0.0)}).scene.at(None).means
+    assert torch.allclose(back, rest, atol=1e-4)
+
+
+@pytest.mark.parametrize("count", [24, 52, 55])
+def test_every_body_has_the_main_joints(count: int) -> None:
+    rows = [joint_row(name, count) for name in MAIN_JOINTS]
+    assert len(set(rows)) == len(rows)
+    assert max(rows) < count
+
+
+def test_motion_files_are_found_by_suffix(tmp_path: Path) -> None:
+    for name in ("walk.npz", "b/run.BVH", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert list(motion_files(tmp_path)) == ["b/run.BVH", "walk.npz"]
+    assert list(motion_files(tmp_path / "walk.npz")) == ["walk.npz"]
+    assert motion_files(None) == {}
+    with pytest.raises(DyngsError, match="no such file"):
+        motion_files(tmp_path / "nothing")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DyngsError, match="no motion files"):
+        motion_files(tmp_path / "empty")
+
+
+def test_a_motion_that_cannot_be_read_is_one_line(viewed: Viewed, tmp_path: Path) -> None:
+    assert viewed.run is None
+    shown = in_motion(replace(viewed, run=None), "walk.npz", {"walk.npz": tmp_path / "walk.npz"}, {})
+    assert shown.is_still  # without a run, which holds the template, only poses

@@ -1,0 +1,144 @@
+"""The viewer in a real browser."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser import Browser, Page, missing
+from moving_scene import write_moving_run
+from PIL import Image
+
+from dyngs.cli import main
+from dyngs.metrics import ssim
+from dyngs.view.recording import Keyframe, Recording
+from dyngs.view.server import Browsing, Serving, Viewer
+from dyngs.view.source import open_source
+
+pytest.importorskip("viser", reason="viser is not installed (pip install 'dyngs[view]')")
+pytestmark = pytest.mark.skipif(missing() is not None, reason=missing() or "")
+
+SIZE = (900, 480)
+SEEN = (slice(160, 470), slice(5, 560))
+"""Of the page: below the browser's message about software rendering, left of the controls."""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with Browser(timeout=30) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_moving_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture
+def viewer(run: Path) -> Iterator[Viewer]:
+    source = open_source(run)
+    with Viewer(source, source.load(source.names[0]), Serving()) as viewer:
+        yield viewer
+
+
+def until(is_so: Callable[[], bool], page: Page | None = None, seconds: float = 30) -> None:
+    end = time.monotonic() + seconds
+    while not is_so():
+        assert time.monotonic() < end, "waited in vain"
+        page.driven.wait_for_timeout(50) if page is not None else time.sleep(0.05)
+
+
+def opened(viewer: Viewer, browser: Browser) -> tuple[Page, Browsing]:
+    """A page whose picture is complete."""
+    known = viewer.browsing
+    page = browser.open(viewer.link, *SIZE)
+    until(lambda: len(viewer.browsing) > len(known), page)
+    (browsing,) = [one for one in viewer.browsing if one not in known]
+    settle(page, browsing)
+    return page, browsing
+
+
+def settle(page: Page, browsing: Browsing) -> None:
+    """Wait until the controls are in their place, nothing is left to be drawn, and the page has shown it."""
+    until(lambda: browsing.session.eye is not None and browsing.session.eye.size[0] < SIZE[0], page)
+    until(lambda: browsing.num_sent > 0 and browsing.session.due() is None, page)
+    page.driven.wait_for_timeout(600)
+    until(lambda: browsing.session.due() is None, page)
+    until(lambda: bool((page.screenshot()[-5, 300] >= 254).all()), page)  # no longer dimmed, as before it is connected
+
+
+def rendered(run: Path, browsing: Browsing, folder: Path) -> np.ndarray:
+    """What ``dyngs render`` draws along the path that the page would save."""
+    session = browsing.session
+    assert session.eye is not None
+    recording = Recording((Keyframe(session.eye.camera(), session.time),))
+    folder.mkdir()
+    path = folder / "path.json"
+    path.write_text(recording.document(session.eye.size, 30.0, session.viewed.world_offset))
+    assert main(["render", str(run), "--path", str(path), "--out", str(folder / "out")]) == 0
+    return np.asarray(Image.open(folder / "out" / "frame_0000.png").convert("RGB"))
+
+
+def likeness(one: np.ndarray, other: np.ndarray) -> float:
+    first, second = (torch.from_numpy(x.copy()).float() / 255 for x in (one, other))
+    return ssim(first, second)
+
+
+def test_the_page_shows_what_render_draws_at_every_time(
+    viewer: Viewer, browser: Browser, run: Path, tmp_path: Path
+) -> None:
+    page, browsing = opened(viewer, browser)
+    first = page.screenshot()
+    truth = rendered(run, browsing, tmp_path / "first")
+    assert likeness(first[SEEN], truth[SEEN]) > 0.95
+    slider = page.driven.get_by_role("slider").nth(1)
+    slider.focus()
+    page.press("End")
+    until(lambda: browsing.session.time == 1.0, page)
+    settle(page, browsing)
+    last = page.screenshot()
+    later = rendered(run, browsing, tmp_path / "last")
+    assert likeness(last[SEEN], later[SEEN]) > 0.95
+    assert likeness(last[SEEN], first[SEEN]) < likeness(last[SEEN], later[SEEN])
+    assert np.abs(later[SEEN].astype(int) - truth[SEEN]).mean() > 0.1  # something has moved
+    assert page.errors == []
+    assert {address.split("//")[1] for address in page.requests} == {viewer.link.split("//")[1]}
+    page.close()
+
+
+def test_two_browsers_have_cameras_of_their_own_and_one_may_go(viewer: Viewer, browser: Browser) -> None:
+    (one, first), (two, second) = opened(viewer, browser), opened(viewer, browser)
+    threads = threading.active_count()
+    before = second.session.eye
+    one.drag((300, 300), (380, 330))
+    until(lambda: first.session.eye is not None and first.session.eye != before, one)
+    assert before is not None
+    assert second.session.eye is not None
+    assert second.session.eye.position == pytest.approx(before.position)
+    for page in (one, two):
+        page.click("text=Play")
+    sent = second.num_sent
+    until(lambda: second.num_sent > sent + 3, two)
+    one.close()  # while it gets pictures
+    until(lambda: len(viewer.browsing) == 1, two)
+    sent = second.num_sent
+    until(lambda: second.num_sent > sent + 3, two)
+    assert viewer.drawer.sessions == (second.session,)
+    assert first.session.closed
+    assert two.errors == []
+    two.close()
+    until(lambda: not viewer.browsing)
+    assert viewer.drawer.sessions == ()
+    assert threading.active_count() <= threads + 2  # viser's pool may have grown
+
+
+def test_a_dead_server_is_shown_as_such(viewer: Viewer, browser: Browser) -> None:
+    page, _ = opened(viewer, browser)
+    assert page.driven.get_by_text("Connected", exact=True).is_visible()
+    viewer.stop()
+    page.driven.get_by_text("Connecting...").wait_for(timeout=15_000)
+    assert not page.driven.get_by_text("Connected", exact=True).is_visible()
+    page.close()

@@ -1,0 +1,176 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from moving_scene import Sliding, camera, moving_scene, still_scene
+
+from dyngs.scene import Scene
+from dyngs.view.cameras import camera_at, pose_of
+from dyngs.view.layers import Shot, draw
+from dyngs.view.pace import STILL_AFTER
+from dyngs.view.recording import Keyframe, Recording
+from dyngs.view.session import Eye, Sent, Session
+from dyngs.view.viewed import Viewed
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def viewed(scene: Scene | None = None) -> Viewed:
+    return Viewed(
+        "balls",
+        scene or moving_scene(Sliding()),
+        still_scene().options,
+        torch.ones(3),
+        camera(),
+        np.zeros(3),
+        4.0,
+        np.array([0.0, -1, 0]),
+    )
+
+
+def eye(x: float = 0.0, size: tuple[int, int] = (400, 300)) -> Eye:
+    wxyz, position = pose_of(camera())
+    return Eye(tuple(wxyz), (x, *position[1:].tolist()), 0.7, size)
+
+
+class Looked:
+    """A session on a clock that stands still, and what it sent."""
+
+    def __init__(self, scene: Scene | None = None) -> None:
+        self.clock, self.sent = Clock(), list[Sent]()
+        self.session = Session(viewed(scene), self.sent.append, clock=self.clock)
+
+    def after(self, seconds: float) -> None:
+        """Let time pass, and draw whatever is due then."""
+        self.clock.now += seconds
+        while self.session.due() == 0.0:
+            self.session.draw_next()
+            self.clock.now += 0.05
+
+
+def test_nothing_is_drawn_before_there_is_a_camera() -> None:
+    assert Looked().session.due() is None
+
+
+def test_small_while_moving_then_whole_and_then_nothing_until_something_changes() -> None:
+    looked = Looked()
+    looked.session.move(eye(size=(800, 600)))
+    looked.after(0)
+    first = looked.sent[0]
+    assert not first.is_refined
+    assert first.picture.shape[0] < 600
+    due = looked.session.due()
+    assert due is not None
+    assert 0 < due <= STILL_AFTER
+    looked.after(due)
+    looked.after(0.1)
+    assert looked.sent[-1].is_refined
+    assert looked.sent[-1].picture.shape == (600, 800, 3)
+    assert looked.session.due() is None
+    looked.session.move(eye(size=(800, 600)))  # the same
+    assert looked.session.due() is None
+    looked.session.change(layer="alpha")
+    assert looked.session.due() == 0.0
+
+
+def test_the_newest_camera_wins() -> None:
+    looked = Looked()
+    for x in (0.1, 0.2, 0.3):
+        looked.session.move(eye(x))
+    looked.after(0)
+    assert len(looked.sent) == 1
+    small = looked.sent[0].picture
+    wanted = draw(viewed(), Shot(eye(0.3).camera((small.shape[1], small.shape[0])), 0.0))
+    assert np.array_equal(small, wanted)
+
+
+def test_a_playing_scene_is_drawn_on_and_on_and_a_still_one_is_not() -> None:
+    looked = Looked()
+    looked.session.move(eye())
+    looked.after(1)
+    looked.after(1)
+    assert looked.session.due() is None
+    before = len(looked.sent)
+    looked.session.change_timeline(playing=True, loops=False)
+    pictures = []
+    for _ in range(4):
+        looked.clock.now += 1.0
+        looked.session.draw_next()
+        pictures.append(looked.sent[-1].picture)
+    assert len(looked.sent) == before + 4
+    assert not np.array_equal(pictures[0], pictures[1])
+    looked.after(5)
+    assert not looked.session.timeline.playing  # the end
+    assert looked.session.time == 1.0
+    looked.after(1)
+    assert looked.session.due() is None
+    still = Looked(still_scene())
+    still.session.move(eye())
+    still.session.change_timeline(playing=True)
+    still.after(1)
+    still.after(1)
+    assert still.session.due() is None
+
+
+def test_a_preview_shows_the_recorded_cameras_and_then_the_browser_s_own() -> None:
+    looked = Looked()
+    looked.session.move(eye())
+    looked.after(1)
+    wxyz, _ = pose_of(camera())
+    far = camera_at(wxyz, (0, 0, -9), 0.7, (400, 300))
+    looked.session.preview(Recording((Keyframe(far, 0.5, 1.0), Keyframe(far, 0.5, 1.0))))
+    shot = looked.session.shot()
+    assert torch.allclose(shot.camera.cam_from_world, far.cam_from_world, atol=1e-6)
+    assert shot.time == pytest.approx(0.5)
+    looked.after(2)
+    assert torch.allclose(looked.session.shot().camera.cam_from_world, eye().camera().cam_from_world)
+
+
+def test_an_error_is_not_drawn_again_until_something_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked = Looked()
+    looked.session.move(eye())
+    monkeypatch.setattr("dyngs.view.session.draw", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        looked.session.draw_next()
+    looked.clock.now += 9
+    assert looked.session.due() is None
+
+
+def test_of_jobs_of_a_kind_the_newest_is_done() -> None:
+    looked, done = Looked(), list[int]()
+    looked.session.move(eye())
+    for number in (1, 2, 3):
+        looked.session.ask(lambda number=number: done.append(number), "pose")
+    looked.session.ask(lambda: done.append(4))
+    looked.after(1)
+    assert done == [3, 4]
+
+
+def test_who_has_gone_gets_nothing() -> None:
+    looked = Looked()
+    looked.session.move(eye())
+    looked.session.ask(lambda: pytest.fail("asked"))
+    looked.session.close()
+    assert looked.session.due() is None
+    looked.session.draw_next()
+    assert looked.sent == []
+
+
+def test_the_scene_in_training_is_drawn_again_as_large_as_it_was() -> None:
+    looked = Looked()
+    looked.session.move(eye())
+    looked.after(1)
+    looked.after(1)
+    whole = looked.sent[-1].picture.shape
+    looked.session.take(viewed(), refreshes=False)
+    assert looked.session.due() is None
+    looked.session.take(replace(viewed(), name="later"), refreshes=True)
+    looked.after(1)
+    assert looked.sent[-1].is_refined
+    assert looked.sent[-1].picture.shape == whole

@@ -1,0 +1,76 @@
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+from view_sessions import looking_at_balls
+
+import dyngs
+from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.training.events import Event, StepDone
+from dyngs.training.trainer import Trainer
+from dyngs.view.drawer import Drawer
+from dyngs.view.session import Session
+from dyngs.view.training import DrawnBetweenSteps
+from dyngs.view.viewed import viewed_training
+
+
+class Onlooker:
+    """A browser without a browser: it looks at the training from the second step on, and never keeps still."""
+
+    def __init__(self) -> None:
+        self.drawer = Drawer(lambda session, message: pytest.fail(message))
+        self.drawn = DrawnBetweenSteps(self.drawer, share=0.9)
+        self.seen: list[bytes] = []
+
+    def __call__(self, event: Event) -> None:
+        match event:
+            case StepDone():
+                trainer = event.loop.trainer
+                assert isinstance(trainer, Trainer)
+                if event.step == 2:
+                    first = viewed_training("run", trainer.config, trainer.scene, trainer.pictures, torch.ones(3))
+                    session = Session(first, lambda sent: self.seen.append(sent.picture.tobytes()))
+                    self.drawer.add(session)
+                for session in self.drawer.sessions:
+                    session.change(divide=event.step / 1000)
+                    if session.eye is None:
+                        other, _ = looking_at_balls()
+                        assert other.eye is not None
+                        session.move(other.eye)
+                self.drawn.after_step(trainer.scene)
+
+
+@pytest.mark.parametrize("preset", ["static", "dynamic"])
+def test_training_gives_the_same_bytes_whoever_looks(preset: str, tmp_path: Path, still: Path, moving: Path) -> None:
+    onlooker, found = Onlooker(), []
+    for name, listeners in (("alone", []), ("seen", [onlooker])):
+        overrides = [f"data.root={still if preset == 'static' else moving}", f"run.dir={tmp_path / name}"]
+        overrides += ["train.steps=12", "init.num_random=40", "run.threads=1"]
+        folder = dyngs.train(dyngs.load_config(preset, overrides), listeners=listeners)
+        found.append(checkpoint_paths(folder)[-1].read_bytes())
+    assert found[0] == found[1]
+    assert len(set(onlooker.seen)) > 2
+
+
+def test_pictures_take_no_more_than_their_share() -> None:
+    now, drawer = [0.0], Drawer(lambda session, message: None)
+    session, sent = looking_at_balls()
+    scene = session.viewed.scene
+
+    def clock() -> float:
+        now[0] += 0.01  # whatever is done takes a while
+        return now[0]
+
+    drawn = DrawnBetweenSteps(drawer, share=0.25, clock=clock)
+    assert drawn.after_step(scene) == 0.0
+    assert now == [0.0]  # without browsers not even the clock is read
+    drawer.add(session)
+    spent = 0.0
+    for _ in range(300):
+        now[0] += 0.01  # a step
+        session.change(divide=now[0] % 1)
+        spent += drawn.after_step(scene)
+    assert sent
+    assert 0.05 < spent / now[0] < 0.3
+    assert threading.active_count() < 20
