@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 MOST = 120
 """Frusta that are shown at most, spread evenly over the cameras."""
 _SIZE = 0.05
-"""Depth of a frustum relative to the distance of the cameras."""
+"""Depth of a frustum relative to the distance of the cameras from what they see, at most."""
+_OF_SPREAD = 0.15
+"""The same relative to the distance of the cameras from their middle: those of a video stand close together."""
 
 
 class Frusta:
@@ -46,14 +48,14 @@ class Frusta:
     def _add(self, viewed: Viewed, index: int, generation: int) -> None:
         if generation != self._generation:
             return
-        camera = viewed.footage.cameras[index]
+        camera, size = viewed.footage.cameras[index], frustum_size(viewed.footage.poses, viewed.extent)
         wxyz, position = pose_of(camera)
         handle = self._browsing.client.scene.add_camera_frustum(
             f"/cameras/{index}",
             fov=fov_of(camera),
             aspect=camera.width / camera.height,
-            scale=_SIZE * viewed.extent,
-            thickness=0.002 * viewed.extent,
+            scale=size,
+            thickness=0.03 * size,
             color=(230, 160, 30),
             image=thumbnail(viewed, index),
             format="jpeg",
@@ -83,6 +85,13 @@ def distinct(poses: np.ndarray) -> list[int]:
     """Return the indices of the first view from each pose of (V, 4, 4), ascending: a standing camera is shown once."""
     _, first = np.unique(poses.round(6).reshape(len(poses), -1), axis=0, return_index=True)
     return sorted(first.tolist())
+
+
+def frustum_size(poses: np.ndarray, extent: float) -> float:
+    """Return the depth of the frusta of poses (V, 4, 4), world units; ``extent`` is the distance of what they see."""
+    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    spread_out = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
+    return min(_SIZE * extent, _OF_SPREAD * spread_out) if spread_out > 1e-4 * extent else _SIZE * extent
 
 
 def thumbnail(viewed: Viewed, index: int) -> np.ndarray | None:

@@ -67,7 +67,9 @@ def draw(viewed: Viewed, shot: Shot) -> np.ndarray:
         return rgb
     if shot.layer == "error":
         return _error(rgb, truth)
-    return _divided(rgb, np.where(np.isnan(truth), rgb, to_uint8(np.nan_to_num(truth))).astype(np.uint8), shot.divide)
+    beside = np.isnan(truth)
+    rgb = np.where(beside, rgb // 2, rgb)  # there is no truth: darker
+    return _divided(rgb, np.where(beside, rgb, to_uint8(np.nan_to_num(truth))).astype(np.uint8), shot.divide)
 
 
 def truth_in_window(viewed: Viewed, view: int, size: tuple[int, int]) -> np.ndarray | None:

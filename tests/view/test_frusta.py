@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dyngs.view.frusta import distinct, spread
+from dyngs.view.frusta import distinct, frustum_size, spread
 
 
 @pytest.mark.parametrize(("count", "most", "chosen"), [(0, 5, []), (3, 5, [0, 1, 2]), (11, 3, [0, 5, 10]), (1, 1, [0])])
@@ -14,3 +14,11 @@ def test_a_standing_camera_is_shown_once() -> None:
     poses[[1, 3], 0, 3] = 1.0
     poses[5, 2, 3] = 2.0
     assert distinct(poses) == [0, 1, 5]
+
+
+def test_frusta_are_as_small_as_the_cameras_stand_close() -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    assert frustum_size(poses, 4.0) == pytest.approx(0.2)  # one standing camera
+    poses[:, 0, 3] = [-1, 1, -1, 1]
+    assert frustum_size(poses, 4.0) == pytest.approx(0.15)
+    assert frustum_size(100 * poses, 4.0) == pytest.approx(0.2)

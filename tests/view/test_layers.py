@@ -86,3 +86,9 @@ def test_the_error_is_that_of_render_and_truth(run: Viewed) -> None:
     error = draw(run, Shot(camera(32, 32), layer="error", view=1)).sum(-1).astype(float)
     wanted = np.abs(render - window).mean(-1)
     assert np.corrcoef(error.ravel(), np.minimum(wanted * 4, 1).ravel())[0, 1] > 0.9
+
+
+def test_beside_the_true_picture_it_is_darker(run: Viewed) -> None:
+    wide = draw(run, Shot(camera(96, 48), view=0, divide=1.0))
+    assert wide[:, :20].mean() <= 128
+    assert wide[:, 40:56].mean() > 128
