@@ -98,7 +98,7 @@ class Controls:
             initial_value=session.look.layer,
             hint="error: against the truth, at a camera of the capture",
         )
-        layer.on_update(lambda _: session.change(layer=layer.value))
+        layer.on_update(lambda _: self._change(layer=layer.value))
         if 0 < viewed.scene.num_moving < len(viewed.scene) or (viewed.in_training and viewed.has_timeline):
             part = gui.add_dropdown("Parts", PARTS, initial_value=session.look.part)
             part.on_update(lambda _: session.change(part=part.value))
@@ -140,7 +140,7 @@ class Controls:
         divide = gui.add_slider("Divide", 0.0, 1.0, 0.01, session.look.divide)
         view = gui.add_dropdown("Picture", (NEAREST, *viewed.footage.names))
         session.change(view=None)
-        compare.on_update(lambda _: session.change(comparing=bool(compare.value)))
+        compare.on_update(lambda _: self._change(comparing=bool(compare.value)))
         divide.on_update(lambda _: session.change(divide=float(divide.value)))
 
         def choose(_: Any) -> None:
@@ -151,6 +151,11 @@ class Controls:
                 self._browsing.go_to(index)
 
         view.on_update(choose)
+
+    def _change(self, **changes: Any) -> None:
+        """Show something else, which frusta may cover."""
+        self._browsing.session.change(**changes)
+        self._frusta.hide_what_covers()
 
     def _choose(self, name: str) -> None:
         """Load another scene, in the thread that draws."""

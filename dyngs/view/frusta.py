@@ -14,6 +14,8 @@ from dyngs.view.viewed import Viewed
 if TYPE_CHECKING:
     from dyngs.view.server import Browsing
 
+_COVERS = 1.5
+"""Distance, in depths of a frustum, within which its picture would cover what is behind."""
 MOST = 120
 """Frusta that are shown at most, spread evenly over the cameras."""
 _SIZE = 0.05
@@ -27,8 +29,9 @@ class Frusta:
 
     def __init__(self, browsing: Browsing) -> None:
         self._browsing = browsing
-        self._handles: list[Any] = []
+        self._handles: list[tuple[Any, np.ndarray, float]] = []
         self._generation = 0
+        browsing.on_move = self.hide_what_covers
 
     def show(self, viewed: Viewed) -> None:
         """Add the frusta, picture by picture, as the thread that draws finds time."""
@@ -42,8 +45,19 @@ class Frusta:
         """Remove all frusta."""
         self._generation += 1
         handles, self._handles = self._handles, []
-        for handle in handles:
+        for handle, _, _ in handles:
             handle.remove()
+
+    def hide_what_covers(self) -> None:
+        """Hide the frusta that the browser's camera stands in, and all where the picture is of another camera."""
+        session = self._browsing.session
+        eye, is_elsewhere = session.eye, session.shown_view is not None
+        if eye is None:
+            return
+        for handle, position, size in list(self._handles):
+            covers = is_elsewhere or float(np.linalg.norm(position - eye.position)) < _COVERS * size
+            if handle.visible == covers:
+                handle.visible = not covers
 
     def _add(self, viewed: Viewed, index: int, generation: int) -> None:
         if generation != self._generation:
@@ -65,7 +79,8 @@ class Frusta:
             receive_shadow=False,
         )
         handle.on_click(lambda _: self._go(index))
-        self._handles.append(handle)
+        self._handles.append((handle, position, size))
+        self.hide_what_covers()
 
     def _go(self, index: int) -> None:
         time = self._browsing.session.viewed.footage.times[index]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -65,6 +65,7 @@ class Browsing:
         self.session = Session(viewed, self.send, pace)
         self.status: viser.GuiMarkdownHandle | None = None
         self.time_slider: viser.GuiSliderHandle | None = None
+        self.on_move: Callable[[], None] = lambda: None
         self.num_sent = 0
         self._told_at, self._since_told = 0.0, 0
 
@@ -84,6 +85,7 @@ class Browsing:
         camera = self.client.camera
         size = (max(16, int(camera.image_width)), max(16, int(camera.image_height)))
         self.session.move(Eye(tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov), size))
+        self.on_move()
 
     def go_to(self, index: int | None) -> None:
         """Move the browser's camera to a view of the capture; None: to where it began."""

@@ -1,7 +1,10 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from view_sessions import looking_at_balls
 
-from dyngs.view.frusta import distinct, frustum_size, spread
+from dyngs.view.frusta import Frusta, distinct, frustum_size, spread
 
 
 @pytest.mark.parametrize(("count", "most", "chosen"), [(0, 5, []), (3, 5, [0, 1, 2]), (11, 3, [0, 5, 10]), (1, 1, [0])])
@@ -22,3 +25,14 @@ def test_frusta_are_as_small_as_the_cameras_stand_close() -> None:
     poses[:, 0, 3] = [-1, 1, -1, 1]
     assert frustum_size(poses, 4.0) == pytest.approx(0.15)
     assert frustum_size(100 * poses, 4.0) == pytest.approx(0.2)
+
+
+def test_a_frustum_that_the_camera_stands_in_is_hidden() -> None:
+    session, _ = looking_at_balls()
+    frusta = Frusta(SimpleNamespace(session=session))  # type: ignore[arg-type]
+    assert session.eye is not None
+    here, there = (SimpleNamespace(visible=True) for _ in range(2))
+    eye = np.array(session.eye.position)
+    frusta._handles = [(here, eye + 0.01, 0.2), (there, eye + 1.0, 0.2)]
+    frusta.hide_what_covers()
+    assert (here.visible, there.visible) == (False, True)
