@@ -1,4 +1,4 @@
-"""``dyngs export``: write a run as files: Gaussians in many formats, tracks, an avatar, one small .dyngs file, or a page."""
+"""``dyngs export``: write a run as files: Gaussians in many formats, tracks, avatar, small .dyngs file, or page."""
 
 from __future__ import annotations
 

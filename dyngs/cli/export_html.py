@@ -27,7 +27,7 @@ def export_page(arguments: argparse.Namespace) -> int:
     from dyngs.output.page_of_run import PageOptions, write_run_page
 
     for name, reason in _UNFIT.items():
-        if getattr(arguments, name, None) not in (None, False):
+        if getattr(arguments, name) not in (None, False):
             raise DyngsError(f"--{name.replace('_', '-')} does not go with --format html: {reason}")
     source: Path = arguments.run_dir
     if arguments.out is None and is_avatar_file(source):
@@ -38,7 +38,7 @@ def export_page(arguments: argparse.Namespace) -> int:
     options = PageOptions(
         motion=arguments.motion,
         time=0.0 if arguments.time is None else arguments.time,
-        up=getattr(arguments, "from_up", None),
+        up=arguments.from_up,
     )
     written, notes = write_run_page(source, out, options)
     print_notes(notes)

@@ -126,8 +126,9 @@ def _around(run: LoadedRun, title: str, seconds: float | None, up: str) -> Stagi
 
 
 def _avatar_page(source: Path, path: Path, options: PageOptions) -> WrittenPage:
-    job = job_of_avatar(source, RenderJobOptions(path="orbit", motion=options.motion, num_frames=8))
-    front = job_of_avatar(source, RenderJobOptions(path=None, motion=options.motion, times=(0.0,))).path.cameras
+    asked = RenderJobOptions(path="orbit", motion=options.motion, num_frames=8, up=options.up)
+    job = job_of_avatar(source, asked)
+    front = job_of_avatar(source, replace(asked, path=None, num_frames=None, times=(0.0,))).path.cameras
     red, green, blue = (0.0, 0.0, 0.0) if job.background is None else job.background.tolist()
     cameras: Cameras = job.path.cameras
     staging = Staging(

@@ -28,6 +28,8 @@ def test_a_page_is_written(run: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     [
         ("--format html --times 0:1:3", "plays the whole clip"),
         ("--format html --static", "shows the whole scene"),
+        ("--format html --up y", "--from-up names its axis"),
+        ("--format html --sh-degree 3", "the colours of the run"),
         ("--format html --max-change 3", "goes with --format dyngs"),
         ("--format html --out page.pdf", "give --out page.html"),
         ("--format html --motion walk.bvh", "needs the run of a person"),
