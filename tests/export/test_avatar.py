@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import asdict
@@ -180,3 +181,18 @@ def test_the_command_line_takes_the_file_for_the_run(
     ):
         assert main(wrong) == 2
         assert line in capsys.readouterr().err
+
+
+def test_a_person_of_a_file_becomes_a_page(
+    file: Path, motion: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "page.html"
+    assert main(["export", str(file), "--motion", str(motion), "--out", str(page)]) == 0
+    header = json.loads(page.read_text(encoding="utf-8").split('id="header">')[1].split("</script>")[0])
+    assert header["moves"]
+    assert len(header["bones"]["parents"]) == 55
+    assert header["up"] == pytest.approx([0.0, 1.0, 0.0], abs=1e-6)
+    capsys.readouterr()
+    assert main(["export", str(file), "--format", "html"]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "Give --out FILE.html" in line
