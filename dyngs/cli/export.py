@@ -7,14 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import is_avatar_file, print_notes, run_of_scene_file, scene_time
-from dyngs.cli.splats import SPLAT_FORMATS, add_axes, known_suffix, print_redrawn
+from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, known_suffix, print_redrawn
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
     from dyngs.export.run_to_splats import Part
+    from dyngs.output.redrawn import Redrawn
     from dyngs.runs.checkpoint import LoadedRun
+    from dyngs.scene import Scene
+    from dyngs.splats.formats import Written
 
-_OTHER_SUFFIXES = {".npz": "tracks", ".safetensors": "avatar", ".dyngs": "dyngs", ".html": "html"}
+_OTHER_SUFFIXES = {f".{MOVING}": MOVING, ".npz": "tracks", ".safetensors": "avatar", ".dyngs": "dyngs"}
+_OTHER_SUFFIXES |= {".html": "html"}
 
 _EPILOG = """\
 examples:
@@ -22,6 +26,7 @@ examples:
   dyngs export runs/dance --time 0.5 --out middle.ply             the scene at one time
   dyngs export runs/bench --out bench.spz                         the suffix names the format: .glb, .sog, .usdz ...
   dyngs export runs/dance --times 0:1:30 --out frames             frame_0000.ply ... for players of sequences
+  dyngs export runs/dance --out dance.4dgs                        all training times in one file
   dyngs export runs/dance --static --out stage.ply                only the Gaussians that never move
   dyngs export runs/ann --motion walk.npz --out walk              a person (model.kind=human), one file per frame
   dyngs export runs/ann --format avatar --out ann.safetensors     a person as one file, for `render` and `export`
@@ -45,7 +50,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--format",
         type=_format,
-        choices=(*SPLAT_FORMATS, "tracks", "dyngs", "avatar", "html"),
+        choices=(*SPLAT_FORMATS, MOVING, "tracks", "dyngs", "avatar", "html"),
         help="file format (default: what the suffix of --out names, else ply)",
     )
     parser.add_argument(
@@ -114,6 +119,8 @@ def run(arguments: argparse.Namespace) -> int:
         print_notes(("nothing moves in this run: it is the same at all times",))
     if kind == "tracks":
         files = _export_tracks(arguments, loaded, times)
+    elif kind == MOVING:
+        files = _export_moving(arguments, loaded, times or loaded.scene.times or (0.0,))
     else:
         files = _export_splats(arguments, loaded, times, kind)
     size = sum(path.stat().st_size for path in files) / 1e6
@@ -209,7 +216,6 @@ def _export_splats(
 ) -> list[Path]:
     """Write a sequence if several times of a moving scene are asked for, else one file; return the paths."""
     from dyngs.export.run_to_splats import scene_part, write_run_sequence, write_run_splats
-    from dyngs.output.redrawn import compare_run
     from dyngs.output.upright import writing_of
     from dyngs.splats.formats import format_named
 
@@ -217,7 +223,7 @@ def _export_splats(
     suffix = own.suffixes[0]
     if loaded.scene.colour is not None:
         print_notes(("the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",))
-    part: Part = "still" if arguments.static else "moving" if arguments.dynamic else "all"
+    part = _part(arguments)
     scene = scene_part(loaded.scene, part)
     how, line = writing_of(loaded, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
@@ -239,8 +245,40 @@ def _export_splats(
         path = out or arguments.run_dir / f"{stem}{suffix}"
         written = [write_run_splats(loaded, path, moments[0], part, how)]
     shown = sorted({0, len(written) // 2, len(written) - 1})
-    print_redrawn(written[0].notes, [compare_run(loaded, scene, moments[i], written[i]) for i in shown])
+    print_redrawn(written[0].notes, [_redrawn(loaded, scene, moments[i], written[i]) for i in shown])
     return [one.path for one in written]
+
+
+def _part(arguments: argparse.Namespace) -> Part:
+    return "still" if arguments.static else "moving" if arguments.dynamic else "all"
+
+
+def _redrawn(loaded: LoadedRun, scene: Scene, time: float, written: Written) -> Redrawn:
+    """Return how a file differs from the scene."""
+    from dyngs.output.redrawn import compare_run
+    from dyngs.splats.formats import read_splats
+
+    return compare_run(loaded, scene, time, written.splat, read_splats(written.path))
+
+
+def _export_moving(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...]) -> list[Path]:
+    """Write all times as one file of moving Gaussians."""
+    from dyngs.export.moving_file import SUFFIX, UP, read_moment, write_moving
+    from dyngs.export.run_to_splats import scene_part
+    from dyngs.output.redrawn import compare_run
+    from dyngs.output.upright import writing_of
+
+    if arguments.sh_degree is not None:
+        raise DyngsError(f"--sh-degree does not go with --format {MOVING}, which holds no harmonics")
+    how, line = writing_of(loaded, UP, arguments.up, arguments.from_up)
+    print_notes((line,))
+    part, scene = _part(arguments), scene_part(loaded.scene, _part(arguments))
+    out = arguments.out or arguments.run_dir
+    written = write_moving(loaded, out / f"splats{SUFFIX}" if out.is_dir() else out, times, part, how)
+    shown = sorted({0, len(times) // 2, len(times) - 1})
+    found = [compare_run(loaded, scene, times[i], written.splats[i], read_moment(written.path, i)) for i in shown]
+    print_redrawn(written.notes, found)
+    return [written.path]
 
 
 def _export_tracks(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...] | None) -> list[Path]:

@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from dyngs.output.redrawn import Redrawn
 
 SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "splat", "sog", "glb", "usd")
-"""Names of ``dyngs.splats.formats.FORMATS``, here so that ``--help`` need not import them."""
+"""Names of ``dyngs.splats.formats.FORMATS``; those and ``MOVING`` are so that ``--help`` need not import them."""
+MOVING = "4dgs"
+"""Name and suffix of the format of moving Gaussians."""
 _AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 

@@ -54,30 +54,29 @@ class Redrawn:
         return self.psnr < FAINT
 
 
-def compare_run(run: LoadedRun, scene: Scene, time: float, written: Written) -> Redrawn:
+def compare_run(run: LoadedRun, scene: Scene, time: float, meant: SplatFile, read: SplatFile) -> Redrawn:
     """Return how a file differs from a scene at one time, seen by cameras of its capture, else from an orbit.
 
     Args:
         run: what was exported.
         scene: the part of it.
         time: in [0, 1].
-        written: the file.
+        meant: what the file is meant to hold, turned from the axes of the scene.
+        read: what it holds.
 
     Raises:
-        DyngsError: the file cannot be read.
+        DyngsError: no camera sees anything.
     """
     options = render_options(run.config.model)
-    moment = scene.moment(time)
     with torch.no_grad():
-        for cameras in (capture_cameras(run), with_scene(around(written.splat), inverse(written.splat.turned))):
+        moment = scene.moment(time)
+        for cameras in (capture_cameras(run), with_scene(around(meant), inverse(meant.turned))):
             if cameras is None:
                 continue
             drawn = scene.render(cameras, moment, options=options, background=_black(moment.gaussians.means))
             if float((drawn.alpha > 0.1).float().mean()) >= _LEAST_SHARE:
-                break
-        else:
-            raise DyngsError(f"{written.path}: no camera sees anything of it")
-    return compare(drawn.rgb, with_scene(cameras, written.splat.turned), written)
+                return compare(drawn.rgb, with_scene(cameras, meant.turned), read)
+    raise DyngsError("nothing of the scene is seen by the cameras of the capture, or from an orbit around it")
 
 
 def compare_splats(splat: SplatFile, written: Written) -> Redrawn:
@@ -94,12 +93,13 @@ def compare_splats(splat: SplatFile, written: Written) -> Redrawn:
     with torch.no_grad():
         background = _black(splat.gaussians.means)
         wanted = render(splat.gaussians, cameras, splat_options(splat), background=background).rgb
-    return compare(wanted, with_scene(cameras, product(written.splat.turned, inverse(splat.turned))), written)
+    return compare(
+        wanted, with_scene(cameras, product(written.splat.turned, inverse(splat.turned))), read_splats(written.path)
+    )
 
 
-def compare(wanted: Tensor, cameras: Cameras, written: Written) -> Redrawn:
-    """Return how a file, seen by cameras in its axes, differs from pictures (V, H, W, 3)."""
-    splat = read_splats(written.path)
+def compare(wanted: Tensor, cameras: Cameras, splat: SplatFile) -> Redrawn:
+    """Return how what a file holds, seen by cameras in its axes, differs from pictures (V, H, W, 3)."""
     with torch.no_grad():
         drawn = render(splat.gaussians, cameras, splat_options(splat), background=_black(wanted)).rgb
     values = [psnr(a, b) for a, b in zip(drawn, wanted, strict=True)]

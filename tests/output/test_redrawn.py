@@ -12,7 +12,7 @@ from splat_scenes import cloud
 from dyngs.export.run_to_splats import Writing, write_run_splats
 from dyngs.output.redrawn import Redrawn, capture_cameras, compare_run, compare_splats
 from dyngs.runs.checkpoint import load_run
-from dyngs.splats.formats import upright, write_splats
+from dyngs.splats.formats import read_splats, upright, write_splats
 from dyngs.splats.rotation import AXES, turn_between
 from dyngs.splats.splat_file import SplatFile
 
@@ -21,9 +21,9 @@ def test_a_run_and_its_files(tmp_path: Path) -> None:
     run = load_run(write_moving_run(tmp_path / "run"))
     for how in (Writing(), Writing(turn_between(AXES["z"], AXES["-y"]), "-y")):
         written = write_run_splats(run, tmp_path / "a.ply", 0.7, how=how)
-        found = compare_run(run, run.scene, 0.7, written)
-        assert found.psnr > 80
-        assert compare_run(run, run.scene, 0.0, written).psnr < 40  # another time is seen as such
+        read = read_splats(written.path)
+        assert compare_run(run, run.scene, 0.7, written.splat, read).psnr > 80
+        assert compare_run(run, run.scene, 0.0, written.splat, read).psnr < 40  # another time is seen as such
     cameras = capture_cameras(run)
     assert cameras is not None
     assert max(cameras.width, cameras.height) <= 240
