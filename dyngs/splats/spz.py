@@ -75,8 +75,8 @@ def write_spz(path: Path, splat: SplatFile) -> None:
         raise DyngsError(f"a .spz holds positions up to 8e6, these reach {extent:.2g}")
     fixed = np.clip(np.round(means * (1 << fraction_bits)), -(1 << 23) + 1, (1 << 23) - 1).astype("<i4")
     sh = gaussians.sh[:, 1:].numpy()
-    step = np.full((sh.shape[1], 1), 16, np.float32)  # 4 bits, 5 for degree 1, as Niantic's own writer does
-    step[:3] = 8
+    step = np.full((sh.shape[1], 1), 8, np.float32)  # 5 bits, 6 for degree 1; Niantic's default is one less: -5 dB
+    step[:3] = 4
     coded_sh = np.clip(np.round(sh * 128 / step) * step + 128, 0, 255).astype(np.uint8)
     colours = gaussians.sh[:, 0].numpy() * (_COLOUR_SCALE * 255) + 0.5 * 255
     flags = _ANTIALIASED if splat.mode is RasterizeMode.ANTIALIASED else 0
