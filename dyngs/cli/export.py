@@ -1,4 +1,4 @@
-"""``dyngs export``: write a run as files: Gaussians in many formats, tracks, avatar, small .dyngs file, or page."""
+"""``dyngs export``: write a run as Gaussians in many formats, a page, tracks, an avatar, or a small .dyngs file."""
 
 from __future__ import annotations
 
@@ -274,6 +274,8 @@ def _export_moving(arguments: argparse.Namespace, loaded: LoadedRun, times: tupl
     print_notes((line,))
     part, scene = _part(arguments), scene_part(loaded.scene, _part(arguments))
     out = arguments.out or arguments.run_dir
+    if not out.is_dir() and out.suffix.lower() != SUFFIX:
+        raise DyngsError(f"{out}: players know these files by the suffix {SUFFIX}; give --out {out.name}{SUFFIX}")
     written = write_moving(loaded, out / f"splats{SUFFIX}" if out.is_dir() else out, times, part, how)
     shown = sorted({0, len(times) // 2, len(times) - 1})
     found = [compare_run(loaded, scene, times[i], written.splats[i], read_moment(written.path, i)) for i in shown]

@@ -34,6 +34,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     said = capsys.readouterr().out
     assert "3 times, each shown for 1/30 s" in said
     assert "drawn again from 4 cameras" in said
+    assert main(["export", str(run), "--format", "4dgs", "--out", str(tmp_path / "b")]) == 2
     assert main(["export", str(run), "--sh-degree", "3", "--out", str(tmp_path / "a.4dgs")]) == 2
 
 
