@@ -12,6 +12,10 @@ What it finds becomes an ``@example`` of its test.
 from __future__ import annotations
 
 import os
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # `pytest -n 2`: processes share the cores, their threads would fight for them
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
