@@ -38,5 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"test views            {result.pictures}")
     print(f"orbit video           {result.video}")
     print(f"for other viewers     {result.ply}")
-    print(f"run folder            {result.run_dir}  (more pictures: dyngs render {result.run_dir} --out DIR)")
+    print(f"run folder            {result.run_dir}")
+    print(f"to look around        dyngs view {result.run_dir}    (pip install 'dyngs[view]')")
+    print(f"one page to share     dyngs export {result.run_dir} --out scene.html")
     return 0

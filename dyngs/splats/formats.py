@@ -168,7 +168,8 @@ def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = 
         try:
             own.writer(temporary, whole)
         except DyngsError as error:
-            raise DyngsError(f"{path}: not written: {error}") from error
+            reason = str(error).removeprefix(f"{temporary}: ")
+            raise DyngsError(f"{path}: not written: {reason}") from error
     return Written(path, whole, tuple(notes))
 
 
