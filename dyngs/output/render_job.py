@@ -69,7 +69,7 @@ class RenderJobOptions:
         size: width and height in pixels; None: that of the pictures, of the JSON, or 960x720 for a .ply or avatar.
         background: "white" or "black"; None: that of training, black for a .ply.
         up: up axis of the paths, such as "z" or "-y"; None: up for the cameras of a run, for the person of an avatar
-            file, and z for a .ply.
+            file, and what a file of Gaussians says, else what is usual for its format.
         times: scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of the view
             for a fixed camera, from 0 to 1 along a path.
         view: the view of the fixed camera: its name, the name of its picture, or its number from 0.

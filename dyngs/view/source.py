@@ -38,7 +38,7 @@ def open_source(path: Path, up: str | None = None, capture: Path | None = None) 
 
     Args:
         path: of it.
-        up: up axis; None: that of the capture, z for a file.
+        up: up axis; None: that of the capture, or of the file.
         capture: for a network: a person, or a folder of people.
 
     Raises:
