@@ -23,6 +23,7 @@ class ProgressBar:
 
     def __init__(self, stream: IO[str] | None = None) -> None:
         self._stream = sys.stderr if stream is None else stream
+        self._is_terminal = self._stream.isatty() and os.environ.get("TERM") != "dumb"
         self._bars: Any = None
         self._tasks: dict[str, Any] = {}
         self._what = ""
@@ -30,7 +31,10 @@ class ProgressBar:
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` parts of ``what`` are done."""
-        if self._bars is not None:
+        if self._is_terminal:
+            if self._bars is None:  # not before: work that needs no bar leaves no line
+                self._bars = _rich_bars(self._stream)
+                self._bars.start()
             if what not in self._tasks:
                 self._tasks[what] = self._bars.add_task(what, total=total)
             self._bars.update(self._tasks[what], completed=done, total=total)
@@ -44,13 +48,6 @@ class ProgressBar:
             self._last_line = now
 
     def __enter__(self) -> ProgressBar:
-        if self._stream.isatty() and os.environ.get("TERM") != "dumb":
-            from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-            self._bars = Progress(*columns, console=Console(file=self._stream), refresh_per_second=4)
-            self._bars.start()
         self._since = self._last_line = time.monotonic()
         return self
 
@@ -59,3 +56,12 @@ class ProgressBar:
     ) -> None:
         if self._bars is not None:
             self._bars.stop()
+
+
+def _rich_bars(stream: IO[str]) -> Any:
+    """Return rich progress bars, not yet shown."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=Console(file=stream), refresh_per_second=4)

@@ -28,6 +28,14 @@ def test_a_terminal_shows_a_bar_for_each_kind_of_work(monkeypatch: pytest.Monkey
     assert "2/8" in shown
 
 
+def test_no_work_leaves_no_line_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    stream = _Terminal()
+    with ProgressBar(stream):
+        pass
+    assert stream.getvalue() == ""
+
+
 def test_short_work_prints_nothing_where_there_is_no_terminal() -> None:
     stream = io.StringIO()
     with ProgressBar(stream) as report:
