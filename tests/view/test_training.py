@@ -1,3 +1,4 @@
+import itertools
 import threading
 from pathlib import Path
 
@@ -20,7 +21,8 @@ class Onlooker:
 
     def __init__(self) -> None:
         self.drawer = Drawer(lambda session, message: pytest.fail(message))
-        self.drawn = DrawnBetweenSteps(self.drawer, share=0.9)
+        ticks = itertools.count(step=100.0)  # a picture is due after each step, however fast the machine is
+        self.drawn = DrawnBetweenSteps(self.drawer, share=0.9, clock=lambda: next(ticks))
         self.seen: list[bytes] = []
 
     def __call__(self, event: Event) -> None:
