@@ -22,7 +22,8 @@ class Onlooker:
     def __init__(self) -> None:
         self.drawer = Drawer(lambda session, message: pytest.fail(message))
         ticks = itertools.count(step=100.0)  # a picture is due after each step, however fast the machine is
-        self.drawn = DrawnBetweenSteps(self.drawer, share=0.9, clock=lambda: next(ticks))
+        self.clock = lambda: next(ticks)
+        self.drawn = DrawnBetweenSteps(self.drawer, share=0.9, clock=self.clock)
         self.seen: list[bytes] = []
 
     def __call__(self, event: Event) -> None:
@@ -32,7 +33,7 @@ class Onlooker:
                 assert isinstance(trainer, Trainer)
                 if event.step == 2:
                     first = viewed_training("run", trainer.config, trainer.scene, trainer.pictures, torch.ones(3))
-                    session = Session(first, lambda sent: self.seen.append(sent.picture.tobytes()))
+                    session = Session(first, lambda sent: self.seen.append(sent.picture.tobytes()), clock=self.clock)
                     self.drawer.add(session)
                 for session in self.drawer.sessions:
                     session.change(divide=event.step / 1000)
