@@ -6,55 +6,28 @@ foresee. So only the pixels count that at least one of the two models explains b
 
 from __future__ import annotations
 
-import time
-from statistics import fmean
-from typing import Literal
-
 import torch
 from torch import Tensor
 
-from dyngs.api.small_runs import FEWEST_VIEWS, drawn, hold_out_every, is_gain, trained
+from dyngs.api.candidate import Candidate, Choice
+from dyngs.api.small_runs import drawn
 from dyngs.config import Config, StaticModel
-from dyngs.data.read import read_capture
 from dyngs.metrics import psnr
 from dyngs.training.background import background_colour
 from dyngs.training.trainer import Trainer
 
-STEPS, SHARE, FEWEST_STEPS = 1500, 0.2, 400
-"""Steps of each small run; at most this share of the run's own. With fewer steps than these it says nothing."""
 EXPLAINED = 0.8
 """Share of the pixels of a view that count: those where the smaller of the two errors is smallest."""
 CLEAR_GAIN = 0.1
 """Mean gain, dB, that masks must bring at least."""
 
 
-def decided(config: Config) -> Config:
-    """Return ``config`` with ``train.robust`` decided, if that is to be found out; a line says what was found.
-
-    Raises:
-        DyngsError: a capture that cannot be read.
-    """
+def _asked(config: Config) -> bool:
     match config.model:
-        case StaticModel() if config.train.robust == "auto":
-            pass
+        case StaticModel():
+            return config.train.robust == "auto"
         case _:
-            return config
-    views, steps = read_capture(config.data).splits["train"], min(STEPS, int(SHARE * config.train.steps))
-    if config.budget.max_minutes is not None or steps < FEWEST_STEPS or len(views) < FEWEST_VIEWS:
-        print("train.robust=auto: too short a run, or too few views, to find out whether it pays; not used", flush=True)
-        return _with(config, "never")
-    begun, every = time.monotonic(), hold_out_every(views)
-    plain, robust = (trained(_with(config, choice), every, steps) for choice in ("never", "always"))
-    scores = compared(plain, robust)
-    gains = [b - a for a, b in scores]
-    pays = is_gain(gains) and fmean(gains) >= CLEAR_GAIN
-    print(
-        f"two runs of {steps:,} steps in small pictures, {len(scores)} held-out training views: "
-        f"{fmean(a for a, _ in scores):.2f} dB as it is, {fmean(b for _, b in scores):.2f} dB without what disagrees "
-        f"between views: train.robust {'taken' if pays else 'not taken'} ({time.monotonic() - begun:.0f} s)",
-        flush=True,
-    )
-    return _with(config, "always" if pays else "never")
+            return False
 
 
 def compared(one: Trainer, other: Trainer) -> list[tuple[float, float]]:
@@ -87,5 +60,15 @@ def explained(one: Tensor, other: Tensor, truth: Tensor, mask: Tensor | None) ->
     return weight * (error <= known.sort().values[rank - 1])
 
 
-def _with(config: Config, choice: Literal["never", "always"]) -> Config:
+def _decided(config: Config, choice: Choice) -> Config:
     return config.model_copy(update={"train": config.train.model_copy(update={"robust": choice})})
+
+
+CANDIDATE = Candidate(
+    key="train.robust",
+    does="without what disagrees between views",
+    asked=_asked,
+    decided=_decided,
+    compared=compared,
+    clear_gain=CLEAR_GAIN,
+)

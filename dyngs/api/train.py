@@ -11,7 +11,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from dyngs.api import robust_choice, still_first
+from dyngs.api import still_choices, still_first
 from dyngs.api.still_first import StillComparison
 from dyngs.budget.count import count_limit
 from dyngs.budget.run import LimitedRun
@@ -87,10 +87,18 @@ def train(config: Config, *, resume_from: Path | None = None, listeners: Sequenc
         if resumed is not None and resumed.info.step >= config.total_steps and not _owes_file(config, folder):
             return folder
         if resumed is None:
-            config = robust_choice.decided(still_first.start(config, folder, _train_still))
+            config = _chosen(config, folder)
         if not _Run(config, folder, resumed).run(listeners):
-            _Run(robust_choice.decided(still_first.still_instead(folder, config)), folder, None).run(listeners)
+            _Run(still_choices.decided(still_first.still_instead(folder, config)), folder, None).run(listeners)
     return folder
+
+
+def _chosen(config: Config, folder: Path) -> Config:
+    """Return the configuration with everything decided that is to be found out before the run.
+
+    What holds for still and moving scenes comes first, as the comparison of the two builds on it.
+    """
+    return still_choices.decided(still_first.start(still_choices.decided(config), folder, _train_still))
 
 
 def _train_still(config: Config, folder: Path) -> None:

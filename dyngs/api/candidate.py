@@ -1,0 +1,53 @@
+"""A setting that may pay or not, and that two small runs of the same length decide about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from dyngs.config import Config
+from dyngs.training.trainer import Trainer
+
+Choice = Literal["never", "always"]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a small run without a setting says about it.
+
+    Attributes:
+        is_worth: a second small run, with it, is worth its time.
+        text: what was found, for a line; empty: nothing to say.
+    """
+
+    is_worth: bool
+    text: str = ""
+
+
+def no_evidence(plain: Trainer) -> Evidence:
+    """Return that nothing can be said without a second run."""
+    return Evidence(True)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A setting that is taken where held-out training views gain.
+
+    Attributes:
+        key: as on the command line, ``train.robust``.
+        does: says in a line what a run with it does, "without what disagrees between views".
+        asked: whether a configuration wants this to be found out (``auto``), for its kind of model.
+        decided: returns a configuration with the setting on or off.
+        compared: returns PSNR, dB, of each view held out, by the small run without and by that with it.
+        clear_gain: mean gain, dB, that it must bring at least.
+        evidence: looks at the small run without it.
+    """
+
+    key: str
+    does: str
+    asked: Callable[[Config], bool]
+    decided: Callable[[Config, Choice], Config]
+    compared: Callable[[Trainer, Trainer], list[tuple[float, float]]]
+    clear_gain: float
+    evidence: Callable[[Trainer], Evidence] = no_evidence
