@@ -73,6 +73,7 @@ from dyngs.training.background import (
     evaluation_background,
     measured_alpha_weight,
 )
+from dyngs.training.exposure import exposures_of
 from dyngs.training.limits import within_cap
 from dyngs.training.loop import Trainable
 from dyngs.training.prediction import assemble_network
@@ -185,6 +186,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         held_out_until=hold_out_until(config.train),
         priors=priors,
         robust=_robust(config, capture, pictures),
+        exposures=exposures_of(config.train, capture.splits["train"]),
     )
 
 

@@ -25,6 +25,19 @@ class Evidence:
     text: str = ""
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """Two small runs on the views held out.
+
+    Attributes:
+        scores: PSNR, dB, of each view by the run without a setting and by that with it: decide whether it pays.
+        objection: why it is not taken even if those scores gain; empty: nothing speaks against it.
+    """
+
+    scores: list[tuple[float, float]]
+    objection: str = ""
+
+
 def no_evidence(plain: Trainer) -> Evidence:
     """Return that nothing can be said without a second run."""
     return Evidence(True)
@@ -39,7 +52,7 @@ class Candidate:
         does: says in a line what a run with it does, "without what disagrees between views".
         asked: whether a configuration wants this to be found out (``auto``), for its kind of model.
         decided: returns a configuration with the setting on or off.
-        compared: returns PSNR, dB, of each view held out, by the small run without and by that with it.
+        compared: compares the small run without it with that with it, on the views held out.
         clear_gain: mean gain, dB, that it must bring at least.
         evidence: looks at the small run without it.
     """
@@ -48,6 +61,6 @@ class Candidate:
     does: str
     asked: Callable[[Config], bool]
     decided: Callable[[Config, Choice], Config]
-    compared: Callable[[Trainer, Trainer], list[tuple[float, float]]]
+    compared: Callable[[Trainer, Trainer], Comparison]
     clear_gain: float
     evidence: Callable[[Trainer], Evidence] = no_evidence

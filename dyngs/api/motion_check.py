@@ -11,9 +11,9 @@ from dyngs.build import assemble
 from dyngs.config import Config, DefaultStrategy, PointsInit, StaticModel
 from dyngs.data.capture import Capture, View
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.geometry.poses import inverse_rigid
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
+from dyngs.data.times import are_scattered
 from dyngs.deform.evidence import MIN_DIFFERING, Evidence, Verdict, agreement_over_time, differing_share
 from dyngs.deform.still_error import cameras_in_place, signed_errors
 from dyngs.training.background import evaluation_background
@@ -28,9 +28,6 @@ MIN_VIEWS = 24
 """With fewer views, agreement by chance cannot be told from other."""
 STEPS, MAX_GAUSSIANS, FIRST_POINTS = 450, 10_000, 5000
 """Of the small still model."""
-SCATTERED = 0.5
-"""Distance between cameras that follow each other in time, in medians of the distance of any two, from which time and
-viewpoint have nothing to do with each other."""
 
 
 def motion_evidence(config: Config) -> Evidence:
@@ -57,14 +54,6 @@ def in_order_of_time(views: Sequence[View]) -> list[int]:
     """Return indices of at most ``MAX_VIEWS`` views, evenly chosen, in order of time."""
     order = sorted(range(len(views)), key=lambda i: (views[i].time or 0.0, views[i].name))
     return [order[i] for i in evenly_spaced(len(order), MAX_VIEWS)]
-
-
-def are_scattered(views: Sequence[View]) -> bool:
-    """Return whether views in order of time jump about as if they were in any order."""
-    centers = np.stack([inverse_rigid(view.cam_from_world)[:3, 3] for view in views])
-    apart = np.linalg.norm(centers[:, None] - centers, axis=2)
-    usual = float(np.median(apart[np.triu_indices(len(views), 1)]))
-    return float(np.median(np.linalg.norm(np.diff(centers, axis=0), axis=1))) > SCATTERED * usual
 
 
 def _of_standing_cameras(capture: Capture, cameras: Sequence[Sequence[int]], config: Config) -> Evidence:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyngs.api.candidate import Candidate, Choice
+from dyngs.api.candidate import Candidate, Choice, Comparison
 from dyngs.api.small_runs import drawn
 from dyngs.config import Config, StaticModel
 from dyngs.metrics import psnr
@@ -30,16 +30,18 @@ def _asked(config: Config) -> bool:
             return False
 
 
-def compared(one: Trainer, other: Trainer) -> list[tuple[float, float]]:
-    """Return the PSNR, dB, of each view held out, drawn by two models, over the pixels that one of them explains."""
+def compared(one: Trainer, other: Trainer) -> Comparison:
+    """Compare two models on the views held out, over the pixels that one of them explains."""
     background, found = background_colour(one.background), []
     for index in sorted(one.held_out):
         picture = one.pictures[index]
         truth = picture.composite(background)
-        pictures = [drawn(x.scene, picture, x.options, background) for x in (one, other)]
+        pictures = [
+            drawn(x.scene, picture, x.options, background, fitted=x.exposures is not None) for x in (one, other)
+        ]
         counts = explained(pictures[0], pictures[1], truth, picture.mask)
         found.append((psnr(pictures[0], truth, counts), psnr(pictures[1], truth, counts)))
-    return found
+    return Comparison(found)
 
 
 def explained(one: Tensor, other: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:

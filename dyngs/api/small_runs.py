@@ -11,9 +11,10 @@ from torch import Tensor
 from typing_extensions import assert_never
 
 from dyngs.build import assemble
+from dyngs.colour.affine import fitted_affine, recoloured
 from dyngs.config import BudgetConfig, Config, DefaultStrategy, FixedStrategy, McmcStrategy, PruneConfig, Strategy
 from dyngs.data.capture import View
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import Picture
 from dyngs.metrics import psnr
 from dyngs.rendering import RenderOptions
 from dyngs.scene import Scene
@@ -61,17 +62,25 @@ def hold_out_every(views: Sequence[View]) -> int:
 
 
 @torch.no_grad()
-def drawn(scene: Scene, picture: Picture, options: RenderOptions, background: Tensor) -> Tensor:
-    """Return ``picture`` as ``scene`` shows it (H, W, 3)."""
-    return scene.render(picture.cameras, picture.time, options=options, background=background).rgb[0]
+def drawn(
+    scene: Scene, picture: Picture, options: RenderOptions, background: Tensor, *, fitted: bool = False
+) -> Tensor:
+    """Return ``picture`` as ``scene`` shows it (H, W, 3); ``fitted``: after an affine colour that is fitted to it."""
+    rendering = scene.render(picture.cameras, picture.time, options=options, background=background)
+    if not fitted:
+        return rendering.rgb[0]
+    affine = fitted_affine([(picture, rendering)], background)
+    return recoloured(affine, picture, rendering, background)
 
 
-def held_out_scores(
-    scene: Scene, pictures: PictureLoader, held_out: frozenset[int], options: RenderOptions, background: Tensor
-) -> list[float]:
-    """Return the PSNR of the pictures held out, dB, in order of their indices."""
-    shown = [pictures[i] for i in sorted(held_out)]
-    return [psnr(drawn(scene, x, options, background), x.composite(background), x.mask) for x in shown]
+def held_out_scores(scene: Scene, trainer: Trainer, background: Tensor) -> list[float]:
+    """Return the PSNR of the pictures that ``trainer`` holds out, dB, in order of their indices.
+
+    Where exposures are learned, those of pictures held out are not: they are fitted.
+    """
+    options, fitted = trainer.options, trainer.exposures is not None
+    shown = [trainer.pictures[i] for i in sorted(trainer.held_out)]
+    return [psnr(drawn(scene, x, options, background, fitted=fitted), x.composite(background), x.mask) for x in shown]
 
 
 def is_gain(gains: Sequence[float]) -> bool:

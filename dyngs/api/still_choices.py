@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from statistics import fmean
 
-from dyngs.api import robust_choice
+from dyngs.api import exposure_choice, robust_choice
 from dyngs.api.candidate import Candidate
 from dyngs.api.small_runs import FEWEST_VIEWS, hold_out_every, is_gain, trained
 from dyngs.config import Config, DynamicModel
@@ -19,7 +19,7 @@ from dyngs.training.trainer import Trainer
 
 STEPS, SHARE, FEWEST_STEPS = 1500, 0.2, 400
 """Steps of each small run; at most this share of the run's own. With fewer steps than these it says nothing."""
-CANDIDATES: tuple[Candidate, ...] = (robust_choice.CANDIDATE,)
+CANDIDATES: tuple[Candidate, ...] = (exposure_choice.CANDIDATE, robust_choice.CANDIDATE)
 
 
 def decided(config: Config) -> Config:
@@ -61,16 +61,13 @@ def _tried(
         return None
     changed = candidate.decided(config, "always")
     other = _trained(changed, every, steps)
-    scores = candidate.compared(plain, other)
-    gains = [b - a for a, b in scores]
-    pays = is_gain(gains) and fmean(gains) >= candidate.clear_gain
-    said = f"{evidence.text}; " if evidence.text else ""
-    print(
-        f"  {said}{len(scores)} views: {fmean(a for a, _ in scores):.2f} dB as it is, "
-        f"{fmean(b for _, b in scores):.2f} dB {candidate.does}: {candidate.key} {'taken' if pays else 'not taken'} "
-        f"({time.monotonic() - begun:.0f} s)",
-        flush=True,
-    )
+    found = candidate.compared(plain, other)
+    gains = [b - a for a, b in found.scores]
+    pays = is_gain(gains) and fmean(gains) >= candidate.clear_gain and not found.objection
+    before, after = (fmean(x) for x in zip(*found.scores, strict=True))
+    said = (evidence.text, f"{len(gains)} views: {before:.2f} dB as it is, {after:.2f} dB {candidate.does}")
+    verdict = f"{candidate.key} {'taken' if pays else 'not taken'} ({time.monotonic() - begun:.0f} s)"
+    print(f"  {'; '.join(text for text in (*said, found.objection) if text)}: {verdict}", flush=True)
     return (changed, other) if pays else None
 
 

@@ -160,11 +160,11 @@ def _compared(
     trainer: Trainer, still: Scene, picture: Picture, small: Picture
 ) -> tuple[tuple[float, float], tuple[float, float] | None]:
     """Return PSNR of a small picture with motion and without, whole and where nothing that moves is in front."""
-    background, options = background_colour(trainer.background), trainer.options
+    background, options, fitted = background_colour(trainer.background), trainer.options, trainer.exposures is not None
     size, truth = (small.cameras.width, small.cameras.height), small.composite(background)
     pictures = [
-        area_downscale(drawn(trainer.scene, picture, options, background), *size),
-        drawn(still, small, options, background),
+        area_downscale(drawn(trainer.scene, picture, options, background, fitted=fitted), *size),
+        drawn(still, small, options, background, fitted=fitted),
     ]
     alpha = trainer.scene.part("moving").render(picture.cameras, picture.time, options=options).alpha[0]
     stands = (area_downscale(alpha[..., None], *size)[..., 0] < CLEAR).float()
@@ -199,10 +199,10 @@ def _small_still_model(folder: Path) -> tuple[float, list[float]]:
     fails = total = 0.0
     for index in sorted(trainer.held_out):
         picture = trainer.pictures[index]
-        shown = drawn(run.scene, picture, trainer.options, background)
+        shown = drawn(run.scene, picture, trainer.options, background, fitted=trainer.exposures is not None)
         errors, weights = signed_errors(run.scene.gaussians, picture, trainer.options, background, shown)
         mean: Tensor = errors.abs().mean(1) / weights.clamp_min(1e-6)
         fails += float(weights[mean > ERRS].sum())
         total += float(weights.sum())
-    scores = held_out_scores(run.scene, trainer.pictures, trainer.held_out, trainer.options, background)
+    scores = held_out_scores(run.scene, trainer, background)
     return fails / max(total, 1e-9), scores

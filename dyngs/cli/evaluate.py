@@ -49,6 +49,9 @@ def report_table(report: EvalReport) -> Table:
 
     table = Table("metric", "value", title=f"{report.num_views} views of the {report.split} split")
     table.add_row("PSNR", f"{report.psnr:.2f} dB")
+    if report.psnr_right is not None and report.psnr_right_fitted is not None:
+        right = f"{report.psnr_right:.2f} dB; {report.psnr_right_fitted:.2f} dB with colours fitted on left halves"
+        table.add_row("PSNR of right halves", right)
     table.add_row("SSIM", f"{report.ssim:.4f}")
     if report.psnr_person is not None and report.ssim_person is not None:
         table.add_row("in the person's box", f"{report.psnr_person:.2f} dB, SSIM {report.ssim_person:.4f}")

@@ -9,7 +9,10 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
+
 from dyngs.data.capture import Splits, View, all_views
+from dyngs.data.geometry.poses import inverse_rigid
 from dyngs.errors import DyngsError
 from dyngs.files.fields import is_number
 
@@ -20,6 +23,9 @@ MENTIONED_CHANGE = 0.05
 _MAX_NAMED = 5
 _EVEN = 1.1
 """Longest over shortest gap of evenly spaced times, with allowance for rounding in the files."""
+SCATTERED = 0.5
+"""Distance between cameras that follow each other in time, in medians of the distance of any two, from which time and
+viewpoint have nothing to do with each other."""
 
 
 def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Splits, list[str]]:
@@ -127,6 +133,28 @@ def static_cameras(views: Sequence[View]) -> list[list[int]]:
             pose, intrinsics = (x.round(9).tobytes() for x in (view.cam_from_world, view.intrinsics))
             cameras[pose, intrinsics, view.lens, view.width, view.height].setdefault(view.time, i)
     return [[at[t] for t in sorted(at)] for at in cameras.values() if len(at) > 1]
+
+
+def are_scattered(views: Sequence[View]) -> bool:
+    """Return whether views in order of time jump about as if they were in any order."""
+    centers = np.stack([inverse_rigid(view.cam_from_world)[:3, 3] for view in views])
+    apart = np.linalg.norm(centers[:, None] - centers, axis=2)
+    usual = float(np.median(apart[np.triu_indices(len(views), 1)]))
+    return float(np.median(np.linalg.norm(np.diff(centers, axis=0), axis=1))) > SCATTERED * usual
+
+
+def videos(views: Sequence[View]) -> list[list[int]]:
+    """Return indices of views, in order of time, for each video: of a camera that stands, or of the one that moves.
+
+    None where views without a common camera jump about in time.
+    """
+    standing = static_cameras(views)
+    if standing:
+        return standing
+    times = [view.time for view in views if view.time is not None]
+    order = sorted(range(len(views)), key=lambda i: views[i].time or 0.0)
+    is_one = len(views) > 2 and len(set(times)) == len(views) and not are_scattered([views[i] for i in order])
+    return [order] if is_one else []
 
 
 def _repeated(views: list[View]) -> list[str]:

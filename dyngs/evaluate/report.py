@@ -21,6 +21,7 @@ from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.true_tracks import read_true_tracks
 from dyngs.errors import DyngsError
+from dyngs.evaluate.half_fit import right_half_scores
 from dyngs.evaluate.regions import RegionName, Regions, RegionScores
 from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
@@ -28,7 +29,7 @@ from dyngs.files.write import write_text
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.captured import captured_motion, same_bodies
 from dyngs.metrics import Lpips, LpipsNet, MetricValue, flip, load_lpips, psnr, ssim
-from dyngs.rendering import RenderOptions
+from dyngs.rendering import Rendering, RenderOptions
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 from dyngs.scene import Scene, render_options
 from dyngs.training.background import evaluation_background
@@ -65,6 +66,8 @@ class ViewScore:
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
     psnr_still: float | None = None
+    psnr_right: float | None = None
+    psnr_right_fitted: float | None = None
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,8 @@ class EvalReport:
         psnr_foreground, psnr_moving, psnr_still: means over the views that have such a region, see
             ``dyngs.evaluate.regions``.
         moving_from: how it was found what moves, None where it was not.
+        psnr_right, psnr_right_fitted: means of the PSNR of right halves, as the scene shows them, and after an affine
+            colour fitted on left halves, see ``dyngs.evaluate.half_fit``; None where a half has no pixel that counts.
         track_error_px, track_within_5px, track_motion_px: see ``dyngs.evaluate.tracks``.
     """
 
@@ -137,6 +142,8 @@ class EvalReport:
     track_error_px: float | None = None
     track_within_5px: float | None = None
     track_motion_px: float | None = None
+    psnr_right: float | None = None
+    psnr_right_fitted: float | None = None
 
     def to_json(self) -> str:
         """Return the report as strict JSON (no NaN or Infinity), ending in a newline."""
@@ -214,6 +221,9 @@ def _with_parts(report: EvalReport, regions: Regions, tracks: TrackScores) -> Ev
         means[region] = fmean(known) if known else None
         if not known:
             reasons[metric] = regions.reason(region)
+    right, fitted = (_mean([getattr(x, name) for x in report.per_view]) for name in ("psnr_right", "psnr_right_fitted"))
+    if right is None:
+        reasons["psnr_right"] = reasons["psnr_right_fitted"] = "half a view has no pixel that counts"
     if tracks.reason is not None:
         reasons["track_error_px"] = tracks.reason
     return replace(
@@ -221,6 +231,8 @@ def _with_parts(report: EvalReport, regions: Regions, tracks: TrackScores) -> Ev
         psnr_foreground=means["foreground"],
         psnr_moving=means["moving"],
         psnr_still=means["still"],
+        psnr_right=right,
+        psnr_right_fitted=fitted,
         moving_from=regions.moving_from,
         track_error_px=tracks.error_px,
         track_within_5px=tracks.within_5px,
@@ -260,12 +272,14 @@ def score_views(
     for picture in pictures:
         if not scores:
             _timed_render(scene, picture, options, background)  # the warm-up
-        rendered, seconds, deform_seconds = _timed_render(scene, picture, options, background)
+        rendering, seconds, deform_seconds = _timed_render(scene, picture, options, background)
+        rendered = rendering.rgb[0]
         if not rendered.isfinite().all():
             raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
         truth, mask = picture.composite(background), picture.mask
         box = person_box(picture) if avatar_of(scene) is not None else None
         parts = RegionScores() if regions is None else regions.scores(picture, rendered, truth)
+        halves = right_half_scores(picture, rendering, background)
         optional = {"flip": flip(rendered, truth, mask), "lpips": lpips(rendered, truth, mask)}
         for name, metric in optional.items():
             if metric.reason is not None:
@@ -286,6 +300,8 @@ def score_views(
             psnr_foreground=parts.foreground,
             psnr_moving=parts.moving,
             psnr_still=parts.still,
+            psnr_right=halves.plain,
+            psnr_right_fitted=halves.fitted,
         )
         _require_finite(score, mask)
         scores.append(score)
@@ -352,15 +368,15 @@ def parameter_megabytes(scene: Scene) -> float:
 
 def _timed_render(
     scene: Scene, picture: Picture, options: RenderOptions, background: Tensor
-) -> tuple[Tensor, float, float]:
-    """Return the (H, W, 3) rendered picture, the seconds it took, and the seconds of these for deformation."""
+) -> tuple[Rendering, float, float]:
+    """Return the rendering, the seconds it took, and the seconds of these for deformation."""
     with torch.no_grad():
         start = time.perf_counter()
         moment = scene.moment(picture.time)
         deformed = time.perf_counter()
         rendering = scene.render(picture.cameras, moment, options=options, background=background)
         end = time.perf_counter()
-    return rendering.rgb[0], end - start, deformed - start
+    return rendering, end - start, deformed - start
 
 
 def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:

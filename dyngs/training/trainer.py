@@ -28,6 +28,7 @@ from dyngs.static.fixed import FixedDensifier
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.training.background import AlphaWeight, background_colour
 from dyngs.training.events import StepReport
+from dyngs.training.exposure import ViewExposures
 from dyngs.training.priors.used import StepView, UsedPriors
 from dyngs.training.robust import RobustMasks
 from dyngs.training.sampler import ViewSampler
@@ -50,6 +51,7 @@ class Trainer:
         generator: the only source of randomness, on the CPU.
         priors: what the user knows about the capture.
         robust: masks of what disagrees with the other views; None: all pixels count.
+        exposures: affine colours of the training pictures; None: they agree.
         done: steps done.
         bad_gradients: how often a Gaussian was left out of a step because its gradient was not finite.
         held_out: indices of the training views that are not trained on up to ``held_out_until``.
@@ -73,6 +75,7 @@ class Trainer:
     generator: torch.Generator
     priors: UsedPriors = field(default_factory=UsedPriors)
     robust: RobustMasks | None = None
+    exposures: ViewExposures | None = None
     done: int = 0
     bad_gradients: int = 0
     held_out: frozenset[int] = frozenset()
@@ -112,13 +115,15 @@ class Trainer:
             with_depth = partial(scene.render, time=moment, options=coarse, background=background)
             picture = self.robust.masked(index, step, picture, rendering.rgb[0], background, with_depth)
         rendered, truth = rendering.rgb[0], picture.composite(background)
+        if self.exposures is not None:
+            rendered = self.exposures.applied((index, step), picture, rendering, background)
         terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
         if self.alpha.weight > 0 and picture.alpha is not None:
             error = (rendering.alpha[0] - picture.alpha).abs()
             if self.robust is not None and picture.mask is not None:
                 error = error * picture.mask
             terms["alpha"] = self.alpha.weight * error.mean()
-        terms |= moment.penalties
+        terms |= moment.penalties | ({} if self.exposures is None else self.exposures.penalties(index))
         first, last = self.training.window(step)
         view = StepView(index, lambda time: first <= time <= last, options)
         terms |= self.priors.terms(scene, picture, rendering, view, self.generator)
@@ -129,6 +134,8 @@ class Trainer:
             size = (picture.cameras.width, picture.cameras.height)
             # Fewer Gaussians suit small pictures: a gradient counts for less there.
             self.densifier.after_backward(step, probe.grad / divisor, rendering.radii, size)
+        if self.exposures is not None:
+            self.bad_gradients += self.exposures.optimize(index, step)
         found = (self.alpha.finding if step == 1 else None, self._update(step))
         variant = self.training.variant(self.scene, step)
         if variant is not None:
@@ -154,6 +161,8 @@ class Trainer:
         state |= prefixed("sampler", with_role(self.sampler.state(), Role.TRAINING))
         if self.robust is not None:
             state |= prefixed("robust", with_role(self.robust.state(), Role.TRAINING))
+        if self.exposures is not None:
+            state |= prefixed("exposures", with_role(self.exposures.state(), Role.TRAINING))
         return state | with_role({"rng": self.generator.get_state()}, Role.TRAINING)
 
     def checkpoint(self) -> Checkpoint:
@@ -182,6 +191,8 @@ class Trainer:
                 self.sampler.load_state(checkpoint.part("sampler"))
                 if self.robust is not None:
                     self.robust.load_state(checkpoint.part("robust"))
+                if self.exposures is not None:
+                    self.exposures.load_state(checkpoint.part("exposures"))
                 self.generator.set_state(checkpoint.tensors["rng"])
             except KeyError as missing:
                 raise DyngsError(f"{checkpoint.name} lacks {missing}; {OTHER_CONFIG}") from None

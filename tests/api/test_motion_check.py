@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from dyngs.api import motion_check
-from dyngs.api.motion_check import are_scattered, in_order_of_time, motion_evidence
+from dyngs.api.motion_check import in_order_of_time, motion_evidence
 from dyngs.config import Config, DataConfig, DynamicModel
 from dyngs.data.capture import View
 from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
+from dyngs.data.times import are_scattered
 from dyngs.deform.evidence import Verdict
 
 

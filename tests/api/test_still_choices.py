@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from dyngs.api import robust_choice, still_choices
-from dyngs.api.candidate import Candidate, Evidence
+from dyngs.api.candidate import Candidate, Comparison, Evidence
 from dyngs.api.still_choices import decided
 from dyngs.config import Config
 from dyngs.config.io import load_config, packaged_preset
@@ -20,7 +20,7 @@ def preset(root: Path, *keys: str) -> Config:
     return load_config(packaged_preset("static"), [f"data.root={root}", "train.robust=auto", *keys])
 
 
-def flagged(name: str, gains: list[float], evidence: Evidence) -> Candidate:
+def flagged(name: str, gains: list[float], evidence: Evidence, objection: str = "") -> Candidate:
     """Return a candidate that sets a key of ``train`` (robust, or a stand-in for another), with known gains."""
     values = {"never": False, "always": True}
 
@@ -33,7 +33,7 @@ def flagged(name: str, gains: list[float], evidence: Evidence) -> Candidate:
         key=f"train.{name}",
         asked=lambda config: config.train.robust == "auto",
         decided=changed,
-        compared=lambda *_: [(20.0, 20.0 + gain) for gain in gains],
+        compared=lambda *_: Comparison([(20.0, 20.0 + gain) for gain in gains], objection),
         evidence=lambda _: evidence,
     )
 
@@ -90,6 +90,15 @@ def test_all_settings_share_one_small_run(
     assert "train.robust taken" in said
     assert "something is odd; 3 views" in said
     assert "nothing to find: train.motion_masks not taken" in said
+
+
+def test_an_objection_counts_more_than_a_gain(
+    still: Path, tried: list[Config], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    candidate = flagged("robust", [0.5, 0.6, 0.4], Evidence(True), "but look at this")
+    monkeypatch.setattr(still_choices, "CANDIDATES", (candidate,))
+    assert decided(preset(still)).train.robust == "never"
+    assert "but look at this: train.robust not taken" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("keys", [("train.steps=1000",), ("budget.max_minutes=3",)])

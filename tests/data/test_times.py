@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tiny_captures import opengl_pose
 
 from dyngs.data.capture import Split, View
-from dyngs.data.times import clip_seconds, sequence_warnings, span_in_files, still_if_constant, unit_times
+from dyngs.data.times import clip_seconds, sequence_warnings, span_in_files, still_if_constant, unit_times, videos
 from dyngs.errors import DyngsError
 
 ROOT = Path("capture")
@@ -150,3 +150,13 @@ def test_different_numbers_of_frames() -> None:
     assert "camera 0 has 20, camera 3 has 22 frames, others 24" in warning
     (warning,) = sequence_warnings(rig([3] * 9 + list(range(4, 12))))
     assert "(3 more cameras differ)" in warning
+
+
+def test_videos_are_those_of_standing_cameras_or_of_the_one_that_moves() -> None:
+    standing = [view(f"{camera}{time}", time, camera) for time in (1.0, 0.0, 0.5) for camera in (0, 1)]
+    assert videos(standing) == [[2, 4, 0], [3, 5, 1]]
+    walk = [view(f"{i}", (7 * i % 10) / 10, i, np.linalg.inv(opengl_pose(0.3 * (7 * i % 10)))) for i in range(10)]
+    assert videos(walk) == [sorted(range(10), key=lambda i: 7 * i % 10)]
+    jumps = [view(f"{i}", i / 10, i, np.linalg.inv(opengl_pose(0.3 * (7 * i % 10)))) for i in range(10)]
+    assert videos(jumps) == []
+    assert videos([view(f"{i}", None, i) for i in range(5)]) == []

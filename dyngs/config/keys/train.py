@@ -50,6 +50,11 @@ class TrainConfig(Section):
         description="leave out pixels that disagree with the other views (people who walk through); still scenes only; "
         "auto: where two small runs beforehand say that it pays",
     )
+    exposure: Literal["never", "auto", "always"] = Field(
+        default="never",
+        description="learn exposure and white balance of each training picture (an affine colour, the mean one is the "
+        "identity); auto: where small runs beforehand say that it pays",
+    )
     sh_every: int = Field(
         default=1000,
         ge=1,
