@@ -321,13 +321,18 @@ def check_files(views: Sequence[View]) -> None:
                 f"expected; restore the original or correct its intrinsics"
             )
         if view.mask_path is not None:
-            check_picture(view.mask_path)
+            mask = check_picture(view.mask_path)
+            _require_size(view, view.mask_path, (mask.width, mask.height), "mask")
 
 
 def _require_shape(view: View, path: Path | None, found: Tensor, what: str) -> None:
-    if found.shape[:2] != (view.height, view.width):
+    _require_size(view, path, (found.shape[1], found.shape[0]), what)
+
+
+def _require_size(view: View, path: Path | None, size: tuple[int, int], what: str) -> None:
+    if size != (view.width, view.height):
         raise DyngsError(
-            f"{path}: the {what} is {found.shape[1]}x{found.shape[0]} but its picture is {view.width}x{view.height}; "
+            f"{path}: the {what} is {size[0]}x{size[1]} but its picture is {view.width}x{view.height}; "
             "make them the same size"
         )
 

@@ -211,7 +211,7 @@ def test_sizes_that_disagree(tmp_path: Path) -> None:
         loader((replace(views[0], height=9),))
     write_picture(tmp_path / "mask.png", np.full((4, 4, 1), 255, np.uint8))
     with pytest.raises(DyngsError, match=r"mask\.png: the mask is 4x4"):
-        loader((replace(views[0], mask_path=tmp_path / "mask.png"),))[0]
+        loader((replace(views[0], mask_path=tmp_path / "mask.png"),))  # before a picture is asked for
 
 
 def test_silhouettes_become_alpha(tmp_path: Path) -> None:

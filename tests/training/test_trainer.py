@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from moving_scene import TRAIN_TIMES, write_timed_capture
@@ -26,9 +29,12 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.data.loader import Picture
+from dyngs.data.pictures.images import read_picture
+from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.files.tensor_file import write_tensors
+from dyngs.files.write import write_image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.rendering import RenderOptions, render
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
@@ -405,3 +411,62 @@ def test_a_state_that_does_not_fit_is_one_line(
     assert str(caught.value).startswith(str(path))
     trainer.restore(whole)
     trainer.step()
+
+
+def with_pictures(capture: Path, out: Path, edit: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None) -> Path:
+    """Return a copy of a capture whose training pictures are edited, and have a mask."""
+    shutil.copytree(capture, out)
+    frames = json.loads((out / "transforms_train.json").read_text())
+    for view in read_capture(out).splits["train"]:
+        write_image(view.image_path, edit(read_picture(view.image_path).numpy()))
+    if mask is not None:
+        write_image(out / "mask.png", mask)
+        frames["frames"] = [frame | {"mask_path": "mask.png"} for frame in frames["frames"]]
+    (out / "transforms_train.json").write_text(json.dumps(frames))
+    return out
+
+
+def trained_state(root: Path) -> dict[str, Tensor]:
+    trainer = _trainer(root)
+    for _ in range(4):
+        trainer.step()
+    return trainer.scene.gaussians.tensors()
+
+
+def test_what_a_mask_ignores_does_not_matter(capture: Path, tmp_path: Path) -> None:
+    """White counts, black is ignored: other colours below black change nothing, below white they do."""
+    mask = np.full((16, 16, 1), 255, np.uint8)
+    mask[:, 8:] = 0
+
+    def repainted(columns: slice) -> Callable[[np.ndarray], np.ndarray]:
+        def edit(pixels: np.ndarray) -> np.ndarray:
+            pixels[:, columns, :3] = 255 - pixels[:, columns, :3]
+            pixels[..., 3] = 255
+            return pixels
+
+        return edit
+
+    nothing, ignored, counting = (
+        trained_state(with_pictures(capture, tmp_path / name, repainted(columns), mask))
+        for name, columns in (("a", slice(0, 0)), ("b", slice(8, 16)), ("c", slice(0, 8)))
+    )
+    assert all(torch.equal(x, ignored[name]) for name, x in nothing.items())
+    assert not torch.equal(nothing["sh"], counting["sh"])
+
+
+def test_what_is_transparent_is_trained_on_as_background(capture: Path, tmp_path: Path) -> None:
+    """Colours below transparent pixels change nothing, but transparency itself does: the scene must be empty there."""
+
+    def transparent(colour: int, alpha: int) -> Callable[[np.ndarray], np.ndarray]:
+        def edit(pixels: np.ndarray) -> np.ndarray:
+            pixels[:, 8:, :3], pixels[:, 8:, 3] = colour, alpha
+            return pixels
+
+        return edit
+
+    dark, light, opaque = (
+        trained_state(with_pictures(capture, tmp_path / name, edit, None))
+        for name, edit in (("a", transparent(0, 0)), ("b", transparent(200, 0)), ("c", transparent(200, 255)))
+    )
+    assert all(torch.equal(x, light[name]) for name, x in dark.items())
+    assert not torch.equal(dark["sh"], opaque["sh"])

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from dyngs.data.capture import Capture, all_views
+from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry.poses import camera_center
 from dyngs.data.times import distinct_times
 
@@ -30,7 +30,7 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         ("field of view", f"{_range(fov_deg)} degrees across"),
         ("lens", counted(lenses)),
         ("alpha", "transparent background" if capture.has_alpha else "none"),
-        ("masks", str(sum(view.mask_path is not None for view in views))),
+        ("masks", _masks(views)),
         *_prior_facts(capture),
         *_time_facts(capture),
         ("points", _points(capture)),
@@ -47,6 +47,11 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         )
         facts.append(("body", f"{next(iter(capture.body.values())).kind}, frames: {frames}"))
     return tuple(facts)
+
+
+def _masks(views: Sequence[View]) -> str:
+    count = sum(view.mask_path is not None for view in views)
+    return f"{count} of {len(views)} pictures; white counts, black is ignored" if count else "none"
 
 
 def _points(capture: Capture) -> str:

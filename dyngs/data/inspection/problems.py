@@ -12,6 +12,7 @@ import numpy as np
 from dyngs.data.capture import Capture, all_views
 from dyngs.data.geometry.poses import matrix_fault, pose_fault
 from dyngs.data.inspection.facts import counted
+from dyngs.data.inspection.mask_problems import mask_problems
 from dyngs.data.inspection.scene_problems import listed, scene_problems, time_problems
 from dyngs.data.pictures.images import SUFFIXES, read_header, read_picture
 from dyngs.errors import DyngsError, reading, reason
@@ -28,7 +29,8 @@ def problems_of(capture: Capture, deep: bool) -> list[str]:
     problems = []
     for check in (_split_problems, _name_problems, _pose_problems, _intrinsics_problems):
         problems += check(capture)
-    return [*problems, *_picture_problems(capture, deep), *time_problems(capture), *scene_problems(capture)]
+    problems += [*_picture_problems(capture, deep), *mask_problems(capture)]
+    return [*problems, *time_problems(capture), *scene_problems(capture)]
 
 
 def _split_problems(capture: Capture) -> list[str]:

@@ -11,6 +11,7 @@ from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry.focus import focus_point, share_in_front
 from dyngs.data.geometry.poses import inverse_rigid, pose_fault
 from dyngs.data.geometry.projection import projected
+from dyngs.data.inspection.mask_problems import mask_problems
 from dyngs.data.times import distinct_times
 
 MAX_LINES_PER_KIND = 5
@@ -26,8 +27,9 @@ CLOSE_IN_TIME, FEW_VIEWS = 0.08, 3
 
 
 def before_training(capture: Capture) -> list[str]:
-    """Return one line for everything about a capture that is likely to spoil a training; no picture is read."""
-    return list(dict.fromkeys([*capture.warnings, *time_problems(capture), *scene_problems(capture)]))
+    """Return one line for everything about a capture that is likely to spoil a training; only some masks are read."""
+    found = [*capture.warnings, *mask_problems(capture), *time_problems(capture), *scene_problems(capture)]
+    return list(dict.fromkeys(found))
 
 
 def time_problems(capture: Capture) -> list[str]:
