@@ -60,8 +60,8 @@ def _between(random: np.random.Generator, limits: tuple[float, float], count: in
 
 
 @torch.no_grad()
-def scores(run: Path) -> tuple[float, float, float]:
-    """Return PSNR of the test pictures: as they are, after one affine colour for all, halves after one for each."""
+def scores(run: Path) -> tuple[float, float, float, float]:
+    """Return PSNR of test pictures as they are, after one affine colour for all, of halves as they are and fitted."""
     loaded = load_run(run)
     config: Config = loaded.config
     capture = read_capture(config.data)
@@ -76,7 +76,7 @@ def scores(run: Path) -> tuple[float, float, float]:
     plain = [psnr(r.rgb[0], p.composite(background), p.mask) for p, r in shown]
     fitted = [psnr(recoloured(one, p, r, background), p.composite(background), p.mask) for p, r in shown]
     halves = [right_half_scores(p, r, background) for p, r in shown]
-    return fmean(plain), fmean(fitted), fmean(x.fitted or 0.0 for x in halves)
+    return fmean(plain), fmean(fitted), fmean(x.plain or 0.0 for x in halves), fmean(x.fitted or 0.0 for x in halves)
 
 
 def row(root: Path, run: Path, exposure: str, overrides: Sequence[str]) -> str:
@@ -86,9 +86,9 @@ def row(root: Path, run: Path, exposure: str, overrides: Sequence[str]) -> str:
         begun = resource.getrusage(resource.RUSAGE_SELF).ru_utime
         train(load_config(PRESET, [f"data.root={root}", f"run.dir={run}", f"train.exposure={exposure}", *overrides]))
         seconds = f"{resource.getrusage(resource.RUSAGE_SELF).ru_utime - begun:.0f}"
-    plain, fitted, halves = scores(run)
+    cells = " | ".join(f"{score:.2f}" for score in scores(run))
     taken = load_run(run).config.train.exposure
-    return f"{taken} | {plain:.2f} | {fitted:.2f} | {halves:.2f} | {seconds}"
+    return f"{taken} | {cells} | {seconds}"
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -101,7 +101,10 @@ def main(words: Sequence[str] | None = None) -> None:
     options = parser.parse_intermixed_args(words)
     captures = [Path(word) for word in options.words if not re.match(r"[\w.]+=", word)]
     overrides = [word for word in options.words if re.match(r"[\w.]+=", word)]
-    print("| capture | pictures | train.exposure | used | PSNR | one affine | halves | CPU s |\n|" + "---|" * 8)
+    print(
+        "| capture | pictures | train.exposure | used | PSNR | one affine | right halves | fitted | CPU s |\n|"
+        + "---|" * 9
+    )
     with kernel_threads(torch.get_num_threads()):
         for capture in captures:
             copy = options.folder / f"{capture.name}_disturbed"

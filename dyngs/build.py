@@ -186,7 +186,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         held_out_until=hold_out_until(config.train),
         priors=priors,
         robust=_robust(config, capture, pictures),
-        exposures=exposures_of(config.train, capture.splits["train"]),
+        exposures=exposures_of(config.train, pictures),
     )
 
 

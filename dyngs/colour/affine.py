@@ -40,9 +40,11 @@ def recoloured(affine: Tensor, picture: Picture, rendering: Rendering, backgroun
     """
     rgb, matrix, offset = rendering.rgb[0], affine[:, :3], affine[:, 3]
     if picture.alpha is None:
-        return rgb @ matrix.T + offset
+        return torch.addmm(offset, rgb.reshape(-1, 3), matrix.T).reshape(rgb.shape)
     through = rendering.transmittance[0][..., None]
-    return (rgb - through * background) @ matrix.T + (1 - through) * offset + through * background
+    behind = through * background
+    shown = torch.addmm(offset - offset * through.reshape(-1, 1), (rgb - behind).reshape(-1, 3), matrix.T)
+    return shown.reshape(rgb.shape) + behind
 
 
 @torch.no_grad()

@@ -4,13 +4,16 @@ A camera that chooses its exposure by itself shows the same place brighter in on
 picture has an affine colour, 3 x 4, that its rendering goes through before the loss, as 3DGS has since its second
 release. The mean over all pictures is the identity, so that the scene has the colours of the mean picture and not any.
 
+Gains of all pictures are found at once, by the places that they share, as soon as the scene has a depth; then Adam
+refines them. Adam alone is too slow for a short run, and leaves a scene bright where bright pictures were taken.
+
 Local letters: V views, M (V, 3, 4) deviations from the identity, matrix beside offset.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import torch
@@ -19,49 +22,45 @@ from torch import Tensor
 from dyngs.adam import AdamState
 from dyngs.colour.affine import SATURATED, recoloured
 from dyngs.config import TrainConfig
-from dyngs.data.capture import View
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.times import videos
 from dyngs.rendering import Rendering
 from dyngs.state import tensors_of
 from dyngs.tensor_checks import require_tensor
+from dyngs.training.shared_places import Draw, log_gains
 
-WARM_UP = 0.05
+WARM_UP = 0.25
 """Share of the run in which pictures are taken as they are: before, the rendering shows too little to compare with."""
 TRAVEL = 0.5
-"""How far a gain may move after its first guess, at most: rates follow from how often a picture is trained on."""
+"""How far a gain may move after it was found, at most: rates follow from how often a picture is trained on."""
 LAST_RATE = 0.02
 """Rate at the end over that at the beginning, log-linear between."""
-MAX_RATE = 0.03
-MIXING_RATE = 0.2
+MAX_RATE = 0.01
+MIXING_RATE = 0.05
 """Rate of what mixes channels, and of offsets, over that of gains."""
-GAIN_WEIGHT, MIXING_WEIGHT = 0.002, 0.02
+GAIN_WEIGHT, MIXING_WEIGHT = 0.3, 1.0
 """Weights of the mean squared deviation from the identity: gains differ, channels hardly mix."""
-CALIBRATED = 0.4
-"""Share of the run up to which gains also follow the ratio of a picture to its rendering: Adam alone is too slow."""
-PULL = 0.5
-"""Part of the way that they follow at each visit; all of it at the first."""
 CELLS, FEWEST_CELLS = 16, 8
 """The ratio is a median over so many cells a side; with fewer that say something there is none."""
 DARK, COVERED = 0.02, 0.1
 """Mean colour up to which a cell says nothing; transmittance from which a pixel says nothing."""
+ENOUGH = 100
+"""Pixels along the longer side from which only every second one is looked at, and so on."""
 MAX_GAIN = 8.0
-SMOOTHED = 0.1
-"""Part of the way to the mean of the pictures before and after, in a video, while gains follow."""
-SMOOTH_WEIGHT = 0.05
+SMOOTH_WEIGHT = 1.0
 """Weight of the mean square of its difference from the pictures before and after, in a video."""
 
 
-def exposures_of(options: TrainConfig, views: Sequence[View]) -> ViewExposures | None:
+def exposures_of(options: TrainConfig, pictures: PictureLoader) -> ViewExposures | None:
     """Return what is learned of the exposures of training views, if that is asked for."""
     if options.exposure != "always":
         return None
-    beside: list[list[int]] = [[] for _ in views]
-    for order in videos(views):
+    beside: list[list[int]] = [[] for _ in pictures.views]
+    for order in videos(pictures.views):
         for one, next_one in pairwise(order):
             beside[one].append(next_one)
             beside[next_one].append(one)
-    return ViewExposures(beside, options.steps)
+    return ViewExposures(beside, options.steps, pictures)
 
 
 class ViewExposures:
@@ -70,12 +69,13 @@ class ViewExposures:
     Args:
         neighbours: for each of V views, the views before and after it in a video; empty: none.
         steps: of the run.
+        pictures: of training, from which all gains are found at once; None: each is found from its rendering.
     """
 
-    def __init__(self, neighbours: Sequence[Sequence[int]], steps: int) -> None:
+    def __init__(self, neighbours: Sequence[Sequence[int]], steps: int, pictures: PictureLoader | None = None) -> None:
         count = len(neighbours)
         self._neighbours, self._steps, self._begins = [list(x) for x in neighbours], steps, round(WARM_UP * steps)
-        self._calibrated = round(CALIBRATED * steps)
+        self._pictures = pictures
         self._visits = torch.zeros(count, dtype=torch.int64, device="cpu")
         self._values = torch.zeros(count, 12, device="cpu", requires_grad=True)
         self._adam = AdamState.zero({"values": self._values})
@@ -84,6 +84,24 @@ class ViewExposures:
         is_gain = torch.eye(3, 4, device="cpu").flatten()
         self._rates = rate * (MIXING_RATE + (1 - MIXING_RATE) * is_gain)
         self._weights = MIXING_WEIGHT + (GAIN_WEIGHT - MIXING_WEIGHT) * is_gain
+
+    def begin(self, step: int, which: Callable[[int], bool], draw: Draw, background: Tensor) -> None:
+        """Find the gains of all pictures at once, if it is time to.
+
+        Args:
+            step: that is being done.
+            which: whether a picture may be looked at.
+            draw: the scene, as far as it is learned.
+            background: (3,) behind it.
+        """
+        if step != self._begins + 1 or self._pictures is None:
+            return
+        looked_at = [i for i in range(len(self._visits)) if which(i)]
+        gains = log_gains(self._pictures, looked_at, draw, background).exp()
+        self._visits[looked_at] = 1
+        with torch.no_grad():
+            self._values.reshape(-1, 3, 4).diagonal(dim1=1, dim2=2).copy_(gains - gains[looked_at].mean(0))
+            self._values[self._visits == 0] = 0
 
     def affine(self, index: int) -> Tensor:
         """Return (3, 4) the affine colour of a picture: what the camera made of the scene's colours."""
@@ -102,9 +120,10 @@ class ViewExposures:
         index, step = view
         if step <= self._begins:
             return rendering.rgb[0]
-        if step <= self._calibrated:
-            self._calibrate(index, picture, rendering, background)
         shown = recoloured(self.affine(index), picture, rendering, background)
+        if not int(self._visits[index]):
+            self._guess(index, picture, rendering, shown.detach(), background)
+            shown = recoloured(self.affine(index), picture, rendering, background)
         return up_to_white(shown, picture.composite(background))
 
     def penalties(self, index: int) -> dict[str, Tensor]:
@@ -147,30 +166,35 @@ class ViewExposures:
         self._visits, self._values = visits.clone(), values.clone().requires_grad_()
 
     @torch.no_grad()
-    def _calibrate(self, index: int, picture: Picture, rendering: Rendering, background: Tensor) -> None:
-        """Bring the gains of a picture closer to the median ratio of it to its rendering, over cells.
+    def _guess(self, index: int, picture: Picture, rendering: Rendering, shown: Tensor, background: Tensor) -> None:
+        """Set the gains of a picture to the median ratio, over cells, of it to its rendering ``shown``.
 
         A rendering that is not sharp yet has the right mean in cells, whereas least squares would take it for flat.
+        Where too little is to be seen it takes after those beside it.
         """
-        shown, truth = recoloured(self.affine(index), picture, rendering, background), picture.composite(background)
-        through = rendering.transmittance[0][..., None]
+        every = max(1, max(shown.shape[:2]) // ENOUGH)
+        few = slice(every // 2, None, every), slice(every // 2, None, every)
+        truth, through, shown = (
+            picture.composite(background)[few],
+            rendering.transmittance[0][few][..., None],
+            shown[few],
+        )
         counts = ((truth < SATURATED).all(-1, keepdim=True) & (through < COVERED)).float()
-        counts = counts if picture.mask is None else counts * picture.mask[..., None]
+        counts = counts if picture.mask is None else counts * picture.mask[few][..., None]
         behind = 0 if picture.alpha is None else through * background
         pixels = torch.cat([(truth - behind) * counts, (shown - behind) * counts, counts], -1).permute(2, 0, 1)
         cells = torch.nn.functional.adaptive_avg_pool2d(pixels, (CELLS, CELLS)).flatten(1)
         known = (cells[6] > 0.5) & (cells[:6] > DARK * cells[6]).all(0)
         if int(known.sum()) < FEWEST_CELLS:
+            beside = self._beside(index)
+            if beside:
+                self._values[index] = self._values[beside].mean(0)
             return
         ratio = (cells[:3, known] / cells[3:6, known]).log().median(1).values
-        gains = self._values[index].reshape(3, 4).diagonal()
-        share = 1.0 if not int(self._visits[index]) else PULL
-        gains.copy_(((1 + gains) * (share * ratio).exp()).clamp(1 / MAX_GAIN, MAX_GAIN) - 1)
-        beside = self._beside(index)
-        if beside:
-            self._values[index].lerp_(self._values[beside].mean(0), SMOOTHED)
+        self._values[index].reshape(3, 4).diagonal().copy_(ratio.exp().clamp(1 / MAX_GAIN, MAX_GAIN) - 1)
 
 
 def up_to_white(rendered: Tensor, truth: Tensor) -> Tensor:
     """Return ``rendered`` (H, W, 3), at most 1 where the picture is saturated: no sensor shows more."""
-    return torch.where(truth >= SATURATED, rendered.clamp_max(1.0), rendered)
+    white = truth >= SATURATED
+    return torch.where(white, rendered.clamp_max(1.0), rendered) if bool(white.any()) else rendered

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dyngs.camera import Cameras
 from dyngs.colour.network import network_of
 from dyngs.colour.training import ColourTraining, TrainingLooks
 from dyngs.colour.view_dependence import MeasuredView
@@ -20,7 +21,7 @@ from dyngs.data.loader import Picture, PictureLoader
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.rendering import RenderOptions
+from dyngs.rendering import Rendering, RenderOptions
 from dyngs.scene import Scene, SceneTraining
 from dyngs.state import Role, State, prefixed, tensors_of, with_role
 from dyngs.static.densify import Densifier
@@ -116,6 +117,7 @@ class Trainer:
             picture = self.robust.masked(index, step, picture, rendering.rgb[0], background, with_depth)
         rendered, truth = rendering.rgb[0], picture.composite(background)
         if self.exposures is not None:
+            self.exposures.begin(step, self._wanted(step), self._drawn_with_depth(background), background)
             rendered = self.exposures.applied((index, step), picture, rendering, background)
         terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
         if self.alpha.weight > 0 and picture.alpha is not None:
@@ -198,6 +200,11 @@ class Trainer:
                 raise DyngsError(f"{checkpoint.name} lacks {missing}; {OTHER_CONFIG}") from None
         self.optimizer, self.scene = optimizer, replace(scene, colour=self.colours.network)
         self.done = checkpoint.info.step
+
+    def _drawn_with_depth(self, background: Tensor) -> Callable[[Cameras, float | None], Rendering]:
+        """Return what draws the scene with its expected depth."""
+        options = replace(self.options, depth="expected", absgrad=False)
+        return partial(self.scene.render, options=options, background=background)
 
     def _options(self, step: int) -> RenderOptions:
         """Return how pictures are drawn in ``step``."""
