@@ -23,6 +23,7 @@ from dyngs.config import Config
 from dyngs.evaluate.report import evaluate_run
 from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
+from dyngs.prune.floaters import FloaterRemoval
 from dyngs.prune.stage import PruneStage
 from dyngs.runs.checkpoint import (
     Checkpoint,
@@ -156,8 +157,10 @@ class _Run:
             Progress(loop.total, done, options.log_every, config=lambda: self.config) as progress,
             Interrupts() as interrupts,
         ):
-            loop.subscribe(*self.limits.values(), log, progress, *listeners, self._save_and_evaluate)
             limited, comparison = self.limited, None
+            if limited is not None:
+                loop.subscribe(FloaterRemoval(loop, lambda: limited.trainer))
+            loop.subscribe(*self.limits.values(), log, progress, *listeners, self._save_and_evaluate)
             if limited is not None:
                 comparison = StillComparison(self.folder, lambda: limited.trainer, loop)
                 loop.subscribe(PruneStage(loop, lambda: limited.trainer), comparison)

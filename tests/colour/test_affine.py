@@ -33,7 +33,7 @@ def test_an_affine_is_found_again() -> None:
     found = fitted_affine([(picture, rendering)], BLACK)
     torch.testing.assert_close(found, WARM, atol=0.02, rtol=0)  # the ridge pulls a little to the identity
     shown = recoloured(found, picture, rendering, BLACK)
-    assert float((shown - picture.rgb_premultiplied).abs().mean()) < 1e-3
+    assert float((shown - picture.rgb_premultiplied).abs().mean()) < 3e-3
 
 
 def test_masked_pixels_and_those_of_weight_0_do_not_count() -> None:

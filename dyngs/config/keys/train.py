@@ -55,6 +55,11 @@ class TrainConfig(Section):
         description="learn exposure and white balance of each training picture (an affine colour, the mean one is the "
         "identity); auto: where small runs beforehand say that it pays",
     )
+    remove_floaters: bool = Field(
+        default=True,
+        description="when training ends, remove Gaussians that hang close before a camera and show mostly there; still "
+        "scenes of 20 views or more",
+    )
     sh_every: int = Field(
         default=1000,
         ge=1,

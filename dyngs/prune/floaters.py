@@ -1,0 +1,101 @@
+"""Floaters: Gaussians close before one camera that explain its picture alone, and haze all views from beside it.
+
+A Gaussian that belongs to a surface contributes to the pictures of many cameras. One that hangs between a camera and
+the scene shows mostly there. It is cheap to tell: most of its blending weight, over all training views, lies in one of
+them, and it is much nearer to that camera than the scene usually is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.config import StaticModel
+from dyngs.rendering import contributions
+from dyngs.training.background import background_colour
+from dyngs.training.events import Event, Message, StepDone, TopologyChanged
+from dyngs.training.loop import Loop
+from dyngs.training.trainer import Trainer
+from dyngs.training.views import training_cameras
+
+MAIN_SHARE = 0.5
+"""Share of the weight of a Gaussian that must lie in one view."""
+NEAR = 0.6
+"""Depth of a Gaussian in that view, over the median depth of the view, below which it is near."""
+SEEN = 0.3
+"""Sum of weights over all views, px, from which a Gaussian shows at all."""
+LONGEST_SIDE = 200
+"""Of the views that are drawn, px: what hangs in the way shows in small ones, too."""
+SOLID = 0.5
+"""Alpha from which a pixel has a depth."""
+FEWEST_VIEWS, MOST = 20, 0.01
+"""With fewer views, or with a larger share of such Gaussians, much of the scene is seen by one view only."""
+
+
+class FloaterRemoval:
+    """Listener that removes floaters when training ends, if that is asked for; still scenes only.
+
+    Args:
+        loop: of the run.
+        trainer: returns the trainer of its scene, which may be another one later.
+    """
+
+    def __init__(self, loop: Loop, trainer: Callable[[], Trainer]) -> None:
+        self._loop, self._trainer = loop, trainer
+
+    def __call__(self, event: Event) -> None:
+        """Remove them after the last step of training, before it is saved."""
+        match event:
+            case StepDone() if event.step == self._trainer().config.train.steps:
+                self._remove(event.step)
+
+    def _remove(self, step: int) -> None:
+        trainer = self._trainer()
+        match trainer.config.model:
+            case StaticModel() if trainer.config.train.remove_floaters and len(trainer.pictures) >= FEWEST_VIEWS:
+                found = floaters(trainer)
+            case _:
+                return
+        before, count = len(trainer.scene), int(found.sum())
+        if not count:
+            return
+        share = f"{count:,} of {before:,} Gaussians hang close before single cameras"
+        if count > MOST * before:
+            self._loop.tell(Message(f"{share}: too many to be floaters, none is removed"))
+            return
+        trainer.keep(~found)
+        self._loop.tell(Message(f"{share}: removed (train.remove_floaters)"))
+        self._loop.tell(TopologyChanged(step, before, len(trainer.scene)))
+
+
+@torch.no_grad()
+def floaters(trainer: Trainer) -> Tensor:
+    """Return (N,) bool which Gaussians of a still scene are floaters, by all of its training views."""
+    scene, background = trainer.scene, background_colour(trainer.background)
+    gaussians, options = scene.gaussians.detach(), replace(trainer.options, depth="expected", absgrad=False)
+    total, most = torch.zeros_like(gaussians.logit_opacities), torch.zeros_like(gaussians.logit_opacities)
+    nearness = torch.full_like(total, torch.inf)
+    for camera in training_cameras(trainer.pictures.views, trainer.config.data):
+        small = _small(camera)
+        drawn = scene.render(small, None, options=options, background=background)
+        assert drawn.depth is not None
+        depths = drawn.depth[0][drawn.alpha[0] > SOLID]
+        weight = contributions(gaussians, small, trainer.options)[0]
+        pose = small.cam_from_world[0]
+        depth = depths.median() if depths.numel() else depths.new_zeros(())
+        is_main = weight > most
+        nearness = torch.where(is_main, (gaussians.means @ pose[2, :3] + pose[2, 3]) / depth, nearness)
+        total, most = total + weight, torch.where(is_main, weight, most)
+    return (total > SEEN) & (most > MAIN_SHARE * total) & (nearness < NEAR)
+
+
+def _small(camera: Cameras) -> Cameras:
+    """Return ``camera`` with pictures of at most ``LONGEST_SIDE``."""
+    factor = min(1.0, LONGEST_SIDE / max(camera.width, camera.height))
+    width, height = max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
+    scale = camera.intrinsics.new_tensor([width / camera.width, height / camera.height, 1.0])
+    return Cameras(camera.cam_from_world, scale[:, None] * camera.intrinsics, width, height)
