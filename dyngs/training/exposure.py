@@ -85,19 +85,18 @@ class ViewExposures:
         self._rates = rate * (MIXING_RATE + (1 - MIXING_RATE) * is_gain)
         self._weights = MIXING_WEIGHT + (GAIN_WEIGHT - MIXING_WEIGHT) * is_gain
 
-    def begin(self, step: int, which: Callable[[int], bool], draw: Draw, background: Tensor) -> None:
+    def begin(self, step: int, which: Callable[[int], bool], draw: Draw) -> None:
         """Find the gains of all pictures at once, if it is time to.
 
         Args:
             step: that is being done.
             which: whether a picture may be looked at.
             draw: the scene, as far as it is learned.
-            background: (3,) behind it.
         """
         if step != self._begins + 1 or self._pictures is None:
             return
         looked_at = [i for i in range(len(self._visits)) if which(i)]
-        gains = log_gains(self._pictures, looked_at, draw, background).exp()
+        gains = log_gains(self._pictures, looked_at, draw).exp()
         self._visits[looked_at] = 1
         with torch.no_grad():
             self._values.reshape(-1, 3, 4).diagonal(dim1=1, dim2=2).copy_(gains - gains[looked_at].mean(0))

@@ -61,16 +61,15 @@ class _Places:
 
 
 @torch.no_grad()
-def log_gains(pictures: PictureLoader, which: Sequence[int], draw: Draw, background: Tensor) -> Tensor:
+def log_gains(pictures: PictureLoader, which: Sequence[int], draw: Draw) -> Tensor:
     """Return (V, 3) log gains of the pictures ``which``, of mean 0; 0 of all others.
 
     Args:
         pictures: V of training.
         which: indices of those that may be looked at.
         draw: the scene, as far as it is learned.
-        background: (3,) behind it.
     """
-    cells = [_cells_of(pictures, index, draw, background) for index in which]
+    cells = [_cells_of(pictures, index, draw) for index in which]
     centres = torch.cat([x.camera.centers for x in cells]).cpu()
     distance = torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")
     places = [
@@ -103,7 +102,7 @@ def _solved(places: Sequence[_Places], gains: Tensor) -> Tensor:
     return torch.linalg.solve(products, sides)
 
 
-def _cells_of(pictures: PictureLoader, index: int, draw: Draw, background: Tensor) -> _Cells:
+def _cells_of(pictures: PictureLoader, index: int, draw: Draw) -> _Cells:
     picture = pictures[index]
     old = picture.cameras
     rows, columns = grid_of(old.width, old.height)

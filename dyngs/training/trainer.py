@@ -117,7 +117,7 @@ class Trainer:
             picture = self.robust.masked(index, step, picture, rendering.rgb[0], background, with_depth)
         rendered, truth = rendering.rgb[0], picture.composite(background)
         if self.exposures is not None:
-            self.exposures.begin(step, self._wanted(step), self._drawn_with_depth(background), background)
+            self.exposures.begin(step, self._wanted(step), self._drawn_with_depth(background))
             rendered = self.exposures.applied((index, step), picture, rendering, background)
         terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
         if self.alpha.weight > 0 and picture.alpha is not None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from flat_wall import BLACK, SIZE, cameras_before_wall, learned, seen_from, with_block, with_depth
+from flat_wall import SIZE, cameras_before_wall, learned, seen_from, with_block, with_depth
 from torch import Tensor
 
 from dyngs.camera import Cameras
@@ -33,7 +33,7 @@ def pictures_with(gains: Tensor) -> Any:
 
 
 def found(pictures: list[Picture], which: list[int] | None = None) -> Tensor:
-    return log_gains(pictures, list(range(COUNT)) if which is None else which, drawn, BLACK)  # type: ignore[arg-type]
+    return log_gains(pictures, list(range(COUNT)) if which is None else which, drawn)  # type: ignore[arg-type]
 
 
 def test_gains_of_pictures_that_only_neighbours_share_places_with() -> None:
@@ -84,6 +84,5 @@ def test_what_the_scene_looks_like_does_not_matter() -> None:
         pictures,
         list(range(COUNT)),
         lambda cameras, time: replace(with_depth(cameras), rgb=0.1 * with_depth(cameras).rgb),
-        BLACK,
     )
     assert torch.equal(dark, found(pictures))
