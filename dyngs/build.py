@@ -34,6 +34,7 @@ from dyngs.config import (
     StaticModel,
 )
 from dyngs.config.kinds import field_of, stored_sh_degree, uses_absgrad
+from dyngs.data.ahead import usual_threads
 from dyngs.data.capture import Capture
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.geometry.frusta import outside_of_cube
@@ -152,7 +153,8 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
     start = StartValues.for_strategy(config.strategy)  # a run may begin with more Gaussians than it may end with
     config = within_cap(config, len(set(training_times(capture))))
     generator = torch.Generator().manual_seed(config.run.seed)
-    pictures = PictureLoader(capture.splits["train"], config.data, with_maps=True)
+    views = capture.splits["train"]
+    pictures = PictureLoader(views, config.data, with_maps=True, decoding_threads=usual_threads())
     priors = _priors(config, capture, pictures)
     if not priors.masks:
         pictures = pictures.without_motion_masks()

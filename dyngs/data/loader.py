@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import DataConfig
+from dyngs.data.ahead import Ahead
 from dyngs.data.capture import View
 from dyngs.data.geometry.intrinsics import scaled_intrinsics
 from dyngs.data.pictures.depth import read_depth, read_labels
@@ -34,6 +34,9 @@ from dyngs.files.containment import pictures_up_to
 
 FULLY_KEPT = 1 - 1e-4
 """Mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding."""
+
+_SMALL_BYTES = 4
+"""Bytes of a shrunk picture, whose values are float32, per byte of the whole one and share of its pixels."""
 
 
 @dataclass(frozen=True)
@@ -129,18 +132,28 @@ class _Decoded:
 
 
 class PictureLoader:
-    """A sequence of pictures, decoded on demand; the last used ones are cached up to ``options.cache_mb``.
+    """A sequence of pictures, decoded on demand or ahead of it; the first ones are cached up to ``options.cache_mb``.
 
-    The same index always gives the same bytes, cached or not. Safe to use from several threads. Tensors are on the CPU.
+    Once the cache is full, what is in it stays: where every picture is asked for once per epoch, in a new order each
+    time, the one used last is the one needed last. The same index always gives the same bytes, cached or not, decoded
+    ahead or not. Safe to use from several threads. Tensors are on the CPU.
     """
 
-    def __init__(self, views: Sequence[View], options: DataConfig | None = None, *, with_maps: bool = False) -> None:
+    def __init__(
+        self,
+        views: Sequence[View],
+        options: DataConfig | None = None,
+        *,
+        with_maps: bool = False,
+        decoding_threads: int = 0,
+    ) -> None:
         """Check every file (not every pixel) at once, so that a bad capture fails before training starts.
 
         Args:
             views: one split of a capture.
             options: ``downscale``, ``longest_side``, ``cache_mb`` and ``max_megapixels`` count; None: the defaults.
             with_maps: read depth maps and flow, too, where views have them.
+            decoding_threads: decode what is to be expected in so many threads; 0, or ``cache_mb`` 0: in none.
 
         Raises:
             DyngsError: missing pictures (count and first), damaged ones, or a size that is not the view's.
@@ -148,8 +161,10 @@ class PictureLoader:
         self._views = tuple(views)
         self._options = options = options or DataConfig(root=Path())
         self._with_maps = with_maps
-        self._cache: OrderedDict[int, _Decoded] = OrderedDict()
+        self._cache: dict[int, _Decoded] = {}
         self._cached_bytes = 0
+        self._threads = decoding_threads if options.cache_mb > 0 else 0
+        self._ahead = Ahead(self._read, self._threads)
         self._small: dict[int, Picture] = {}
         self._small_by, self._small_bytes = 1, 0
         self._last_map: tuple[object, LensMap] | None = None
@@ -201,12 +216,13 @@ class PictureLoader:
 
     def shrunk(self, index: int, factor: int) -> Picture:
         """Return ``self[index].shrunk(factor)``; cached for the last factor, where memory is left."""
+        with self._lock:
+            if factor != self._small_by:
+                self._small, self._small_by, self._small_bytes = {}, factor, 0
         if factor == 1:
             return self[index]
         index %= len(self._views)
         with self._lock:
-            if factor != self._small_by:
-                self._small, self._small_by, self._small_bytes = {}, factor, 0
             if index in self._small:
                 return self._small[index]
         picture = self[index].shrunk(factor)
@@ -217,12 +233,27 @@ class PictureLoader:
                 self._small_bytes += picture.num_bytes
         return picture
 
+    def expect(self, indices: Sequence[int]) -> None:
+        """Begin to decode the pictures that are asked for next, in this order, as far as they are not cached."""
+        with self._lock:
+            wanted = [i for i in indices if i not in self._cache and not (self._small_by > 1 and i in self._small)]
+        self._ahead.expect(wanted)
+
+    def rest(self) -> None:
+        """End the threads that decode ahead; they begin anew with the next ``expect``."""
+        self._ahead.rest()
+
     def without_motion_masks(self) -> PictureLoader:
         """Return a loader of the same pictures that reads no motion masks."""
         if all(view.motion_mask_path is None for view in self._views):
             return self
         views = [replace(view, motion_mask_path=None) for view in self._views]
-        return PictureLoader(views, self._options, with_maps=self._with_maps)
+        return PictureLoader(views, self._options, with_maps=self._with_maps, decoding_threads=self._threads)
+
+    @property
+    def decoded_ahead(self) -> int:
+        """Number of pictures that ``expect`` decodes ahead; 0 where all are cached."""
+        return 0 if len(self._cache) == len(self._views) else self._ahead.most
 
     @property
     def cached_bytes(self) -> int:
@@ -232,18 +263,30 @@ class PictureLoader:
     def _decoded(self, index: int) -> _Decoded:
         with self._lock:
             if index in self._cache:
-                self._cache.move_to_end(index)
                 return self._cache[index]
-        with pictures_up_to(self._options.max_megapixels):
-            decoded = self._decode(self._views[index])
-        limit = self._options.cache_mb * 1e6
+        decoded = self._ahead.take(index)
+        if decoded is None:
+            decoded = self._read(index)
         with self._lock:
-            if index not in self._cache and decoded.num_bytes <= limit:
+            if index not in self._cache and self._has_room(decoded.num_bytes):
                 self._cache[index] = decoded
                 self._cached_bytes += decoded.num_bytes
-            while self.cached_bytes > limit and self._cache:
-                self._cached_bytes -= self._cache.popitem(last=False)[1].num_bytes
         return decoded
+
+    def _has_room(self, size: int) -> bool:
+        """Return whether a picture of ``size`` bytes is to be cached.
+
+        While pictures are shrunk, only where small and large ones fit together: the small ones are what is asked for.
+        """
+        limit, left = self._options.cache_mb * 1e6, len(self._views) - len(self._cache) - 1
+        if self._small_by > 1 and len(self._views) * size * (1 + _SMALL_BYTES / self._small_by**2) > limit:
+            return False
+        waiting = min(self._ahead.most, left) * size
+        return self.cached_bytes + size + waiting <= limit
+
+    def _read(self, index: int) -> _Decoded:
+        with pictures_up_to(self._options.max_megapixels):
+            return self._decode(self._views[index])
 
     def _decode(self, view: View) -> _Decoded:
         pixels = read_picture(view.image_path)

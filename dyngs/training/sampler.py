@@ -32,6 +32,16 @@ class ViewSampler:
             if wanted(index):
                 return index
 
+    def coming(self, count: int, wanted: Callable[[int], bool]) -> list[int]:
+        """Return up to ``count`` views of this epoch that come next, by what is ``wanted`` now; nothing is drawn."""
+        found: list[int] = []
+        for index in self._order[self._position :].tolist():
+            if len(found) == count:
+                break
+            if wanted(index):
+                found.append(index)
+        return found
+
     def state(self) -> dict[str, Tensor]:
         return {"order": self._order, "position": torch.tensor([self._position], device="cpu")}
 

@@ -98,8 +98,11 @@ class Trainer:
         """
         config, step, scene = self.config, self.done + 1, self.scene
         divisor = picture_divisor(config.train, step)
-        index = self.sampler.next(self.generator, self._wanted(step))
+        wanted = self._wanted(step)
+        index = self.sampler.next(self.generator, wanted)
         picture = self.pictures.shrunk(index, divisor)
+        if self.pictures.decoded_ahead:
+            self.pictures.expect(self.sampler.coming(self.pictures.decoded_ahead, wanted))
         background = background_colour(self.background, self.generator)
         moment = self.training.moment(scene, picture, step)
         probe = (

@@ -118,7 +118,7 @@ def test_same_bytes_cached_or_not_and_from_threads(tmp_path: Path) -> None:
     assert uncached.cached_bytes == 0
 
 
-def test_cache_keeps_to_its_limit_and_drops_the_oldest(tmp_path: Path) -> None:
+def test_cache_keeps_to_its_limit_and_what_is_in_it(tmp_path: Path) -> None:
     one = 8 * 12 * 4
     pictures = loader(views_of(tmp_path, 4), cache_mb=2.5 * one / 1e6)
     for i in (0, 1, 0, 2):
@@ -126,9 +126,34 @@ def test_cache_keeps_to_its_limit_and_drops_the_oldest(tmp_path: Path) -> None:
         assert pictures.cached_bytes <= 2.5 * one
     for i in range(4):
         (tmp_path / f"{i}.png").unlink()
-    pictures[0], pictures[2]
-    with pytest.raises(DyngsError, match=r"1\.png"):
-        pictures[1]
+    pictures[0], pictures[1]
+    with pytest.raises(DyngsError, match=r"2\.png"):
+        pictures[2]
+
+
+@pytest.mark.parametrize("cache_mb", [1e-3, 1])
+def test_pictures_decoded_ahead_are_the_same(cache_mb: float, tmp_path: Path) -> None:
+    """In any order, also one that was not foretold, and within the limit."""
+    views = views_of(tmp_path, 6)
+    options = DataConfig(root=Path(), cache_mb=cache_mb)
+    ahead, plain = PictureLoader(views, options, decoding_threads=2), loader(views, cache_mb=0)
+    for factor, order in ((2, (3, 1, 4, 0, 2, 5)), (1, (5, 0, 1, 2, 4, 3)), (1, (0, 1, 2, 3, 4, 5))):
+        for position, index in enumerate(order):
+            found, wanted = ahead.shrunk(index, factor), plain.shrunk(index, factor)
+            assert torch.equal(found.rgb_premultiplied, wanted.rgb_premultiplied)
+            ahead.expect((*order[position + 1 : position + 4], 0))
+            assert ahead.cached_bytes <= cache_mb * 1e6
+    assert ahead.decoded_ahead == (0 if cache_mb == 1 else 4)
+
+
+def test_a_damaged_picture_is_reported_when_its_turn_comes(tmp_path: Path) -> None:
+    views = views_of(tmp_path, 3)
+    pictures = PictureLoader(views, DataConfig(root=Path()), decoding_threads=1)
+    views[2].image_path.unlink()
+    pictures.expect([1, 2])
+    assert pictures[1].name == "1"
+    with pytest.raises(DyngsError, match=r"2\.png"):
+        pictures[2]
 
 
 def test_length_iteration_and_last(tmp_path: Path) -> None:

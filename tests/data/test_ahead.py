@@ -1,0 +1,70 @@
+"""What is worked on ahead: taken once, bounded, dropped when it is no longer expected, errors kept for their turn."""
+
+from __future__ import annotations
+
+from threading import Event, active_count
+
+import pytest
+
+from dyngs.data.ahead import Ahead, usual_threads
+
+
+def test_what_is_expected_is_ready_once() -> None:
+    done: list[int] = []
+
+    def work(index: int) -> int:
+        done.append(index)
+        return 10 * index
+
+    ahead = Ahead(work, 1)
+    ahead.expect([3, 1, 3, 2, 7])  # at most two
+    assert (ahead.take(3), ahead.take(1)) == (30, 10)
+    assert ahead.take(3) is None
+    assert ahead.take(2) is None
+    assert done == [3, 1]
+
+
+def test_what_is_no_longer_expected_is_dropped() -> None:
+    begun, go = Event(), Event()
+
+    def work(index: int) -> int:
+        begun.set()
+        go.wait(10)
+        return index
+
+    ahead = Ahead(work, 1)
+    ahead.expect([1, 2])
+    assert begun.wait(10)
+    ahead.expect([3])
+    go.set()
+    assert ahead.take(3) == 3
+    assert ahead.take(1) is None
+    assert ahead.take(2) is None
+
+
+def test_errors_come_when_the_item_is_asked_for() -> None:
+    ahead = Ahead(lambda index: 1 // index, 1)
+    ahead.expect([0, 1])
+    assert ahead.take(1) == 1
+    with pytest.raises(ZeroDivisionError):
+        ahead.take(0)
+
+
+def test_threads_end_and_begin_anew() -> None:
+    before = active_count()
+    ahead = Ahead(lambda index: index, 2)
+    ahead.expect([1, 2])
+    ahead.rest()
+    assert active_count() == before
+    assert ahead.take(1) is None
+    ahead.expect([2])
+    assert ahead.take(2) == 2
+    ahead.rest()
+
+
+def test_without_threads_nothing_is_done() -> None:
+    ahead = Ahead(lambda index: index, 0)
+    ahead.expect([1])
+    assert ahead.take(1) is None
+    assert ahead.most == 0
+    assert 1 <= usual_threads() <= 4
