@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import Config, DataConfig, DynamicModel, StaticModel, TrajectoryField
+from dyngs.config import Config, DataConfig, DynamicModel, StaticModel, TrainConfig, TrajectoryField
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.field import DeformationField, FieldSetup, NetworkField, Offsets, chosen
@@ -110,7 +110,7 @@ def write_moving_run(
     root = write_timed_capture(folder / "capture", standing=standing)
     options = TrajectoryField(polynomial=1, fourier=0, move_rotations=False, move_scales=False)
     model = DynamicModel(deform=options) if moves else StaticModel()
-    config = Config(data=DataConfig.model_validate({"root": root}), model=model)
+    config = Config(data=DataConfig.model_validate({"root": root}), model=model, train=TrainConfig(steps=7))
     save_config(config, folder / "run" / RESOLVED_NAME)
     gaussians = row_of_balls()
     tensors = {f"gaussians.{name}": x.contiguous() for name, x in gaussians.tensors().items()}

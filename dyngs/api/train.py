@@ -20,12 +20,15 @@ from dyngs.budget.speed import SpeedLimit
 from dyngs.budget.time import Deadline, first_fit, refitted
 from dyngs.build import build
 from dyngs.config import Config
+from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FloaterRemoval
 from dyngs.prune.stage import PruneStage
 from dyngs.runs.checkpoint import (
+    SCENE_FILE,
     Checkpoint,
     checkpoint_paths,
     last_good,
@@ -35,13 +38,25 @@ from dyngs.runs.checkpoint import (
     seconds_at,
     step_of,
 )
-from dyngs.runs.folder import begin, default_folder, require_startable, tidy, was_only_begun
+from dyngs.runs.folder import (
+    ASKED_NAME,
+    EXPORT_FOLDER,
+    asked_for,
+    begin,
+    default_folder,
+    is_done,
+    note_asked,
+    require_startable,
+    tidy,
+    was_only_begun,
+)
 from dyngs.runs.lock import writing
 from dyngs.runs.log import RunLog
 from dyngs.runs.progress import Progress
 from dyngs.training.events import Evaluated, Event, Listener, Saved, StepDone
 from dyngs.training.interrupt import Interrupts
 from dyngs.training.limits import require_possible
+from dyngs.training.longer import told, with_length
 from dyngs.training.loop import Loop, Stopwatch
 
 _COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"
@@ -66,7 +81,8 @@ def train(config: Config, *, resume_from: Path | None = None, listeners: Sequenc
     """Train and return the run folder.
 
     Args:
-        config: everything that decides the run; on resuming, that of the run folder.
+        config: everything that decides the run; on resuming, that of the run folder, whose ``train.steps`` may be
+            changed: the run then goes on to so many, on their schedules (``dyngs.training.longer``).
         resume_from: a run folder to go on with, from its newest checkpoint, or from the beginning where it was stopped
             before its first: the result has the same bytes as if the run had never stopped.
         listeners: are told everything that happens, see ``dyngs.training.events``.
@@ -84,13 +100,20 @@ def train(config: Config, *, resume_from: Path | None = None, listeners: Sequenc
     keep_freed_memory()
     with writing(folder) as is_sole_writer, kernel_threads(config.run.threads or num_cores()):
         tidy(folder, sole_writer=is_sole_writer)
+        if resume_from is None and is_done(folder, config) and not _owes_file(config, folder):
+            print(_told_again(config, folder), flush=True)
+            return folder
         resumed = _start_of_run(config, folder, resuming=resume_from is not None)
+        if resume_from is not None:
+            config = _with_new_length(config, folder, resumed)
         if resumed is not None and resumed.info.step >= config.total_steps and not _owes_file(config, folder):
             return folder
+        asked = asked_for(folder) if resume_from is not None else config
         if resumed is None:
             config = _chosen(config, folder)
-        if not _Run(config, folder, resumed).run(listeners):
-            _Run(still_choices.decided(still_first.still_instead(folder, config)), folder, None).run(listeners)
+        if not _Run(config, folder, resumed, asked).run(listeners):
+            _Run(still_choices.decided(still_first.still_instead(folder, config)), folder, None, asked).run(listeners)
+        note_asked(folder, asked)
     return folder
 
 
@@ -100,6 +123,15 @@ def _chosen(config: Config, folder: Path) -> Config:
     What holds for still and moving scenes comes first, as the comparison of the two builds on it.
     """
     return still_choices.decided(still_first.start(still_choices.decided(config), folder, _train_still))
+
+
+def _told_again(config: Config, folder: Path) -> str:
+    """Return the line for a run that is asked for once more."""
+    longer = "" if config.prune.is_wanted else f", go on with `dyngs train --resume {folder} train.steps=N`"
+    return (
+        f"{folder} holds just this run, finished, and training again would end with the same bytes: nothing is done; "
+        f"look at it with `dyngs eval {folder}`{longer}, or give another run.dir"
+    )
 
 
 def _train_still(config: Config, folder: Path) -> None:
@@ -121,9 +153,10 @@ class _Run:
         config: of the run.
         folder: of the run.
         resumed: what it goes on from; None: it begins.
+        asked: the configuration that was asked for, from which this one was chosen; None: this one.
     """
 
-    def __init__(self, config: Config, folder: Path, resumed: Checkpoint | None) -> None:
+    def __init__(self, config: Config, folder: Path, resumed: Checkpoint | None, asked: Config | None = None) -> None:
         watch = Stopwatch()
         built = build(config, restored=resumed is not None)
         self.folder, self.limits = folder, dict[str, Limit]()
@@ -139,6 +172,8 @@ class _Run:
             self._set_limits(self.limited, resumed)
         if resumed is None:
             begin(folder, self.config)
+            if asked is not None:
+                note_asked(folder, asked)
 
     @property
     def config(self) -> Config:
@@ -164,7 +199,11 @@ class _Run:
             if limited is not None:
                 comparison = StillComparison(self.folder, lambda: limited.trainer, loop)
                 loop.subscribe(PruneStage(loop, lambda: limited.trainer), comparison)
-            loop.run(lambda: interrupts.requested or _is_lost(comparison))
+            try:
+                loop.run(lambda: interrupts.requested or _is_lost(comparison))
+            finally:
+                if limited is not None:
+                    limited.trainer.pictures.rest()
             if _is_lost(comparison):
                 return False
             if loop.trainer.done < loop.total:
@@ -278,6 +317,31 @@ def _start_of_run(config: Config, folder: Path, *, resuming: bool) -> Checkpoint
     checkpoint = latest_checkpoint(folder)
     remove_old_checkpoints(folder)
     return checkpoint
+
+
+def _with_new_length(config: Config, folder: Path, resumed: Checkpoint | None) -> Config:
+    """Return ``config`` of a resumed run, changed in its folder, too, where it asks for another number of steps.
+
+    Raises:
+        DyngsError: that number is not possible.
+    """
+    stored, steps = load_resolved(folder), config.train.steps
+    was = stored.train.steps
+    if steps == was:
+        return config
+    if resumed is None:
+        raise DyngsError(
+            f"train.steps={steps}: {folder} has no checkpoint to go on from; remove it, or give another run.dir, and "
+            "begin with so many steps"
+        )
+    done = resumed.info.step
+    longer = with_length(stored, done, steps)
+    print(told(stored, longer, done), flush=True)
+    if stored.budget.max_mb is not None:  # otherwise a run that is stopped now would take it for its own
+        (folder / EXPORT_FOLDER / SCENE_FILE).unlink(missing_ok=True)
+    save_config(longer, folder / RESOLVED_NAME)
+    (folder / ASKED_NAME).unlink(missing_ok=True)  # what was asked for now is what is there
+    return with_length(config.model_copy(update={"train": config.train.model_copy(update={"steps": was})}), done, steps)
 
 
 def num_cores() -> int:

@@ -16,7 +16,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from dyngs.budget.run import LimitedRun
+from dyngs.budget.run import LimitedRun, stage
 from dyngs.config import Config
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.errors import DyngsError
@@ -127,6 +127,9 @@ class SpeedLimit:
         """Restore the state that ``state`` returned."""
         for name in self.state().keys() & stored.keys():
             setattr(self.found, name, stored[name].item())
+        config = self.run.config
+        if config.budget.max_minutes is None:  # a run that has become longer comes to its last stages again
+            self.found.passed = min(self.found.passed, stage(config, self.run.trainer.done))
 
     def hold(self) -> None:
         """Let the trainer add no more Gaussians than measured before."""

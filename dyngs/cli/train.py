@@ -21,12 +21,24 @@ examples:
   dyngs train configs/static.yaml data.root=scans/bench
   dyngs train configs/static.yaml data.root=scans/bench train.steps=30000 run.dir=runs/bench run.threads=8
   dyngs train --resume runs/bench
+  dyngs train --resume runs/bench train.steps=60000
   dyngs train configs/static.yaml data.root=scans/bench --view
 
 CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip, dynamic,
 human, human_predictor.
 All keys are listed in docs/cli.md.
 """
+
+_WITH_RESUME = (
+    "train.steps",
+    "run.threads",
+    "train.save_every",
+    "train.eval_every",
+    "train.log_every",
+    "train.tensorboard",
+    "data.cache_mb",
+)
+"""Keys that may be given with ``--resume``: the first changes the run, the others nothing that it ends with."""
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -39,7 +51,12 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("overrides", nargs="*", metavar="CONFIG key=value", help="preset or YAML file, and overrides")
-    parser.add_argument("--resume", type=Path, metavar="RUN", help="continue an interrupted run")
+    parser.add_argument(
+        "--resume",
+        type=Path,
+        metavar="RUN",
+        help="continue an interrupted run; with train.steps=N: go on to N steps, also from a finished one",
+    )
     parser.add_argument("--view", action="store_true", help="show the scene in a browser while it trains")
     add_serving_arguments(parser)
     parser.set_defaults(run=run)
@@ -116,7 +133,7 @@ def parse_config(words: Sequence[str], resume: Path | None) -> Config:
     """Return the configuration for the words after ``dyngs train``.
 
     Raises:
-        DyngsError: nothing to train, an override of a resumed run other than ``run.threads``, or a wrong key or value.
+        DyngsError: nothing to train, an override that a resumed run does not take, or a wrong key or value.
     """
     from dyngs.config.io import load_config, load_resolved
 
@@ -126,8 +143,11 @@ def parse_config(words: Sequence[str], resume: Path | None) -> Config:
         if not words:
             raise DyngsError("give a config, for instance `dyngs train configs/static.yaml data.root=FOLDER`")
         return load_config(preset, overrides)
-    other = [word for word in words if word.partition("=")[0].strip() != "run.threads"]
+    other = [word for word in words if word.partition("=")[0].strip() not in _WITH_RESUME]
     if other:
-        raise DyngsError(f"{other[0]!r}: a resumed run keeps its own config; only run.threads=N may be given")
+        raise DyngsError(
+            f"{other[0]!r}: a resumed run keeps its own config; train.steps=N goes on to N steps, and for this call "
+            f"alone may be given {', '.join(_WITH_RESUME[1:])}"
+        )
     config = load_resolved(resume, overrides)
     return config.model_copy(update={"run": config.run.model_copy(update={"dir": resume})})

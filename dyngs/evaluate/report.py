@@ -382,6 +382,11 @@ def _timed_render(
 def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
     """Return notes on how to read the numbers."""
     notes = []
+    if run.step < run.config.total_steps:
+        notes.append(
+            f"the run is not finished: it stands at step {run.step:,} of {run.config.total_steps:,}, and its schedules "
+            "where they were then"
+        )
     if run.config.data.background == "random":
         notes.append("trained on random backgrounds, evaluated on black")
     if field_of(run.config) is not None and run.scene.is_still:

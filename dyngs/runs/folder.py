@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from dyngs.config import Config, RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.files.temporary import remove_leftovers, remove_quietly, temporary_folder_beside
-from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths
+from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of
 from dyngs.runs.lock import LOCK_NAME, writing
 from dyngs.runs.log import LOG_NAME
 
@@ -22,7 +22,9 @@ FORMER_EXPORT_FOLDER = "small"
 """Name of ``EXPORT_FOLDER`` in runs of earlier versions; nothing is written there."""
 STILL_FOLDER = "still"
 """In the folder of a run of a moving scene: the run of the still model that it is compared with."""
-_BEGUN = (RESOLVED_NAME, LOG_NAME, TIMING_NAME, STILL_FOLDER)
+ASKED_NAME = "asked.yaml"
+"""In a run folder: the configuration as it was asked for, where training has chosen something else (config.yaml)."""
+_BEGUN = (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, STILL_FOLDER)
 """Files that a run stopped before its first checkpoint may have written."""
 _OLD_LEFTOVER = re.compile(r"\.step_\d+\.\d+\.safetensors|\.tmp[A-Za-z0-9]{6}")
 """Names of half-written checkpoints of earlier versions and of the library that wrote them."""
@@ -135,12 +137,87 @@ def require_startable(folder: Path, config: Config) -> None:
     """
     begun = _config_of_begun(folder)
     if begun is None:
+        if checkpoint_paths(folder):
+            raise DyngsError(_about_other(folder, config))
         require_no_run(folder)
-    elif not _is_same_run(begun, config):
+    elif not (_is_same_run(begun, config) or _is_as_asked(folder, config)):
         raise DyngsError(
             f"{folder} already holds another run, stopped before its first checkpoint; begin that again with `dyngs "
             f"train --resume {folder}`, give another run.dir, or remove the folder"
         )
+
+
+def is_done(folder: Path, config: Config) -> bool:
+    """Return whether ``folder`` holds the finished run of just this configuration, as it was asked for."""
+    paths = checkpoint_paths(folder)
+    if not paths or not _is_as_asked(folder, config):
+        return False
+    return step_of(paths[-1]) >= load_resolved(folder).total_steps
+
+
+def note_asked(folder: Path, asked: Config) -> None:
+    """Write the configuration that was asked for beside that of the run, if the two differ; otherwise there is none."""
+    path = folder / ASKED_NAME
+    if _is_same_run(load_resolved(folder), asked):
+        path.unlink(missing_ok=True)
+    else:
+        save_config(asked, path)
+
+
+def asked_for(folder: Path) -> Config:
+    """Return the configuration of a run as it was asked for.
+
+    Raises:
+        DyngsError: there is none, or it is broken.
+    """
+    path = folder / ASKED_NAME
+    return load_resolved(path if path.is_file() else folder)
+
+
+def _is_as_asked(folder: Path, config: Config) -> bool:
+    try:
+        return _is_same_run(asked_for(folder), config)
+    except DyngsError:  # a file of that name, but not of a run
+        return False
+
+
+def _about_other(folder: Path, config: Config) -> str:
+    """Return why the run of ``config`` cannot begin in ``folder``, which has checkpoints, and what to do."""
+    try:
+        stored, asked = load_resolved(folder), asked_for(folder)
+    except DyngsError:
+        return f"{folder} already holds a run, whose {RESOLVED_NAME} cannot be read; give another run.dir"
+    done = step_of(checkpoint_paths(folder)[-1])
+    if _is_same_run(asked, config):
+        return (
+            f"{folder} already holds a run, this very one, stopped after step {done:,} of {stored.total_steps:,}; go "
+            f"on with `dyngs train --resume {folder}`"
+        )
+    different = list(_differences(asked, config))
+    shown = ", ".join(f"{key} is {was} there and {now} here" for key, was, now in different[:2])
+    more = f" and {len(different) - 2} more" if len(different) > 2 else ""
+    longer = [key for key, _, _ in different] == ["train.steps"] and config.train.steps > done
+    go_on = f", or go on to so many with `dyngs train --resume {folder} train.steps={config.train.steps}`"
+    return (
+        f"{folder} already holds a run, another one ({shown}{more}); give another run.dir to keep both"
+        f"{go_on if longer else ''}"
+    )
+
+
+def _differences(one: Config, other: Config) -> Iterator[tuple[str, object, object]]:
+    """Yield dotted key and both values, as they are printed, of what makes two runs different."""
+    first, second = (_flat(c.model_dump(mode="json", exclude={"run"}) | {"run.seed": c.run.seed}) for c in (one, other))
+    for key in dict.fromkeys((*first, *second)):
+        if first.get(key) != second.get(key):
+            yield key, first.get(key, "not"), second.get(key, "not")
+
+
+def _flat(values: Mapping[str, object], above: str = "") -> dict[str, object]:
+    """Return nested values by their dotted keys."""
+    found: dict[str, object] = {}
+    for key, value in values.items():
+        found |= _flat(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": value}
+    return found
 
 
 def was_only_begun(folder: Path) -> bool:

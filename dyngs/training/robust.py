@@ -103,6 +103,8 @@ class RobustMasks:
         left_out = require_indices("left_out", state["left_out"], (count, CELLS, CELLS), 2, torch.uint8)
         histogram = require_tensor("histogram", state["histogram"], self._histogram.shape, torch.float64)
         self._visits, self._left_out, self._histogram = visits.clone(), left_out.clone(), histogram.clone()
+        if bool(visits.any()):
+            self._begins = 0.0  # also where the run has become longer
 
     @torch.no_grad()
     def _look(

@@ -181,14 +181,45 @@ def test_time_adds_up_over_resumes(capture: Path, tmp_path: Path, monkeypatch: p
     assert 1000 + before < load_run(run_dir).seconds_train < 1060 + before
 
 
-def test_a_run_is_never_overwritten(capture: Path, tmp_path: Path) -> None:
-    config = _config(capture, tmp_path / "run", steps=2)
-    train(config)
-    before = _final_bytes(tmp_path / "run")
-    with pytest.raises(DyngsError, match=r"already holds a run.*--resume"):
+def test_a_run_is_never_overwritten(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = _config(capture, tmp_path / "run", steps=4)
+    with monkeypatch.context() as patch:
+        _interrupt_after(2, patch)
+        with pytest.raises(KeyboardInterrupt):
+            train(config)
+    with pytest.raises(DyngsError, match=r"already holds a run, this very one, stopped after step 2 of 4.*--resume"):
         train(config)
+    train(config, resume_from=tmp_path / "run")
+    before = _final_bytes(tmp_path / "run")
+    capsys.readouterr()
+    assert train(config) == tmp_path / "run"
+    line = capsys.readouterr().out
+    assert re.search(r"holds just this run, finished.*dyngs eval.*--resume.*run.dir", line)
+    assert line.count("\n") == 1
+    with pytest.raises(
+        DyngsError, match=r"another one \(train.steps is 4 there and 9 here\).*--resume .*train.steps=9"
+    ):
+        train(_config(capture, tmp_path / "run", steps=9))
+    with pytest.raises(DyngsError, match=r"another one \(run.seed is 42 there and 7 here\); give another run.dir"):
+        train(config.model_copy(update={"run": config.run.model_copy(update={"seed": 7})}))
     assert train(config, resume_from=tmp_path / "run") == tmp_path / "run"  # finished: nothing to do
     assert _final_bytes(tmp_path / "run") == before
+
+
+def test_a_run_is_known_by_what_was_asked_for(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where training has chosen something itself."""
+    config = _config(capture, tmp_path / "run", train=TrainConfig(steps=3, robust="auto"))
+    before = _final_bytes(train(config))
+    assert load_resolved(tmp_path / "run").train.robust == "never"
+    assert load_resolved(tmp_path / "run" / "asked.yaml") == config
+    train(config)
+    assert "holds just this run" in capsys.readouterr().out
+    assert _final_bytes(tmp_path / "run") == before
+    assert not (train(_config(capture, tmp_path / "plain", steps=3)) / "asked.yaml").exists()
 
 
 def test_bad_input_leaves_no_folder(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from moving_scene import TEST_TIMES, Sliding, moving_scene, row_of_balls, still_
 
 from dyngs.camera import Cameras
 from dyngs.cli import main
-from dyngs.config import Config, DataConfig, StaticModel
+from dyngs.config import Config, DataConfig, StaticModel, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import RasterizeMode
 from dyngs.data.capture import Capture
@@ -69,7 +69,8 @@ def write_run(folder: Path, gaussians: Gaussians, background: str = "auto") -> P
     """A run folder with a 16x16 capture of 2 train and 3 test pictures beside it."""
     root = write_still_capture(folder / "capture", StillOptions(size=16, num_train=2, num_test=3, samples=1))
     run_dir = folder / "run"
-    config = Config(data=DataConfig.model_validate({"root": root, "background": background}))
+    data = DataConfig.model_validate({"root": root, "background": background})
+    config = Config(data=data, train=TrainConfig(steps=7))
     save_config(config, run_dir / RESOLVED_NAME)
     tensors = {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
     save_checkpoint(run_dir, Checkpoint(CheckpointInfo(7, 1.0, (0.0, 0.0, 0.0), "white", "classic"), tensors), 12.5)
@@ -153,6 +154,15 @@ def test_report_of_a_run(tmp_path) -> None:
     assert len({view["name"] for view in stored["per_view"]}) == 3
     again = evaluate_run(run_dir)
     assert (again.psnr, again.ssim, again.flip) == (report.psnr, report.ssim, report.flip)
+
+
+def test_an_unfinished_run_says_so(tmp_path) -> None:
+    run_dir = write_run(tmp_path, some_gaussians())
+    config = load_resolved(run_dir)
+    save_config(config.model_copy(update={"train": TrainConfig(steps=7000)}), run_dir / RESOLVED_NAME)
+    (note,) = evaluate_run(run_dir).notes
+    assert "stands at step 7 of 7,000" in note
+    assert json.loads((run_dir / "metrics.json").read_text())["notes"] == [note]
 
 
 def test_other_splits_and_backgrounds(tmp_path) -> None:

@@ -1,0 +1,159 @@
+"""A run that goes on to another number of steps: its configuration from there on, and what that means in words.
+
+All schedules become those of the new length, but what has begun keeps the step at which it did: nothing is begun twice,
+pictures do not become small again, and what was decided stays decided.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dyngs.config import AutoColour, Config, DynamicModel, HumanModel, TrainConfig
+from dyngs.config.kinds import harmonics_measured_after, network_of
+from dyngs.deform.training import DeformSchedule
+from dyngs.errors import DyngsError
+from dyngs.static.rates import Rates
+from dyngs.training.schedule import (
+    PUBLISHED_STEPS,
+    deform_schedule,
+    hold_out_until,
+    means_rate,
+    motion_begins_after,
+    rates_of,
+    scaled,
+)
+
+MOST_SHARE = 1 - 1e-9
+"""Largest share of a run, for keys that must be below 1."""
+
+
+@dataclass(frozen=True)
+class Length:
+    """A change of the length of a run.
+
+    Attributes:
+        done: steps done.
+        was: steps that the run had.
+        steps: that it shall have.
+    """
+
+    done: int
+    was: int
+    steps: int
+
+    def kept(self, step: int | float) -> float:
+        """Return the share of the new length at which ``step`` of the old one lies, at most 1."""
+        return min(step / self.steps, 1.0)
+
+    def share(self, share: float) -> float:
+        """Return the share of the new length for what began, or shall begin, after ``share`` of a run.
+
+        What has begun keeps its step; what should have begun by now, in a shorter run, begins with the next step.
+        """
+        if self.done >= round(share * self.was):
+            return self.kept(share * self.was)
+        return max(share, self.kept(self.done + 1)) if self.done >= round(share * self.steps) else share
+
+
+def with_length(config: Config, done: int, steps: int) -> Config:
+    """Return the configuration with which a run goes on, after ``done`` steps, to ``steps``; no limit of time holds.
+
+    Args:
+        config: of the run so far.
+
+    Raises:
+        DyngsError: so many steps are done already, the run was pruned, or its motion began too early for that length.
+    """
+    length = Length(done, config.train.steps, steps)
+    if done > length.was:
+        raise DyngsError(
+            f"train.steps={steps}: the run was pruned after step {length.was:,}, so its training cannot be made "
+            "longer; go on with the run before that, and prune again"
+        )
+    if steps <= done:
+        raise DyngsError(f"train.steps={steps}: {done:,} steps are done already; give more than that")
+    changed = {
+        "train": _train(config.train, length),
+        "budget": config.budget.model_copy(update={"max_minutes": None}),
+    }
+    match config.model:
+        case DynamicModel():
+            changed["model"] = _dynamic(config, config.model, length)
+        case HumanModel():
+            share = length.share(config.model.refine_from)
+            changed["model"] = config.model.model_copy(update={"refine_from": share})
+        case _:
+            pass
+    match config.colour:
+        case AutoColour():
+            share = min(_share_of_measure(config, length), MOST_SHARE)
+            changed["colour"] = config.colour.model_copy(update={"measure_at": share})
+        case _:
+            pass
+    return config.model_copy(update=changed)
+
+
+def told(before: Config, after: Config, done: int) -> str:
+    """Return the line that says how a run goes on after ``done`` steps."""
+    was, steps = before.train.steps, after.train.steps
+    line = f"goes on from step {done:,} to {steps:,} instead of {was:,}, on the schedules of {steps:,} steps"
+    if network_of(after) is not None:
+        return line
+    then, now = (means_rate(c.optim, rates_of(c).progress(done), 1.0) for c in (before, after))
+    stop = scaled(after.strategy.stop, steps)
+    grows = after.strategy.growth_limit > 0 and stop > done + 1
+    line += f": the learning rate of positions is {now / then:.3g} times what it was, "
+    line += f"Gaussians are added up to step {stop:,}" if grows else "no more Gaussians are added"
+    return line + ("" if before.budget.max_minutes is None else "; budget.max_minutes holds no longer")
+
+
+def _train(options: TrainConfig, length: Length) -> TrainConfig:
+    """Return the section ``train``: pictures, harmonics and views held out go on where they are."""
+    changed: dict[str, object] = {"steps": length.steps}
+    full_at = max(options.resolution_grows_from, options.resolution_full_at)
+    if options.initial_downscale > 1 and length.done >= options.resolution_grows_from * length.was:
+        changed["resolution_grows_from"] = length.kept(options.resolution_grows_from * length.was)
+        changed["resolution_full_at"] = length.kept(full_at * length.was)
+    if length.steps > length.was:
+        pace = scaled(options.sh_every, length.was)
+        changed["sh_every"] = max(1, pace * PUBLISHED_STEPS // length.steps)
+    if length.done >= hold_out_until(options):
+        changed["hold_out_every"] = 0
+    return options.model_copy(update=changed)
+
+
+def _dynamic(config: Config, model: DynamicModel, length: Length) -> DynamicModel:
+    """Return the section ``model`` of a moving scene.
+
+    Raises:
+        DyngsError: motion began before a run of the new length lets anything move.
+    """
+    old = deform_schedule(model, Rates(length.was))
+    shares = {"motion_from": _motion_from(old, model, length)}
+    if length.done >= old.opens:
+        shares |= {"time_window_grows_from": length.kept(old.opens), "time_window_full_at": length.kept(old.full)}
+    changed = model.model_copy(update=shares)
+    begins = motion_begins_after(config.model_copy(update={"model": changed}), length.steps)
+    if begins is not None and old.fine <= length.done < begins:
+        raise DyngsError(
+            f"train.steps={length.steps}: motion began after {old.fine:,} steps, and a run of {length.steps:,} trains "
+            f"{begins:,} before anything moves; train anew with so many steps"
+        )
+    return changed
+
+
+def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> float:
+    """Return the share after which motion is learned: the step where it began, else one that is still to come."""
+    if length.done >= old.fine:
+        return length.kept(old.fine)
+    new = deform_schedule(model, Rates(length.steps))
+    return length.kept(length.done + 1) if new.fine <= length.done else model.motion_from
+
+
+def _share_of_measure(config: Config, length: Length) -> float:
+    """Return the share after which harmonics are measured, likewise."""
+    longer = config.model_copy(update={"train": config.train.model_copy(update={"steps": length.steps})})
+    old, new = harmonics_measured_after(config) or 0, harmonics_measured_after(longer) or 0
+    if length.done >= old:
+        return length.kept(old)
+    return length.kept(length.done + 1) if new <= length.done else new / length.steps
