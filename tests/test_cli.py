@@ -38,6 +38,9 @@ VERBS = (
     "doctor",
     "predict",
     "tradeoff",
+    "config",
+    "docs",
+    "completion",
 )
 ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"} | {
     "PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])

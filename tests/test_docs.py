@@ -309,7 +309,7 @@ def shortened(command: Command) -> list[str]:
     """The command with less to do."""
     words, extra = list(command.words), SHORTER.get(command.verb, ())
     if "--resume" in words:
-        extra = ("run.threads=1",)
+        words, extra = [re.sub(r"^train\.steps=\d+", "train.steps=6", word) for word in words], ("run.threads=1",)
     elif words[2:3] in (["room"], ["human"]):
         extra = (*extra, "--cameras", "3")
     if "--times" in words:

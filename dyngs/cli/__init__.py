@@ -23,9 +23,12 @@ from typing import NoReturn, TextIO
 from dyngs import __version__
 from dyngs.cli import (
     bench,
+    completion,
+    config,
     convert,
     data,
     demo,
+    docs,
     doctor,
     evaluate,
     export,
@@ -131,7 +134,8 @@ def _add_commands(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for module in (demo, train, prune, predict, evaluate, render, view, export, convert, tradeoff, data, bench, doctor):
+    running = (demo, train, prune, predict, evaluate, render, view, export, convert, tradeoff, data, bench)
+    for module in (*running, config, docs, completion, doctor):
         module.add_parser(commands)
     return parser
 

@@ -29,7 +29,7 @@ human, human_predictor.
 All keys are listed in docs/cli.md.
 """
 
-_WITH_RESUME = (
+WITH_RESUME = (
     "train.steps",
     "run.threads",
     "train.save_every",
@@ -143,11 +143,11 @@ def parse_config(words: Sequence[str], resume: Path | None) -> Config:
         if not words:
             raise DyngsError("give a config, for instance `dyngs train configs/static.yaml data.root=FOLDER`")
         return load_config(preset, overrides)
-    other = [word for word in words if word.partition("=")[0].strip() not in _WITH_RESUME]
+    other = [word for word in words if word.partition("=")[0].strip() not in WITH_RESUME]
     if other:
         raise DyngsError(
             f"{other[0]!r}: a resumed run keeps its own config; train.steps=N goes on to N steps, and for this call "
-            f"alone may be given {', '.join(_WITH_RESUME[1:])}"
+            f"alone may be given {', '.join(WITH_RESUME[1:])}"
         )
     config = load_resolved(resume, overrides)
     return config.model_copy(update={"run": config.run.model_copy(update={"dir": resume})})

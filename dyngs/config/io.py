@@ -111,7 +111,7 @@ def find_preset(path: Path) -> Path:
     """
     if path.is_file():
         return path
-    packaged = _packaged_presets()
+    packaged = packaged_presets()
     if path.parent.name in ("", "configs") and path.suffix in ("", ".yaml", ".yml") and path.stem in packaged:
         return packaged[path.stem]
     if path.exists() and not path.is_dir():
@@ -129,13 +129,13 @@ def packaged_preset(name: str) -> Path:
     Raises:
         DyngsError: there is none of that name.
     """
-    packaged = _packaged_presets()
+    packaged = packaged_presets()
     if name not in packaged:
         raise DyngsError(f"no packaged preset {name!r}; there are {', '.join(sorted(packaged))}")
     return packaged[name]
 
 
-def _packaged_presets() -> dict[str, Path]:
+def packaged_presets() -> dict[str, Path]:
     package = Path(__file__).resolve().parents[1]
     folder = next((f for f in (package / "configs", package.parent / "configs") if f.is_dir()), None)
     return {f.stem: f for f in sorted(folder.glob("*.yaml"))} if folder else {}

@@ -51,7 +51,7 @@ def _keys_below(section: type[BaseModel], prefix: str) -> Iterator[ConfigKey]:
     for key, info in section.model_fields.items():
         name, variants = prefix + key, section_classes(info)
         if not variants:
-            yield ConfigKey(name, (), allowed_values(info), _default_text(info), info.description or "")
+            yield ConfigKey(name, (), allowed_values(info), default_text(info), info.description or "")
         elif len(variants) == 1:
             yield from _keys_below(variants[0], f"{name}.")
         else:
@@ -119,7 +119,7 @@ def choices_of(annotation: Any) -> list[str]:
     return []
 
 
-def _default_text(info: FieldInfo) -> str:
+def default_text(info: FieldInfo) -> str:
     if info.default is PydanticUndefined:
         return ""
     value = info.default.value if isinstance(info.default, Enum) else info.default

@@ -1,0 +1,88 @@
+"""``dyngs docs``: the documentation that comes with dyngs."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from difflib import get_close_matches
+from pathlib import Path
+
+from dyngs.errors import DyngsError
+
+_LINK = re.compile(r"\]\(([^)#\s:]+)(#[^)\s]*)?\)")
+_FRONT = "README"
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``docs`` to the commands."""
+    parser = commands.add_parser(
+        "docs",
+        help="the documentation",
+        description="Show a page of the documentation (without a terminal: as Markdown), or the list of all pages.",
+    )
+    parser.add_argument("topic", nargs="?", metavar="TOPIC", help="name of a page, for instance cli or photos")
+    parser.add_argument("--path", action="store_true", help="print only where the page, or the folder, lies")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Show a page, or print where it is."""
+    folder = docs_folder()
+    if arguments.path:
+        print(folder if arguments.topic is None else page(folder, arguments.topic))
+        return 0
+    path = page(folder, _FRONT if arguments.topic is None else arguments.topic)
+    text = path.read_text(encoding="utf-8")
+    if sys.stdout.isatty():
+        from rich.console import Console
+        from rich.markdown import Markdown
+
+        console = Console()
+        with console.pager(styles=True, links=True):
+            console.print(Markdown(_with_whole_links(text, path.parent)))
+    else:
+        print(text, end="")
+    others = sorted({Path(match[1]).stem for match in _LINK.finditer(text) if match[1].endswith(".md")} - {path.stem})
+    known = [name for name in others if (folder / f"{name}.md").is_file()]
+    if known:
+        print(f"pages that this one names: dyngs docs {' | '.join(known)}", file=sys.stderr)
+    return 0
+
+
+def docs_folder() -> Path:
+    """Return the folder of the pages: in an installation that of the package, in a checkout that of the repository.
+
+    Raises:
+        DyngsError: it is not there.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "docs", package.parent / "docs"):
+        if (folder / f"{_FRONT}.md").is_file():
+            return folder
+    raise DyngsError("the documentation is not installed; install dyngs again")
+
+
+def page(folder: Path, topic: str) -> Path:
+    """Return the page of a topic.
+
+    Raises:
+        DyngsError: there is none; names those that are similar.
+    """
+    pages = {path.stem: path for path in sorted(folder.glob("*.md"))}
+    name = topic.removesuffix(".md")
+    if name in pages:
+        return pages[name]
+    close = get_close_matches(name.lower(), pages, n=1)
+    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    raise DyngsError(f"no page {topic!r}{hint}; there are {', '.join(key for key in pages if key != _FRONT)}")
+
+
+def _with_whole_links(text: str, folder: Path) -> str:
+    """Return Markdown whose links to files are those of the files, so that a terminal can open them."""
+
+    def whole(match: re.Match[str]) -> str:
+        target = folder / match[1]
+        return f"]({target.resolve().as_uri()}{match[2] or ''})" if target.exists() else match[0]
+
+    return _LINK.sub(whole, text)

@@ -1,0 +1,72 @@
+"""A configuration as YAML in which every key stands with its value, its default and what it means."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from dyngs.config import Config
+from dyngs.config.io import find_preset, load_config, load_resolved
+from dyngs.config.schema import allowed_values, default_text, kinds_of, section_classes
+from dyngs.config.yaml_reader import read_file, read_override
+
+WIDTH = 118
+_NO_ROOT = "FOLDER"
+_END = "...\n"
+"""What YAML writes after a single value."""
+
+
+def listing(source: Path, overrides: list[str]) -> str:
+    """Return the resolved configuration of a preset, a YAML file or a run, as YAML with comments.
+
+    It is a preset itself. Where it says no ``data.root``, that key stands in a comment.
+
+    Raises:
+        DyngsError: no such preset or run, or a wrong key or value.
+    """
+    if source.is_dir():
+        return _text(load_resolved(source, overrides), True, str(source))
+    leaves = [*read_file(find_preset(source)), *(leaf for text in overrides for leaf in read_override(text))]
+    has_root = any(leaf.keys == ("data", "root") for leaf in leaves)
+    config = load_config(source, overrides if has_root else [f"data.root={_NO_ROOT}", *overrides])
+    return _text(config, has_root, str(source))
+
+
+def _text(config: Config, has_root: bool, source: str) -> str:
+    head = f"# {source!r} with every key; train with it: dyngs train THIS_FILE.yaml data.root=FOLDER"
+    lines = [head.encode("unicode_escape").decode("ascii")]
+    for line in _section(config, config.model_dump(mode="json"), 0):
+        lines.append(line)
+    text = "\n".join(lines) + "\n"
+    return text if has_root else re.sub(r"\n  root: .*", f"\n  # root: {_NO_ROOT}", text, count=1)
+
+
+def _section(section: BaseModel, values: dict[str, Any], depth: int) -> Iterator[str]:
+    """Yield the lines of a section with its ``values``."""
+    space = "  " * depth
+    for name, info in type(section).model_fields.items():
+        value, inner = values[name], getattr(section, name)
+        if section_classes(info):
+            yield "" if depth == 0 else f"{space}#"
+            if kinds_of(info):
+                about = f"{info.description}; kind is one of {', '.join(kinds_of(info))}"
+                yield from (f"{space}# {line}" for line in textwrap.wrap(about, WIDTH - 2 - len(space)))
+            yield f"{space}{name}:"
+            yield from _section(inner, value, depth + 1)
+            continue
+        about = f"{info.description}" if name == "kind" else f"{info.description} ({allowed_values(info)})"
+        yield from (f"{space}# {line}" for line in textwrap.wrap(about, WIDTH - 2 - len(space)))
+        dumped = yaml.safe_dump(value, default_flow_style=True, width=10**6, allow_unicode=False)
+        yield f"{space}{name}: {dumped.removesuffix(_END).strip()}  # {_default(info)}"
+
+
+def _default(info: FieldInfo) -> str:
+    text = default_text(info)
+    return f"default {text}" if text else "required"
