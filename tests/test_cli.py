@@ -313,15 +313,16 @@ def test_words_after_train() -> None:
     assert parse_config(["data.root=x"], None) == load_config(None, ["data.root=x"])
 
 
-def test_a_resumed_run_keeps_its_config_but_for_threads(tmp_path: Path) -> None:
+def test_a_resumed_run_keeps_its_config_but_for_its_length_and_threads(tmp_path: Path) -> None:
     stored = load_config(None, ["data.root=x", "train.steps=5", "strategy.kind=mcmc"])
     save_config(stored, tmp_path / "config.yaml")
     resumed = parse_config(["run.threads=3"], tmp_path)
     assert resumed.run.threads == 3
     assert resumed.run.dir == tmp_path
     assert resumed.model_copy(update={"run": stored.run}) == stored
-    with pytest.raises(DyngsError, match=r"only run\.threads=N"):
-        parse_config(["train.steps=9"], tmp_path)
+    assert parse_config(["train.steps=9", "data.cache_mb=5"], tmp_path).train.steps == 9
+    with pytest.raises(DyngsError, match=r"'optim.lr_means=1': .* keeps its own config; train.steps=N .*run.threads"):
+        parse_config(["train.steps=9", "optim.lr_means=1"], tmp_path)
 
 
 # ---------------------------------------------------------------------------------------------------- every verb

@@ -75,7 +75,7 @@ def _told(what: str, scores: Sequence[float]) -> Sequence[float]:
 def pilot_steps(config: Config) -> int:
     """Return the steps of each pilot run; 0: none, as none were asked for, or the run is too short for them."""
     match config.model:
-        case DynamicModel() if config.budget.max_minutes is None:
+        case DynamicModel() if config.train.minutes is None:
             steps = min(config.model.pilot_steps, int(SHARE * config.train.steps))
             return steps if steps >= min(FEWEST_STEPS, config.model.pilot_steps) else 0
         case _:

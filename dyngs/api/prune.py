@@ -147,7 +147,7 @@ def prune_within(
 def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequence[str]) -> Config:
     """Return the configuration of a run that goes on from ``start`` in the folder ``out``."""
     defaults = [f"prune.{key}={value}" for key, value in PruneConfig().model_dump().items()]
-    done = [f"train.steps={start.info.step}", "budget.max_minutes=null", f"run.dir={out}"]
+    done = [f"train.steps={start.info.step}", "train.minutes=null", f"run.dir={out}"]
     config = load_resolved(run_dir, [*done, *defaults, *overrides])
     if network_of(config) is not None:
         raise DyngsError(f"{run_dir}: a network, not a scene; prune what it predicts")

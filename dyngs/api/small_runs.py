@@ -34,12 +34,12 @@ FEW_VIEWS, OFTEN, HELD_OUT = 24, 4, 10
 def small_run(config: Config, every: int, steps: int) -> Config:
     """Return ``config`` for ``steps`` in small pictures, without limits, one view of ``every`` never trained on."""
     side = min(config.data.longest_side or SMALL_SIDE, SMALL_SIDE)
-    held_out = {"hold_out_every": every, "hold_out_until": 1.0, "steps": steps, "save_every": 0, "eval_every": 0}
+    held_out = {"hold_out_every": every, "hold_out_until": 1.0, "steps": steps, "minutes": None}
     return config.model_copy(
         update={
             "data": config.data.model_copy(update={"longest_side": side}),
             "strategy": _limited(config.strategy),
-            "train": config.train.model_copy(update=held_out),
+            "train": config.train.model_copy(update=held_out | {"save_every": 0, "eval_every": 0}),
             "budget": BudgetConfig(),
             "prune": PruneConfig(),
         }

@@ -37,7 +37,7 @@ def decided(config: Config) -> Config:
     for candidate in asked:
         best = candidate.decided(best, "never")
     views, steps = read_capture(config.data).splits["train"], min(STEPS, int(SHARE * config.train.steps))
-    if config.budget.max_minutes is not None or steps < FEWEST_STEPS or len(views) < FEWEST_VIEWS:
+    if config.train.minutes is not None or steps < FEWEST_STEPS or len(views) < FEWEST_VIEWS:
         keys = ", ".join(f"{candidate.key}=auto" for candidate in asked)
         print(f"{keys}: too short a run, or too few views, to find out whether it pays; not used", flush=True)
         return best

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from dyngs.api import still_choices, still_first
 from dyngs.api.still_first import StillComparison
+from dyngs.budget.cost import CostMeter
 from dyngs.budget.count import count_limit
 from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
@@ -58,6 +60,8 @@ from dyngs.training.interrupt import Interrupts
 from dyngs.training.limits import require_possible
 from dyngs.training.longer import told, with_length
 from dyngs.training.loop import Loop, Stopwatch
+from dyngs.training.memory import memory_forecast
+from dyngs.training.trainer import Trainer
 
 _COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"
 """Names of the limits' states in a checkpoint."""
@@ -168,6 +172,9 @@ class _Run:
             None if built.scene_trainer is None else LimitedRun(folder, config, self.loop, built.scene_trainer)
         )
         self._config, self._saved = config, self.loop.trainer.done
+        if self.limited is not None and asked is not None:
+            _tell_memory(self.limited.trainer)
+        self._meter: CostMeter | None = None
         if self.limited is not None:
             self._set_limits(self.limited, resumed)
         if resumed is None:
@@ -192,10 +199,11 @@ class _Run:
             Progress(loop.total, done, options.log_every, config=lambda: self.config) as progress,
             Interrupts() as interrupts,
         ):
+            measures = [] if self._meter is None else [self._meter]
             limited, comparison = self.limited, None
             if limited is not None:
                 loop.subscribe(FloaterRemoval(loop, lambda: limited.trainer))
-            loop.subscribe(*self.limits.values(), log, progress, *listeners, self._save_and_evaluate)
+            loop.subscribe(*measures, *self.limits.values(), log, progress, *listeners, self._save_and_evaluate)
             if limited is not None:
                 comparison = StillComparison(self.folder, lambda: limited.trainer, loop)
                 loop.subscribe(PruneStage(loop, lambda: limited.trainer), comparison)
@@ -224,8 +232,9 @@ class _Run:
             if resumed is not None:
                 speed.restore(resumed.part(_SPEED))
             speed.begin()
-        if budget.max_minutes is not None:
-            run.given = 60 * budget.max_minutes
+        minutes = run.config.train.minutes
+        if minutes is not None:
+            run.given = 60 * minutes
             wanted, begun = run.config.train.steps, run.used
             if resumed is None:
                 run.config = first_fit(run.config, run.trainer, run.used + run.reserve)
@@ -240,6 +249,7 @@ class _Run:
                 save=self._save,
                 on_refit=(lambda: None) if speed is None else speed.hold,
             )
+            self._meter = CostMeter(run, wanted) if resumed is None else None
         count = count_limit(run)
         if count is not None:
             self.limits[_COUNT] = count
@@ -282,10 +292,23 @@ class _Run:
         for part in (_COUNT, _TIME):
             if part in self.limits:
                 yield self.limits[part].reached()
+        cost = None if self._meter is None or self._meter.steps <= self.loop.trainer.done else self._meter.found()
+        if cost is not None:
+            longer = f"`dyngs train --resume {self.folder} train.steps={cost.steps}`"
+            yield f"{cost}; this run goes on to that with {longer}, or train anew without train.minutes"
         if self.limited is not None and self.config.budget.max_mb is not None:
             yield str(write_within(self.limited.trainer, self.folder, self.config.budget.max_mb))
         if _SPEED in self.limits:
             yield self.limits[_SPEED].reached()
+
+
+def _tell_memory(trainer: Trainer) -> None:
+    """Print how much memory a run will take, and a warning where that is more than is there."""
+    forecast = memory_forecast(trainer)
+    print(forecast, flush=True)
+    warning = forecast.warning()
+    if warning is not None:
+        print(f"dyngs: warning: {warning}", file=sys.stderr, flush=True)
 
 
 def _is_lost(comparison: StillComparison | None) -> bool:

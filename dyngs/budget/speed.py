@@ -128,7 +128,7 @@ class SpeedLimit:
         for name in self.state().keys() & stored.keys():
             setattr(self.found, name, stored[name].item())
         config = self.run.config
-        if config.budget.max_minutes is None:  # a run that has become longer comes to its last stages again
+        if config.train.minutes is None:  # a run that has become longer comes to its last stages again
             self.found.passed = min(self.found.passed, stage(config, self.run.trainer.done))
 
     def hold(self) -> None:

@@ -1,4 +1,4 @@
-"""``budget.max_minutes``: how many steps fit into a time, measured before training and again while it goes on.
+"""``train.minutes``: how many steps fit into a time, measured before training and again while it goes on.
 
 Seconds per step are measured; how they go on is assumed: pixels take ``PIXEL_SHARE`` of a step, which later gets slower
 while Gaussians are added (``GROWTH``) and when motion begins (``MOTION``). Later fits correct what is wrong in this.
@@ -113,13 +113,13 @@ class Deadline:
         """Do nothing."""
 
     def reached(self) -> str:
-        """Return the line about ``budget.max_minutes`` after a run."""
+        """Return the line about ``train.minutes`` after a run."""
         done = self.run.trainer.done
         asked = f"asked {self.run.given / 60:g}, got {self.run.used / 60:.2f}"
         if not self.fits:
-            return f"budget.max_minutes: {asked}: {done:,} steps"
+            return f"train.minutes: {asked}: {done:,} steps"
         cost = "; what more would bring is not known" if done < self.most_steps else ": all, it cost nothing"
-        return f"budget.max_minutes: {asked}: {done:,} of {self.most_steps:,} steps{cost}"
+        return f"train.minutes: {asked}: {done:,} of {self.most_steps:,} steps{cost}"
 
     def _go_on(self, steps: int, done: int) -> None:
         run = self.run
@@ -155,7 +155,7 @@ def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
     Raises:
         DyngsError: too few fit; says how many minutes would do.
     """
-    minutes, wanted = config.budget.max_minutes or math.inf, config.train.steps
+    minutes, wanted = config.train.minutes or math.inf, config.train.steps
     begin = time.perf_counter()
     pilot = refitted(trainer, config)
     prepared = time.perf_counter()
@@ -173,7 +173,7 @@ def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
     if found < fewest:
         needed = (used + seconds_left(config, 0, fewest, pace)) / AIM / 60
         raise DyngsError(
-            f"budget.max_minutes={minutes:g}: about {found} steps would fit, and fewer than {fewest} are of no use; "
+            f"train.minutes={minutes:g}: about {found} steps would fit, and fewer than {fewest} are of no use; "
             f"{_rounded_up(needed):g} would do, or smaller pictures (data.longest_side)"
         )
     return with_steps(config, found)

@@ -25,6 +25,7 @@ KEYS = {
     "model.views": "model.source_views",
     "model.inputs": "model.source_sets",
     "model.targets": "model.target_views",
+    "budget.max_minutes": "train.minutes",
     "train.coarsest": "train.initial_downscale",
     "train.sharpen_from": "train.resolution_grows_from",
     "train.sharpen_to": "train.resolution_full_at",

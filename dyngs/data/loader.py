@@ -256,6 +256,28 @@ class PictureLoader:
         return 0 if len(self._cache) == len(self._views) else self._ahead.most
 
     @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """Width and height of the pictures, in px, without decoding any."""
+        options = self._options
+        return [target_size(v.width, v.height, options.downscale, options.longest_side) for v in self._views]
+
+    @property
+    def keeps_all(self) -> bool:
+        """Whether the cache has room for all pictures, as far as their sizes tell."""
+        return self._bytes_of_all() <= self._options.cache_mb * 1e6
+
+    @property
+    def bytes_to_come(self) -> int:
+        """Bytes that pictures will take, in the cache or decoded ahead, beside those that they take now."""
+        whole = min(self._bytes_of_all(), round(self._options.cache_mb * 1e6))
+        return max(whole - self.cached_bytes, 0)
+
+    def _bytes_of_all(self) -> int:
+        """Return the bytes of all pictures once decoded; whether a file has alpha is not known, and taken as no."""
+        masks = [view.mask_path is not None for view in self._views]
+        return sum(w * h * (3 + mask) for (w, h), mask in zip(self.sizes, masks, strict=True))
+
+    @property
     def cached_bytes(self) -> int:
         """Bytes of memory that cached pictures take."""
         return self._cached_bytes + self._small_bytes

@@ -31,9 +31,11 @@ def require_possible(config: Config) -> None:
     given = [name for name, value in budget.model_dump().items() if value is not None]
     if given and network_of(config) is not None:
         raise DyngsError(f"budget.{given[0]}: a network has no budget; leave it out")
-    if budget.max_minutes is not None and config.prune.is_wanted:
+    if config.train.minutes is not None and network_of(config) is not None:
+        raise DyngsError("train.minutes: a network is trained for train.steps; leave it out")
+    if config.train.minutes is not None and config.prune.is_wanted:
         raise DyngsError(
-            "budget.max_minutes: how long the stage of prune.* takes cannot be foreseen; leave that out and run "
+            "train.minutes: how long the stage of prune.* takes cannot be foreseen; leave that out and run "
             "`dyngs prune` afterwards"
         )
 

@@ -72,10 +72,7 @@ def with_length(config: Config, done: int, steps: int) -> Config:
         )
     if steps <= done:
         raise DyngsError(f"train.steps={steps}: {done:,} steps are done already; give more than that")
-    changed = {
-        "train": _train(config.train, length),
-        "budget": config.budget.model_copy(update={"max_minutes": None}),
-    }
+    changed: dict[str, object] = {"train": _train(config.train, length)}
     match config.model:
         case DynamicModel():
             changed["model"] = _dynamic(config, config.model, length)
@@ -104,12 +101,12 @@ def told(before: Config, after: Config, done: int) -> str:
     grows = after.strategy.growth_limit > 0 and stop > done + 1
     line += f": the learning rate of positions is {now / then:.3g} times what it was, "
     line += f"Gaussians are added up to step {stop:,}" if grows else "no more Gaussians are added"
-    return line + ("" if before.budget.max_minutes is None else "; budget.max_minutes holds no longer")
+    return line + ("" if before.train.minutes is None else "; train.minutes holds no longer")
 
 
 def _train(options: TrainConfig, length: Length) -> TrainConfig:
     """Return the section ``train``: pictures, harmonics and views held out go on where they are."""
-    changed: dict[str, object] = {"steps": length.steps}
+    changed: dict[str, object] = {"steps": length.steps, "minutes": None}
     full_at = max(options.resolution_grows_from, options.resolution_full_at)
     if options.initial_downscale > 1 and length.done >= options.resolution_grows_from * length.was:
         changed["resolution_grows_from"] = length.kept(options.resolution_grows_from * length.was)

@@ -98,7 +98,7 @@ def test_motion_must_be_better_than_a_still_model(
         (("train.steps=6000",), 1500),
         (("train.steps=3900",), 0),
         (("model.pilot_steps=0",), 0),
-        (("budget.max_minutes=3",), 0),
+        (("train.minutes=3",), 0),
     ],
 )
 def test_short_runs_have_none(keys: tuple[str, ...], steps: int, moving: Path) -> None:

@@ -10,7 +10,7 @@ from tiny_fields import busy_config
 
 from dyngs.api.small_runs import SMALL_GAUSSIANS, SMALL_SIDE, hold_out_every, is_gain, small_run
 from dyngs.build import assemble
-from dyngs.config import BudgetConfig, DefaultStrategy
+from dyngs.config import BudgetConfig, DefaultStrategy, TrainConfig
 from dyngs.data.capture import View
 
 
@@ -27,9 +27,7 @@ def test_cameras_take_turns_in_being_held_out() -> None:
 
 def test_a_small_run_has_no_limits_and_never_trains_on_what_is_held_out(moving: Path, tmp_path: Path) -> None:
     config = busy_config(moving, tmp_path / "run", "trajectory")
-    many = config.model_copy(
-        update={"strategy": DefaultStrategy(max_gaussians=10**6), "budget": BudgetConfig(max_minutes=5)}
-    )
+    many = config.model_copy(update={"strategy": DefaultStrategy(max_gaussians=10**6), "train": TrainConfig(minutes=5)})
     small = small_run(many, 3, 7)
     assert small.data.longest_side == SMALL_SIDE
     assert small.strategy == DefaultStrategy(max_gaussians=SMALL_GAUSSIANS)

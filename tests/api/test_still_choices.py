@@ -101,7 +101,7 @@ def test_an_objection_counts_more_than_a_gain(
     assert "but look at this: train.robust not taken" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("keys", [("train.steps=1000",), ("budget.max_minutes=3",)])
+@pytest.mark.parametrize("keys", [("train.steps=1000",), ("train.minutes=3",)])
 def test_short_runs_go_without(keys: tuple[str, ...], still: Path, tried: list[Config]) -> None:
     assert decided(preset(still, *keys)).train.robust == "never"
     assert not tried

@@ -28,7 +28,7 @@ from dyngs.budget.time import (
     with_steps,
 )
 from dyngs.build import assemble
-from dyngs.config import AutoColour, BudgetConfig, Config, DataConfig, DynamicModel, TrainConfig
+from dyngs.config import AutoColour, Config, DataConfig, DynamicModel, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
@@ -46,7 +46,7 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def timed(config: Config, minutes: float) -> Config:
-    return config.model_copy(update={"budget": BudgetConfig(max_minutes=minutes)})
+    return config.model_copy(update={"train": config.train.model_copy(update={"minutes": minutes})})
 
 
 @given(done=st.integers(0, 5000), pace=st.floats(1e-3, 10), seconds=st.floats(0, 1e5))
@@ -168,7 +168,7 @@ def test_a_first_fit_keeps_or_lowers_the_steps_or_refuses(
     _slowed(monkeypatch, 1.0)
     assert wanted < FEWEST_STEPS
     assert first_fit(timed(config, 1000.0), assemble(config), 0.0).train.steps == wanted
-    with pytest.raises(DyngsError, match=r"budget.max_minutes=0.1: about \d+ steps would fit.* would do") as refused:
+    with pytest.raises(DyngsError, match=r"train.minutes=0.1: about \d+ steps would fit.* would do") as refused:
         first_fit(timed(config, 0.1), assemble(config), 0.0)
     would_do = float(str(refused.value).split(";")[1].split()[0])
     assert first_fit(timed(config, would_do), assemble(config), 0.0).train.steps == wanted

@@ -243,7 +243,7 @@ def test_a_torn_last_line_of_the_log_is_dropped_once(run_dir: Path, tmp_path: Pa
 def test_the_time_of_a_checkpoint_is_there_as_soon_as_it_is(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A kill right after its rename loses no time of training, which budget.max_minutes counts."""
+    """A kill right after its rename loses no time of training, which train.minutes counts."""
     checkpoint = latest_checkpoint(run_dir)
     real = os.replace
 

@@ -36,6 +36,10 @@ BUSY = DefaultStrategy(start=1, stop=30_000, every=2, grad_threshold=1e-9)
 BUSY_MCMC = McmcStrategy(start=1, stop=30_000, every=2)
 
 
+def timed(config: Config, minutes: float) -> Config:
+    return config.model_copy(update={"train": config.train.model_copy(update={"minutes": minutes})})
+
+
 def limited(config: Config = NOTHING, **limits: float) -> Config:
     return config.model_copy(update={"budget": BudgetConfig.model_validate(limits)})
 
@@ -91,7 +95,7 @@ def test_a_cap_holds_where_motion_adds_some(tmp_path: Path) -> None:
 def test_without_limits_the_run_is_the_same(still: Path, tmp_path: Path) -> None:
     config = still_config(still, tmp_path / "free")
     assert within_cap(config, 0) is config
-    wide = limited(still_config(still, tmp_path / "wide"), max_gaussians=10**6, max_minutes=1000.0)
+    wide = timed(limited(still_config(still, tmp_path / "wide"), max_gaussians=10**6), 1000.0)
     free, kept = (checkpoint_paths(train(c))[-1].read_bytes() for c in (config, wide))
     assert free == kept, "limits that are far away change nothing"
 
@@ -138,8 +142,10 @@ def test_what_contradicts_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match=r"budget.max_mb: a network"):
         require_possible(limited(NOTHING.model_copy(update={"model": HumanPredictorModel()}), max_mb=5.0))
     both = NOTHING.model_copy(update={"prune": PruneConfig(share=0.5), "run": RunConfig(dir=tmp_path / "run")})
-    with pytest.raises(DyngsError, match=r"budget.max_minutes: .*dyngs prune"):
-        train(limited(both, max_minutes=5.0))
+    with pytest.raises(DyngsError, match=r"train.minutes: .*dyngs prune"):
+        train(timed(both, 5.0))
+    with pytest.raises(DyngsError, match=r"train.minutes: a network"):
+        require_possible(timed(NOTHING.model_copy(update={"model": HumanPredictorModel()}), 5.0))
     assert not (tmp_path / "run").exists()
 
 

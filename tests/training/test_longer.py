@@ -132,12 +132,13 @@ def test_a_run_that_was_stopped_may_become_longer_or_shorter(
 
 
 def test_limits_hold_on_but_that_of_time(captures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    asked = BudgetConfig(max_gaussians=70, max_mb=1.0, max_minutes=5)
-    run = train(_config(captures, tmp_path / "run", "default", budget=asked))
+    asked = BudgetConfig(max_gaussians=70, max_mb=1.0)
+    run = train(_config(captures, tmp_path / "run", "default", budget=asked, train=TrainConfig(steps=12, minutes=5)))
     capsys.readouterr()
     _to(run, 24)
-    assert "budget.max_minutes holds no longer" in capsys.readouterr().out
-    assert load_resolved(run).budget == asked.model_copy(update={"max_minutes": None})
+    assert "train.minutes holds no longer" in capsys.readouterr().out
+    assert load_resolved(run).budget == asked
+    assert load_resolved(run).train.minutes is None
     assert load_run(run).step == 24
     assert len(load_run(run).scene) <= 70
     assert load_run(run / "export").step == 24

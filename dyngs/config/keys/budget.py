@@ -14,11 +14,6 @@ class BudgetConfig(Section):
     max_mb: float | None = Field(
         default=None, gt=0, description="largest size of `export/scene.dyngs`, 1e6 bytes; the file is then written"
     )
-    max_minutes: float | None = Field(
-        default=None,
-        gt=0,
-        description="longest time of training on this machine, min; fewer than `train.steps` are done if need be",
-    )
     min_fps: float | None = Field(
         default=None,
         gt=0,

@@ -13,6 +13,12 @@ class TrainConfig(Section):
     """Length, loss and logging of a run."""
 
     steps: int = Field(default=7000, ge=1, description="optimisation steps; all schedules follow this number")
+    minutes: float | None = Field(
+        default=None,
+        gt=0,
+        description="longest time of training on this machine, min; fewer than train.steps are done if need be, with "
+        "schedules to match, and a line at the end says what all would cost; 1 is a preview; null: no limit",
+    )
     initial_downscale: Literal[1, 2, 4, 8, 16] = Field(
         default=1, description="sides of the training pictures are divided by this at first; 1: full resolution"
     )

@@ -1,0 +1,162 @@
+"""The cost of a run of all its steps, by what was measured in one that ``train.minutes`` made shorter: a preview.
+
+A step is taken to cost a constant, and in proportion to its pixels and its Gaussians (``dyngs.runs.remaining``); how
+fast this machine is at that was measured in every step. Gaussians are added at certain steps, about equally many each
+time. How far that was from whole runs: docs/budget.md.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from statistics import fmean, median
+
+from dyngs.budget.run import LimitedRun
+from dyngs.budget.time import with_steps
+from dyngs.config import Config, DefaultStrategy, FixedStrategy, McmcStrategy
+from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.runs.remaining import FIXED, MOTION, PER_GAUSSIAN, PER_MEGAPIXEL
+from dyngs.training.events import Event, StepDone
+from dyngs.training.memory import USUAL_CHANGES, USUAL_GAUSSIANS, gaussian_bytes, num_changes, peak_memory
+from dyngs.training.schedule import growth_per_change, motion_begins_after, picture_divisor, scaled
+
+SLOWER = 0.1
+"""Power of the number of changes with which each adds fewer Gaussians."""
+LEAST, MOST = 0.5, 1.6
+"""Factors on the Gaussians still to be added, for the range that is told."""
+PACE, MEMORY = 1.3, 1.2
+"""Factors, up and down, by which time and memory may differ beside that."""
+OUTLIER = 4.0
+"""Steps that took so many times longer than usual did something else, too."""
+FIRST = 5
+"""Steps at the start that are not counted."""
+SAMPLES = 200
+
+
+@dataclass(frozen=True)
+class Range:
+    """A number that is expected, and the range that it is expected in."""
+
+    low: float
+    middle: float
+    high: float
+
+    def told(self, unit: str, scale: float = 1.0) -> str:
+        """Return it in words, two digits each, in units of which one is 1 / ``scale``."""
+        low, middle, high = (_two_digits(scale * x) for x in (self.low, self.middle, self.high))
+        return f"{middle} {unit} ({low} to {high})" if low != high else f"{middle} {unit}"
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a run of ``steps`` is expected to cost: seconds, bytes of memory and of disk, and its Gaussians."""
+
+    steps: int
+    seconds: Range
+    memory: Range
+    disk: Range
+    gaussians: Range
+
+    def __str__(self) -> str:
+        parts = [self.seconds.told("min", 1 / 60), f"{self.memory.told('MB', 1e-6)} of memory"]
+        parts += [f"{self.disk.told('MB', 1e-6)} of disk", self.gaussians.told("Gaussians")]
+        return f"all {self.steps:,} steps would take about {', '.join(parts)}"
+
+
+class CostMeter:
+    """Listener that measures what steps cost.
+
+    Args:
+        run: what is measured.
+        steps: of the whole run.
+    """
+
+    def __init__(self, run: LimitedRun, steps: int) -> None:
+        self.run, self.steps, self.first = run, steps, run.trainer.num_gaussians
+        self._last: float | None = None
+        self._paces: list[float] = []
+        self._pixels = self._stepping = 0.0
+
+    def __call__(self, event: Event) -> None:
+        """Take in a step."""
+        match event:
+            case StepDone():
+                now, (height, width) = time.perf_counter(), event.report.truth.shape[:2]
+                config = self.run.trainer.config
+                self._pixels = height * width * picture_divisor(config.train, event.step) ** 2
+                if self._last is not None:
+                    cost = step_cost(config, event.step, self._pixels, event.num_gaussians)
+                    self._paces.append((now - self._last) / cost)
+                    self._stepping += now - self._last
+                self._last = now
+
+    def found(self) -> Cost | None:
+        """Return what the whole run would cost; None where there were too few steps to tell."""
+        paces = self._paces[FIRST:]
+        if not paces:
+            return None
+        usual = median(paces)
+        pace = fmean(pace for pace in paces if pace <= OUTLIER * usual)
+        config, now = with_steps(self.run.config, self.steps), self.run.trainer.num_gaussians
+        counts = self.gaussians(config)
+        other = max(self.run.used - self._stepping, 0.0)
+        slow, middle, fast = (other + pace * self._whole(config, n) for n in (counts.high, counts.middle, counts.low))
+        peak, each = peak_memory() + self.run.trainer.pictures.bytes_to_come, gaussian_bytes(config)
+        least, expected, most = (peak + each * max(n - now, 0) for n in (counts.low, counts.middle, counts.high))
+        paths = checkpoint_paths(self.run.folder)
+        stored = (paths[-1].stat().st_size if paths else 0) / max(now, 1) * (2 if config.train.save_every else 1)
+        return Cost(
+            self.steps,
+            Range(fast / PACE, middle, slow * PACE),
+            Range(least / MEMORY, expected, most * MEMORY),
+            Range(stored * counts.low, stored * counts.middle, stored * counts.high),
+            counts,
+        )
+
+    def gaussians(self, config: Config) -> Range:
+        """Return how many Gaussians the run of ``config`` is expected to end with."""
+        now, limit = self.run.trainer.num_gaussians, self.run.trainer.config.strategy.growth_limit
+        done, changes = num_changes(self.run.trainer.config, self.run.trainer.done), num_changes(config)
+        match config.strategy:
+            case McmcStrategy():
+                grown = (1 + growth_per_change(config.strategy, self.steps)) ** min(changes, 10_000)
+                count = max(min(self.first * min(grown, 1e9), limit), now)
+                return Range(count, count, count)
+            case DefaultStrategy() if config.strategy.grow:
+                more, factors = self._more(now, done, changes), (LEAST, 1.0, MOST) if done else (0.2, 1.0, 3.0)
+                low, middle, high = (max(min(now + factor * more, limit), now) for factor in factors)
+                return Range(low, middle, high)
+            case DefaultStrategy() | FixedStrategy():
+                return Range(now, now, now)
+
+    def _more(self, now: int, done: int, changes: int) -> float:
+        """Return how many Gaussians are still to be added, by what the changes ``done`` have added; else as usual."""
+        if not done:
+            return changes * min(USUAL_GAUSSIANS / USUAL_CHANGES, 0.25 * now)
+        each = max(now - self.first, 0.05 * now) / done
+        return each * (max(changes, 1) / done) ** -SLOWER * max(changes - done, 0)
+
+    def _whole(self, config: Config, count: float) -> float:
+        """Return the cost of all steps of ``config``, whose Gaussians become ``count`` while they are added."""
+        steps, stop, total = config.train.steps, scaled(config.strategy.stop, config.train.steps), 0.0
+        for i in range(SAMPLES):
+            step = max(1, math.ceil(steps * (i + 0.5) / SAMPLES))
+            total += step_cost(config, step, self._pixels, self.first + (count - self.first) * min(step / stop, 1.0))
+        return total * steps / SAMPLES
+
+
+def step_cost(config: Config, step: int, pixels: float, num_gaussians: float) -> float:
+    """Return the cost of ``step``, whose picture has so many pixels at full size; only ratios mean something."""
+    begins = motion_begins_after(config, config.train.steps)
+    moving = MOTION if begins is not None and step > begins else 1.0
+    shown = 1e-6 * pixels / picture_divisor(config.train, step) ** 2
+    return moving * (FIXED + PER_MEGAPIXEL * shown + PER_GAUSSIAN * num_gaussians)
+
+
+def _two_digits(x: float) -> str:
+    """Return ``x`` with two significant digits."""
+    if x <= 0:
+        return "0"
+    digits = 1 - math.floor(math.log10(x))
+    return f"{round(x, digits):,.{max(digits, 0)}f}"
