@@ -18,13 +18,16 @@ from dyngs.config import Config, DefaultStrategy, FixedStrategy, McmcStrategy
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.remaining import FIXED, MOTION, PER_GAUSSIAN, PER_MEGAPIXEL
 from dyngs.training.events import Event, StepDone
-from dyngs.training.memory import USUAL_CHANGES, USUAL_GAUSSIANS, gaussian_bytes, num_changes, peak_memory
+from dyngs.training.memory import gaussian_bytes, num_changes, peak_memory
 from dyngs.training.schedule import growth_per_change, motion_begins_after, picture_divisor, scaled
 
 SLOWER = 0.1
 """Power of the number of changes with which each adds fewer Gaussians."""
 LEAST, MOST = 0.5, 1.6
 """Factors on the Gaussians still to be added, for the range that is told."""
+USUAL_MORE, UNSEEN = 4000.0, (0.25, 1.0, 2.0)
+"""Gaussians that a change usually adds, for a preview that saw none, and the factors on them for the range. Seen:
+colmap_small 3,300 (100 px), stage 1,900 (100 px), fox 7,800 (200 px and 480 px), lego 7,400."""
 PACE, MEMORY = 1.3, 1.2
 """Factors, up and down, by which time and memory may differ beside that."""
 OUTLIER = 4.0
@@ -124,7 +127,7 @@ class CostMeter:
                 count = max(min(self.first * min(grown, 1e9), limit), now)
                 return Range(count, count, count)
             case DefaultStrategy() if config.strategy.grow:
-                more, factors = self._more(now, done, changes), (LEAST, 1.0, MOST) if done else (0.2, 1.0, 3.0)
+                more, factors = self._more(now, done, changes), (LEAST, 1.0, MOST) if done else UNSEEN
                 low, middle, high = (max(min(now + factor * more, limit), now) for factor in factors)
                 return Range(low, middle, high)
             case DefaultStrategy() | FixedStrategy():
@@ -133,7 +136,7 @@ class CostMeter:
     def _more(self, now: int, done: int, changes: int) -> float:
         """Return how many Gaussians are still to be added, by what the changes ``done`` have added; else as usual."""
         if not done:
-            return changes * min(USUAL_GAUSSIANS / USUAL_CHANGES, 0.25 * now)
+            return changes * USUAL_MORE
         each = max(now - self.first, 0.05 * now) / done
         return each * (max(changes, 1) / done) ** -SLOWER * max(changes - done, 0)
 

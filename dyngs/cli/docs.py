@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
 from difflib import get_close_matches
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from dyngs.errors import DyngsError
 
-_LINK = re.compile(r"\]\(([^)#\s:]+)(#[^)\s]*)?\)")
+_LINK = re.compile(r"\[([^]]+)\]\(([^)#\s:]+)(?:#[^)\s]*)?\)")
 _FRONT = "README"
 
 
@@ -38,12 +39,13 @@ def run(arguments: argparse.Namespace) -> int:
         from rich.console import Console
         from rich.markdown import Markdown
 
+        os.environ.setdefault("LESS", "-R")  # otherwise less shows colours as codes
         console = Console()
-        with console.pager(styles=True, links=True):
-            console.print(Markdown(_with_whole_links(text, path.parent)))
+        with console.pager(styles=True):
+            console.print(Markdown(_with_commands(text, folder)))
     else:
         print(text, end="")
-    others = sorted({Path(match[1]).stem for match in _LINK.finditer(text) if match[1].endswith(".md")} - {path.stem})
+    others = sorted({Path(match[2]).stem for match in _LINK.finditer(text) if match[2].endswith(".md")} - {path.stem})
     known = [name for name in others if (folder / f"{name}.md").is_file()]
     if known:
         print(f"pages that this one names: dyngs docs {' | '.join(known)}", file=sys.stderr)
@@ -78,11 +80,14 @@ def page(folder: Path, topic: str) -> Path:
     raise DyngsError(f"no page {topic!r}{hint}; there are {', '.join(key for key in pages if key != _FRONT)}")
 
 
-def _with_whole_links(text: str, folder: Path) -> str:
-    """Return Markdown whose links to files are those of the files, so that a terminal can open them."""
+def _with_commands(text: str, folder: Path) -> str:
+    """Return Markdown in which a link to another page is the command that shows it, as a terminal can open no page."""
 
-    def whole(match: re.Match[str]) -> str:
-        target = folder / match[1]
-        return f"]({target.resolve().as_uri()}{match[2] or ''})" if target.exists() else match[0]
+    def command(match: re.Match[str]) -> str:
+        words, target = match[1], Path(match[2])
+        if target.suffix != ".md" or not (folder / target.name).is_file():
+            return match[0]
+        shown = f"`dyngs docs {target.stem}`"
+        return shown if words == target.name else f"{words} ({shown})"
 
-    return _LINK.sub(whole, text)
+    return _LINK.sub(command, text)

@@ -28,10 +28,10 @@ def test_pages_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["docs", "../README"]) == 2
 
 
-def test_links_of_a_terminal_are_those_of_files() -> None:
-    text = docs._with_whole_links("[a](longer.md#x) [b](https://x.y/z.md) [c](none.md) [d](#e)", docs_folder())
-    target = (docs_folder() / "longer.md").resolve().as_uri()
-    assert text == f"[a]({target}#x) [b](https://x.y/z.md) [c](none.md) [d](#e)"
+def test_links_in_a_terminal_are_commands() -> None:
+    text = "([longer.md](longer.md#x)) [b](https://x.y/z.md) [c](none.md) [d](#e) [the keys](cli.md)"
+    found = docs._with_commands(text, docs_folder())
+    assert found == "(`dyngs docs longer`) [b](https://x.y/z.md) [c](none.md) [d](#e) the keys (`dyngs docs cli`)"
 
 
 def test_links_lead_to_what_is_installed() -> None:
