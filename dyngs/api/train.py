@@ -287,6 +287,15 @@ class _Run:
         self.loop.watch.pause(seconds)
         self.loop.tell(Evaluated(step, "test", report.psnr, report.ssim, seconds))
 
+    def _how_to_go_on(self, steps: int) -> str:
+        """Return what to do after a preview for a run of all ``steps``."""
+        try:
+            with_length(self.config, self.loop.trainer.done, steps)
+        except DyngsError:  # motion began too early for so many
+            return "for that train anew without train.minutes"
+        longer = f"`dyngs train --resume {self.folder} train.steps={steps}`"
+        return f"this run goes on to that with {longer}, or train anew without train.minutes"
+
     def _reached(self) -> Iterator[str]:
         """Yield a line for each limit; what is still owed is done before its line."""
         for part in (_COUNT, _TIME):
@@ -294,8 +303,7 @@ class _Run:
                 yield self.limits[part].reached()
         cost = None if self._meter is None or self._meter.steps <= self.loop.trainer.done else self._meter.found()
         if cost is not None:
-            longer = f"`dyngs train --resume {self.folder} train.steps={cost.steps}`"
-            yield f"{cost}; this run goes on to that with {longer}, or train anew without train.minutes"
+            yield f"{cost}; {self._how_to_go_on(cost.steps)}"
         if self.limited is not None and self.config.budget.max_mb is not None:
             yield str(write_within(self.limited.trainer, self.folder, self.config.budget.max_mb))
         if _SPEED in self.limits:

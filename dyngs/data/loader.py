@@ -19,6 +19,7 @@ from dyngs.data.pictures.depth import read_depth, read_labels
 from dyngs.data.pictures.flow import read_flow
 from dyngs.data.pictures.images import (
     area_downscale,
+    area_downscale_uint8,
     check_picture,
     premultiplied,
     read_mask,
@@ -321,16 +322,16 @@ class PictureLoader:
         maps = self._maps(view, size)
         if is_pinhole(view.lens) and size == (view.width, view.height):
             return _Decoded(pixels, mask, **maps)
-        linear = premultiplied(pixels)
-        if not is_pinhole(view.lens):
+        if is_pinhole(view.lens):
+            small = area_downscale_uint8(pixels, *size)
+        else:
             lens_map = self._lens_map(view)
-            linear = undistort(linear, lens_map)
+            small = straight_uint8(area_downscale(undistort(premultiplied(pixels), lens_map), *size))
             mask = _undistorted_mask(mask, lens_map)
-        linear = area_downscale(linear, *size)
         if mask is not None:
             # A pixel counts only if all that it covers is kept: otherwise masked colours would bleed in.
             mask = area_downscale(mask.float()[..., None], *size)[..., 0] > FULLY_KEPT
-        return _Decoded(straight_uint8(linear), mask, **maps)
+        return _Decoded(small, mask, **maps)
 
     def _maps(self, view: View, size: tuple[int, int]) -> dict[str, Tensor]:
         """Return motion mask, depth and flow of a view, as far as it has them, for the picture of ``size``."""

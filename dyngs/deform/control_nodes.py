@@ -99,7 +99,7 @@ class ControlNodes(NetworkField):
             require_indices("labels", buffers["labels"], (count,), groups[0] + 1)
         own = field._extended(groups, moving, lives=any(name in learned for name in SIZES))
         field.parameters = own.restored(learned, dict.fromkeys(head_sizes(self.options), count))
-        if count:
+        if count and ("radii" in buffers or "followed" in buffers):  # both are found where nodes are first needed
             require_positive("radii", require_tensor("radii", buffers["radii"], (count,)))
         for name, length in (("followed", moving), ("others", moving), ("neighbours", count)):
             if name in buffers:

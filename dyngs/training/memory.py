@@ -19,10 +19,11 @@ COPIES = 7
 changes. Measured: 1.65 kB per Gaussian with harmonics of degree 3, whose 59 values take 0.24 kB."""
 SHAPE_VALUES = 11
 """Values of a Gaussian beside its harmonics: position, rotation, sizes, opacity."""
-DRAWING_BYTES = 300
+DRAWING_BYTES = 200
 """Bytes per pixel of the largest picture that a step takes beside them: rendering, truth, windows of SSIM."""
-DECODING_BYTES = 60
-"""Bytes per pixel of the file that decoding takes for a while: floats for shrinking and undistorting."""
+DECODING_BYTES = 45
+"""Bytes per pixel of the file that decoding takes for a while: floats for shrinking and undistorting. Measured, as that
+above, on photos of 12 megapixels."""
 USUAL_GAUSSIANS, USUAL_CHANGES = 250_000, 34
 """Gaussians that photos led to in 7,000 steps (fox 268,000, cup 204,000, lego 173,000: docs/benchmarks.md), in which
 their set changes so often."""
@@ -86,7 +87,7 @@ def memory_forecast(trainer: Trainer) -> MemoryForecast:
     pictures, config = trainer.pictures, trainer.config
     pixels = max((width * height for width, height in pictures.sizes), default=0)
     files = max((view.width * view.height for view in pictures.views), default=0)
-    waiting = pictures.decoded_ahead // 2 * DECODING_BYTES * files
+    waiting = (pictures.decoded_ahead // 2 or 1) * DECODING_BYTES * files
     return MemoryForecast(
         program=resident_memory(),
         pictures=pictures.bytes_to_come + waiting,

@@ -3,6 +3,7 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_captures import random_pixels, write_picture
 
+from dyngs.data.pictures import images
 from dyngs.data.pictures.images import (
     area_downscale,
+    area_downscale_uint8,
     check_picture,
     premultiplied,
     read_header,
@@ -124,6 +127,18 @@ def test_area_filter_is_the_mean_over_the_covered_rectangle(height: int, width: 
     found = area_downscale(torch.from_numpy(pixels), new_width, new_height).numpy()
     np.testing.assert_allclose(found, wanted, atol=1e-12)
     np.testing.assert_allclose(found.mean(axis=(0, 1)), pixels.mean(axis=(0, 1)), atol=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.sampled_from([3, 4]), st.data())
+def test_strips_give_the_same_bytes(height: int, width: int, channels: int, data: st.DataObject) -> None:
+    new_height, new_width = data.draw(st.integers(1, height)), data.draw(st.integers(1, width))
+    numbers = np.random.default_rng(height * 41 + width).integers(0, 256, (height, width, channels), dtype=np.uint8)
+    pixels = torch.from_numpy(numbers)
+    wanted = straight_uint8(area_downscale(premultiplied(pixels), new_width, new_height))
+    assert torch.equal(area_downscale_uint8(pixels, new_width, new_height), wanted)
+    with mock.patch.object(images, "_STRIP_PIXELS", data.draw(st.integers(1, 200))):
+        assert torch.equal(area_downscale_uint8(pixels, new_width, new_height), wanted)
 
 
 def test_colour_of_transparent_pixels_does_not_bleed() -> None:
