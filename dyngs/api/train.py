@@ -111,6 +111,7 @@ def train(config: Config, *, resume_from: Path | None = None, listeners: Sequenc
         if resume_from is not None:
             config = _with_new_length(config, folder, resumed)
         if resumed is not None and resumed.info.step >= config.total_steps and not _owes_file(config, folder):
+            print(f"{folder}: all {config.total_steps:,} steps are done; train.steps=N goes on to more", flush=True)
             return folder
         asked = asked_for(folder) if resume_from is not None else config
         if resumed is None:

@@ -28,8 +28,8 @@ LEAST, MOST = 0.5, 1.6
 USUAL_MORE, UNSEEN = 4000.0, (0.25, 1.0, 2.0)
 """Gaussians that a change usually adds, for a preview that saw none, and the factors on them for the range. Seen:
 colmap_small 3,300 (100 px), stage 1,900 (100 px), fox 7,800 (200 px and 480 px), lego 7,400."""
-PACE, MEMORY = 1.3, 1.2
-"""Factors, up and down, by which time and memory may differ beside that."""
+PACE, PACE_UNSEEN, MEMORY = 1.3, 2.0, 1.2
+"""Factors, up and down, by which time and memory may differ beside that; time more where no growth was seen, either."""
 OUTLIER = 4.0
 """Steps that took so many times longer than usual did something else, too."""
 FIRST = 5
@@ -102,7 +102,8 @@ class CostMeter:
         usual = median(paces)
         pace = fmean(pace for pace in paces if pace <= OUTLIER * usual)
         config, now = with_steps(self.run.config, self.steps), self.run.trainer.num_gaussians
-        counts = self.gaussians(config)
+        counts, has_grown = self.gaussians(config), num_changes(self.run.trainer.config, self.run.trainer.done) > 0
+        spread = PACE if has_grown else PACE_UNSEEN
         other = max(self.run.used - self._stepping, 0.0)
         slow, middle, fast = (other + pace * self._whole(config, n) for n in (counts.high, counts.middle, counts.low))
         peak, each = peak_memory() + self.run.trainer.pictures.bytes_to_come, gaussian_bytes(config)
@@ -111,7 +112,7 @@ class CostMeter:
         stored = (paths[-1].stat().st_size if paths else 0) / max(now, 1) * (2 if config.train.save_every else 1)
         return Cost(
             self.steps,
-            Range(fast / PACE, middle, slow * PACE),
+            Range(fast / spread, middle, slow * spread),
             Range(least / MEMORY, expected, most * MEMORY),
             Range(stored * counts.low, stored * counts.middle, stored * counts.high),
             counts,
