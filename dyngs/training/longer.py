@@ -13,6 +13,7 @@ from dyngs.config.kinds import harmonics_measured_after, network_of
 from dyngs.deform.training import DeformSchedule
 from dyngs.errors import DyngsError
 from dyngs.static.rates import Rates
+from dyngs.training.exposure import WARM_UP
 from dyngs.training.schedule import (
     PUBLISHED_STEPS,
     deform_schedule,
@@ -72,6 +73,7 @@ def with_length(config: Config, done: int, steps: int) -> Config:
         )
     if steps <= done:
         raise DyngsError(f"train.steps={steps}: {done:,} steps are done already; give more than that")
+    _require_exposures_stay(config, length)
     changed: dict[str, object] = {"train": _train(config.train, length)}
     match config.model:
         case DynamicModel():
@@ -88,6 +90,16 @@ def with_length(config: Config, done: int, steps: int) -> Config:
         case _:
             pass
     return config.model_copy(update=changed)
+
+
+def _require_exposures_stay(config: Config, length: Length) -> None:
+    """Raise DyngsError where exposures were learned before a run of the new length begins with that."""
+    begun, begins = (round(WARM_UP * steps) for steps in (length.was, length.steps))
+    if config.train.exposure == "always" and begun < length.done <= begins:
+        raise DyngsError(
+            f"train.steps={length.steps}: exposures were learned after {begun:,} steps, and a run of {length.steps:,} "
+            f"begins with that after {begins:,}; train anew with so many steps"
+        )
 
 
 def told(before: Config, after: Config, done: int) -> str:

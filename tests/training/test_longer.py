@@ -184,6 +184,14 @@ def test_what_has_begun_keeps_its_step() -> None:
             assert told(config, new, done).count("\n") == 0
 
 
+def test_exposures_that_are_learned_stay_so() -> None:
+    options = TrainConfig(steps=1000, exposure="always")
+    config = Config(data=DataConfig(root=Path("x")), train=options)
+    assert with_length(config, 1000, 5000).train.exposure == "always"
+    with pytest.raises(DyngsError, match="exposures were learned after"):
+        with_length(config, 1000, 1_000_000)
+
+
 def test_what_a_shorter_run_would_have_begun_by_now_begins_next() -> None:
     model = DynamicModel(motion_from=0.5)
     config = Config(data=DataConfig(root=Path("x")), model=model, colour=AutoColour(), train=TrainConfig(steps=10_000))
