@@ -95,7 +95,7 @@ def test_a_preview_says_what_all_steps_would_cost(
     monkeypatch.setattr("dyngs.budget.time.FEWEST_STEPS", 1)  # a slow machine may do no more
     monkeypatch.setattr(cost, "FIRST", 0)
     words = [f"data.root={capture}", "init.kind=random", "init.num_random=60", "run.threads=1"]
-    asked = ["train.steps=100000", "train.minutes=0.06", f"run.dir={tmp_path / 'run'}"]
+    asked = ["train.steps=100000", "train.minutes=0.03", f"run.dir={tmp_path / 'run'}"]
     run = train(load_config("static", [*words, *asked]))
     told = capsys.readouterr().out
     assert re.search(r"^memory: about .* GB", told)
