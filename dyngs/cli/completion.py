@@ -7,6 +7,8 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from dyngs.cli.docs import docs_folder
+
 _BASH = """\
 # Put this line into ~/.bashrc:   eval "$(dyngs completion bash)"
 _dyngs() {
@@ -149,6 +151,9 @@ def _values(action: argparse.Action, word: str) -> Iterator[str]:
     metavar = action.metavar if isinstance(action.metavar, str) else action.dest.upper()
     if action.choices is not None:
         yield from map(str, action.choices)
+        return
+    if metavar == "TOPIC":
+        yield from (path.stem for path in docs_folder().glob("*.md"))
         return
     runs = [f"runs/{path.parent.name}" for path in Path("runs").glob("*/config.yaml")] if "RUN" in metavar else []
     yield from runs

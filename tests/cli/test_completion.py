@@ -53,6 +53,7 @@ def _offered(line: str) -> list[str]:
         ("dyngs train static train.tensorboard=t", ["train.tensorboard=true"]),
         ("dyngs train static data.root=sc", ["data.root=scan/"]),
         ("dyngs train static budget.max_mb=", ["budget.max_mb=null"]),
+        ("dyngs docs lon", ["longer"]),
         ("dyngs config mi", ["mine.yaml", "mip"]),
         ("dyngs nonsense --x ", None),
     ],
