@@ -117,7 +117,8 @@ def render(
 ) -> Rendering:
     """Return pictures of the Gaussians from every camera (Kerbl et al. 2023).
 
-    Differentiable in the Gaussians, the camera poses, the background, the probe and what the shader computes.
+    Differentiable in the Gaussians, the poses and intrinsics of the cameras, the background, the probe and what the
+    shader computes.
 
     Args:
         gaussians: N Gaussians, float32 (production), float64 (checks) or half (computed in float32).

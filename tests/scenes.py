@@ -70,9 +70,8 @@ class Scene:
         return self.map(lambda x: x.to(dtype))
 
     def leaves(self) -> Scene:
-        """Copies that collect gradients (the intrinsics are constants)."""
-        scene = self.map(lambda x: x.detach().clone().requires_grad_())
-        return replace(scene, intrinsics=self.intrinsics)
+        """Copies that collect gradients."""
+        return self.map(lambda x: x.detach().clone().requires_grad_())
 
     def view(self, index: int) -> Scene:
         picked = {k: getattr(self, k)[index : index + 1] for k in ("cam_from_world", "intrinsics", "background")}

@@ -83,13 +83,13 @@ def test_gradcheck(depth: str) -> None:
     scene = replace(scene, scales=5 * scene.scales)
     options = replace(EXACT, depth=depth, mode=RasterizeMode.ANTIALIASED)
 
-    def run(poses: Tensor, background: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
-        cameras = replace(scene, cam_from_world=poses).cameras
+    def run(poses: Tensor, intrinsics: Tensor, background: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+        cameras = replace(scene, cam_from_world=poses, intrinsics=intrinsics).cameras
         picture = render(Gaussians(*tensors), cameras, options, background=background)
         assert picture.depth is not None
         return picture.rgb, picture.alpha, picture.depth
 
-    tensors = (scene.cam_from_world, scene.background, *scene.gaussians.tensors().values())
+    tensors = (scene.cam_from_world, scene.intrinsics, scene.background, *scene.gaussians.tensors().values())
     assert torch.autograd.gradcheck(run, [x.detach().clone().requires_grad_() for x in tensors])
 
 

@@ -120,18 +120,22 @@ void bind_projection(nb::module_& module, const char* arrays_name) {
       nb::arg().noconvert());
   module.def("project_backward", [](const Arrays& in, const ProjectSettings& settings, Array<const int32_t> radii,
                                     std::tuple<Array<const S>, Array<const S>, Array<const S>, Array<const S>> grads,
-                                    std::tuple<Array<S>, Array<S>, Array<S>, MaybeArray<S>> out) {
+                                    std::tuple<Array<S>, Array<S>, Array<S>, MaybeArray<S>, MaybeArray<S>> out) {
     const GaussianViews<S> views = in.views();
     const int64_t n = views.num_gaussians, rows = views.num_views * n;
     const auto& [g_means2d, g_depths, g_factors, g_compensations] = grads;
-    const auto& [means, quats, scales, viewmats] = out;
+    const auto& [means, quats, scales, viewmats, intrinsics] = out;
     expect(radii, 2 * rows, "radii"), expect(g_means2d, 2 * rows, "means2d gradient");
     expect(g_depths, rows, "depths gradient"), expect(g_factors, 3 * rows, "factors gradient");
     expect(g_compensations, rows, "compensations gradient"), expect(means, 3 * n, "means gradient");
     expect(quats, 4 * n, "quats gradient"), expect(scales, 3 * n, "scales gradient");
     expect(viewmats, 16 * views.num_views, "viewmats gradient");
+    expect(intrinsics, 9 * views.num_views, "intrinsics gradient");
+    if (viewmats.has_value() != intrinsics.has_value())
+      throw nb::value_error("project_backward: the gradients of viewmats and intrinsics go together");
     const ProjectedGrads<S> from{g_means2d.data(), g_depths.data(), g_factors.data(), g_compensations.data()};
-    const GaussianGrads<S> to{means.data(), quats.data(), scales.data(), data_or_null(viewmats)};
+    const GaussianGrads<S> to{means.data(), quats.data(), scales.data(), data_or_null(viewmats),
+                              data_or_null(intrinsics)};
     nb::gil_scoped_release release;
     project_backward(views, settings.cast<S>(), radii.data(), from, to);
   });

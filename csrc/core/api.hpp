@@ -55,10 +55,11 @@ struct ProjectedGrads {
 
 template <class S>
 struct GaussianGrads {
-  S* means;     // (N, 3)
-  S* quats;     // (N, 4)
-  S* scales;    // (N, 3)
-  S* viewmats;  // (V, 4, 4) or null
+  S* means;       // (N, 3)
+  S* quats;       // (N, 4)
+  S* scales;      // (N, 3)
+  S* viewmats;    // (V, 4, 4); null: neither these nor the intrinsics
+  S* intrinsics;  // (V, 3, 3), 0 but for fx, fy, cx, cy; null where viewmats is
 };
 
 // Means, shapes and extents of N Gaussians in V images; zeros where culled.

@@ -94,7 +94,10 @@ struct BlockGrads {
   Quat<Packet<S>> unit;
 };
 
-// Adds the gradients of one view for 16 Gaussians; `camera` (12 numbers) collects those of [rotation | translation].
+// Numbers per camera: its rotation and translation (3, 4), fx, fy, cx, cy.
+constexpr int kCamera = 16;
+
+// Adds the gradients of one view for 16 Gaussians; `camera` (kCamera numbers) collects those of the camera.
 template <class S>
 void backward_view(const Pinhole<S>& cam, const Loaded<S>& g, const ProjectOptions<S>& options, const int32_t* radii,
                    const ProjectedGrads<S>& grads, int64_t row, int count, BlockGrads<S>& sum, double* camera) {
@@ -132,6 +135,9 @@ void backward_view(const Pinhole<S>& cam, const Loaded<S>& g, const ProjectOptio
     for (int j = 0; j < 3; ++j) camera[4 * i + j] += horizontal_sum(kept(gc[i] * w[j] + d.view[i][j]));
     camera[4 * i + 3] += horizontal_sum(gc[i]);
   }
+  const IntrinsicsGrad<P> lens = intrinsics_vjp(state, gs, d);
+  camera[12] += horizontal_sum(kept(lens.fx)), camera[13] += horizontal_sum(kept(lens.fy));
+  camera[14] += horizontal_sum(kept(lens.cx)), camera[15] += horizontal_sum(kept(lens.cy));
 }
 
 }  // namespace
@@ -155,7 +161,8 @@ void project_backward(const GaussianViews<S>& in, const ProjectOptions<S>& optio
   std::vector<Pinhole<S>> cams;
   cams.reserve(in.num_views);
   for (int64_t v = 0; v < in.num_views; ++v) cams.push_back(load_pinhole(in, options, v));
-  std::vector<double> camera(out.viewmats ? blocks * in.num_views * 12 : 0);  // per block: summed in fixed order below
+  std::vector<double> camera(out.viewmats ? blocks * in.num_views * kCamera
+                                          : 0);  // per block: summed in fixed order below
   parallel_for(in.num_gaussians, kBlock, options.threads, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; i += kLanes) {
       const int count = static_cast<int>(std::min<int64_t>(kLanes, end - i));
@@ -163,7 +170,7 @@ void project_backward(const GaussianViews<S>& in, const ProjectOptions<S>& optio
       const P zero(S(0));
       BlockGrads<S> sum{{zero, zero, zero}, {zero, zero, zero}, {zero, zero, zero, zero}};
       for (int64_t v = 0; v < in.num_views; ++v) {
-        double* cam_sum = out.viewmats ? camera.data() + ((begin / kBlock) * in.num_views + v) * 12 : nullptr;
+        double* cam_sum = out.viewmats ? camera.data() + ((begin / kBlock) * in.num_views + v) * kCamera : nullptr;
         backward_view(cams[v], g, options, radii, grads, v * in.num_gaussians + i, count, sum, cam_sum);
       }
       const Quat<P> q = normalize_vjp(g.unit, g.inv_norm, sum.unit);
@@ -176,10 +183,15 @@ void project_backward(const GaussianViews<S>& in, const ProjectOptions<S>& optio
   });
   if (out.viewmats == nullptr) return;
   for (int64_t v = 0; v < in.num_views; ++v) {
-    double total[16] = {};
+    double total[kCamera] = {};
     for (int64_t b = 0; b < blocks; ++b)
-      for (int k = 0; k < 12; ++k) total[k] += camera[(b * in.num_views + v) * 12 + k];
-    for (int k = 0; k < 16; ++k) out.viewmats[v * 16 + k] = static_cast<S>(total[k]);
+      for (int k = 0; k < kCamera; ++k) total[k] += camera[(b * in.num_views + v) * kCamera + k];
+    S* viewmat = out.viewmats + v * 16;
+    for (int k = 0; k < 16; ++k) viewmat[k] = k < 12 ? static_cast<S>(total[k]) : S(0);
+    S* intrinsics = out.intrinsics + v * 9;
+    for (int k = 0; k < 9; ++k) intrinsics[k] = S(0);
+    intrinsics[0] = static_cast<S>(total[12]), intrinsics[4] = static_cast<S>(total[13]);
+    intrinsics[2] = static_cast<S>(total[14]), intrinsics[5] = static_cast<S>(total[15]);
   }
 }
 

@@ -79,7 +79,8 @@ struct ProjectionGrad {
   Vec3<R> cam;   // by the centre in the camera
   Quat<R> unit;  // by the unit quaternion
   Vec3<R> scale;
-  R view[3][3];  // by the camera's rotation, through J W only
+  R view[3][3];          // by the camera's rotation, through J W only
+  R j00, j02, j11, j12;  // by the entries of J
 };
 
 template <class R, class S>
@@ -110,7 +111,24 @@ DYNGS_HD ProjectionGrad<R> project_vjp(const Pinhole<S>& cam, const Quat<R>& uni
   grad.cam = {st.rz * g_tan_x, st.rz * g_tan_y, g.depth - st.rz * st.rz * g_rz};
   grad.unit = shape.unit;
   grad.scale = shape.scale;
+  grad.j00 = g_j00, grad.j02 = g_j02, grad.j11 = g_j11, grad.j12 = g_j12;
   return grad;
+}
+
+// Gradient by the intrinsics of the camera.
+template <class R>
+struct IntrinsicsGrad {
+  R fx, fy, cx, cy;
+};
+
+// Continues project_vjp, whose result is `d`. Where the clamp is active, fx tx = const - cx: fx cancels in J.
+template <class R>
+DYNGS_HD IntrinsicsGrad<R> intrinsics_vjp(const ProjectionState<R>& st, const SplatGrad<R>& g,
+                                          const ProjectionGrad<R>& d) {
+  const R zero = real<R>(0), x = st.cam.x * st.rz, y = st.cam.y * st.rz;
+  return {x * g.x + st.rz * (d.j00 - select(st.free_x, st.tx * d.j02, zero)),
+          y * g.y + st.rz * (d.j11 - select(st.free_y, st.ty * d.j12, zero)),
+          g.x + select(st.free_x, zero, st.rz * d.j02), g.y + select(st.free_y, zero, st.rz * d.j12)};
 }
 
 // The rectangle in which a splat can be seen.

@@ -53,6 +53,8 @@ __global__ void projection(Numbers<S> n) {
   const SplatGrad<S> g{n.next(), n.next(), n.next(), {n.next(), n.next(), n.next(), n.next()}};
   const ProjectionGrad<S> grad = project_vjp(camera, unit, scale, eps, state, splat, g);
   n.put(grad.cam + grad.scale), n.put(grad.unit), n.put(grad.view[0][0]);
+  const IntrinsicsGrad<S> lens = intrinsics_vjp(state, g, grad);
+  n.put(lens.fx + lens.fy + lens.cx + lens.cy);
   const Extent<S> extent = visible_extent(splat, n.next(), Vec2<S>{camera.width, camera.height}, n.next(), n.next());
   n.put(extent.visible ? extent.x : extent.y);
   const Conic<S>& c = splat.conic;

@@ -67,7 +67,8 @@ void test_rotation_matrix() {
   expect_vjp("rotation_matrix_vjp", f, x, g, values(rotation_matrix_vjp(quat(x), cotangent)));
 }
 
-// Inputs of project() in a row: centre in the camera 0-2, quaternion 3-6, scales 7-9, camera rotation 10-18.
+// Inputs of project() in a row: centre in the camera 0-2, quaternion 3-6, scales 7-9, camera rotation 10-18,
+// fx, fy, cx, cy 19-22.
 struct Setup {
   Pinhole<double> camera;
   Vec3<double> center, scale;
@@ -76,7 +77,7 @@ struct Setup {
 
 Setup unpack(const Values& v) {
   Setup s;
-  s.camera = {{}, {0, 0, 0}, 310, 295, 160, 125, 320, 240};
+  s.camera = {{}, {0, 0, 0}, v[19], v[20], v[21], v[22], 320, 240};
   for (int i = 0; i < 9; ++i) s.camera.rotation.m[i / 3][i % 3] = v[10 + i];
   s.center = {v[0], v[1], v[2]}, s.unit = quat(v, 3), s.scale = {v[7], v[8], v[9]};
   return s;
@@ -90,6 +91,7 @@ Values random_setup() {
   for (double e : values(normalize(quat(uniforms(4, -1, 1)), inv))) v.push_back(e);
   for (double e : uniforms(3, 0.05, 0.6)) v.push_back(e);
   v.insert(v.end(), turn.begin(), turn.end());
+  v.insert(v.end(), {310, 295, 160, 125});
   return v;
 }
 
@@ -117,6 +119,8 @@ void test_project_vjp(double eps, bool outside) {
   for (double e : values(d.unit)) gradient.push_back(e);
   for (double e : {d.scale.x, d.scale.y, d.scale.z}) gradient.push_back(e);
   for (const auto& row : d.view) gradient.insert(gradient.end(), row, row + 3);
+  const IntrinsicsGrad<double> lens = intrinsics_vjp(state, cotangent, d);
+  gradient.insert(gradient.end(), {lens.fx, lens.fy, lens.cx, lens.cy});
   expect_vjp("project_vjp eps " + std::to_string(eps) + (outside ? " clamped" : ""), f, x, g, gradient);
 }
 

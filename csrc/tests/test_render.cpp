@@ -47,7 +47,7 @@ struct Drawn {
   std::vector<S> means2d, depths, factors, compensations, opacities, colors;
   std::vector<int32_t> radii, stop;
   std::vector<S> color, transmittance, tallies[4];
-  std::vector<S> g_means, g_quats, g_scales, g_viewmats, g_opacities, g_sh, g_centers, g_features, probe;
+  std::vector<S> g_means, g_quats, g_scales, g_viewmats, g_intrinsics, g_opacities, g_sh, g_centers, g_features, probe;
 };
 
 // The scene's arrays in the scalar type of the kernels, and the structs that point into them.
@@ -135,10 +135,12 @@ void backward(const Inputs<S>& in, const Entries& entries, const Cotangents& cot
     d.g_opacities[i % s.n] += g_seen[i] * d.compensations[i];
     g_compensations[i] = g_seen[i] * in.opacities[i % s.n];
   }
-  d.g_means.resize(3 * s.n), d.g_quats.resize(4 * s.n), d.g_scales.resize(3 * s.n), d.g_viewmats.resize(16 * s.views);
+  d.g_means.resize(3 * s.n), d.g_quats.resize(4 * s.n), d.g_scales.resize(3 * s.n);
+  d.g_viewmats.resize(16 * s.views), d.g_intrinsics.resize(9 * s.views);
   project_backward(in.views(), in.options(), d.radii.data(),
                    ProjectedGrads<S>{g_means2d.data(), g_depths.data(), g_factors.data(), g_compensations.data()},
-                   GaussianGrads<S>{d.g_means.data(), d.g_quats.data(), d.g_scales.data(), d.g_viewmats.data()});
+                   GaussianGrads<S>{d.g_means.data(), d.g_quats.data(), d.g_scales.data(), d.g_viewmats.data(),
+                                    d.g_intrinsics.data()});
   if (s.channels != 3) return;
   std::vector<S> by_direction(3 * s.n);
   d.g_sh.resize(s.sh.size()), d.g_centers.resize(3 * s.views);
@@ -218,6 +220,7 @@ void test_gradients(const Scene& s, const Cotangents& cotangents, const Drawn<do
   test("scales", &Scene::scales, d.g_scales), test("opacities", &Scene::opacities, d.g_opacities);
   Values g_viewmats = d.g_viewmats, viewmats = s.viewmats;
   expect_gradient("viewmats gradient", by(&Scene::viewmats), viewmats, g_viewmats, 1e-6, 1e-6, 16);
+  expect_gradient("intrinsics gradient", by(&Scene::intrinsics), s.intrinsics, d.g_intrinsics, 1e-6, 1e-6, 9);
   if (s.channels != 3) return test("features", &Scene::features, d.g_features);
   test("sh", &Scene::sh, d.g_sh), test("centers", &Scene::centers, d.g_centers);
 }
@@ -266,6 +269,7 @@ void test_threads(int64_t n, double size) {
   expect_same_bits("sh gradient" + on, one.g_sh, four.g_sh);
   expect_same_bits("centers gradient" + on, one.g_centers, four.g_centers);
   expect_same_bits("viewmats gradient" + on, one.g_viewmats, four.g_viewmats);
+  expect_same_bits("intrinsics gradient" + on, one.g_intrinsics, four.g_intrinsics);
   for (int k = 0; k < 4; ++k) expect_same_bits("tally" + on, one.tallies[k], four.tallies[k]);
 }
 

@@ -127,20 +127,20 @@ def _project_backward(
     size: list[int],
     limits: list[float],
     antialiased: bool,
-    with_viewmats: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    means, quats, scales, _, viewmats, _ = gaussians
+    with_cameras: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    means, quats, scales, _, viewmats, intrinsics = gaussians
     out = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means, quats, scales)]
-    g_viewmats = viewmats.new_zeros(viewmats.shape)
+    of_cameras = viewmats.new_zeros(viewmats.shape), intrinsics.new_zeros(intrinsics.shape)
     settings = _settings(size[0], size[1], limits, antialiased)
     core.project_backward(
         _arrays(*gaussians),
         settings,
         array(radii),
         tuple(array(g) for g in grads),
-        (*(array(x) for x in out), array(g_viewmats) if with_viewmats else None),
+        (*(array(x) for x in out), *(array(x) if with_cameras else None for x in of_cameras)),
     )
-    return out[0], out[1], out[2], g_viewmats
+    return out[0], out[1], out[2], *of_cameras
 
 
 def _fake_project_backward(
@@ -150,12 +150,12 @@ def _fake_project_backward(
     size: list[int],
     limits: list[float],
     antialiased: bool,
-    with_viewmats: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    g_means, g_quats, g_scales, g_viewmats = (
-        torch.empty_like(gaussians[i], memory_format=torch.contiguous_format) for i in (0, 1, 2, 4)
+    with_cameras: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    g_means, g_quats, g_scales, g_viewmats, g_intrinsics = (
+        torch.empty_like(gaussians[i], memory_format=torch.contiguous_format) for i in (0, 1, 2, 4, 5)
     )
-    return g_means, g_quats, g_scales, g_viewmats
+    return g_means, g_quats, g_scales, g_viewmats, g_intrinsics
 
 
 project_backward_op = register("project_backward", _project_backward, fake=_fake_project_backward)
@@ -171,12 +171,13 @@ def _backward(
     ctx: Any, g_means2d: Tensor, g_depths: Tensor, g_factors: Tensor, g_compensations: Tensor, _: Tensor | None
 ) -> tuple[Tensor | None, ...]:
     *gaussians, radii = ctx.saved_tensors
-    with_viewmats = ctx.needs_input_grad[4]
+    with_cameras = any(ctx.needs_input_grad[4:6])
     grads = [g_means2d, g_depths, g_factors, g_compensations]
-    *out, g_viewmats = project_backward_op(
-        gaussians, radii, grads, ctx.size, ctx.limits, ctx.antialiased, with_viewmats
+    *out, g_viewmats, g_intrinsics = project_backward_op(
+        gaussians, radii, grads, ctx.size, ctx.limits, ctx.antialiased, with_cameras
     )
-    return *out, None, g_viewmats if with_viewmats else None, None, None, None, None
+    of_cameras = (g_viewmats, g_intrinsics) if with_cameras else (None, None)
+    return *out, None, *of_cameras, None, None, None
 
 
 project_op = register("project", _project, fake=_fake_project, gradient=Gradient(_save, _backward))
@@ -192,7 +193,7 @@ def project(
 ) -> Projection:
     """Return the splats of the Gaussians in every camera (EWA splatting; Zwicker et al. 2001, Kerbl et al. 2023).
 
-    Differentiable in means, quats, scales and ``cameras.cam_from_world``.
+    Differentiable in means, quats, scales and cameras: poses, focal lengths and principal points.
 
     Args:
         means: (N, 3) world.

@@ -19,7 +19,7 @@ from dyngs.ops.projection import Projection, ProjectionOptions, project, project
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 OUTPUTS = ("means2d", "depths", "factors", "compensations")
-INPUTS = ("means", "quats", "scales", "cam_from_world")
+INPUTS = ("means", "quats", "scales", "cam_from_world", "intrinsics")
 DEFAULTS = ProjectionOptions()
 
 
@@ -82,8 +82,8 @@ def test_gradcheck() -> None:
     options = ProjectionOptions(alpha_min=0.0)
     leaves = random_scene(n=3, views=2).leaves()
 
-    def run(means: Tensor, quats: Tensor, scales: Tensor, poses: Tensor) -> tuple[Tensor, ...]:
-        p = splats(replace(leaves, means=means, quats=quats, scales=scales, cam_from_world=poses), options)
+    def run(*tensors: Tensor) -> tuple[Tensor, ...]:
+        p = splats(replace(leaves, **dict(zip(INPUTS, tensors, strict=True))), options)
         return p.means2d, p.depths, p.factors, p.compensations
 
     assert torch.autograd.gradcheck(run, [getattr(leaves, name) for name in INPUTS])
@@ -131,8 +131,8 @@ def test_no_gaussians() -> None:
     p = splats(empty)
     assert p.means2d.shape == (2, 0, 2)
     assert p.radii.dtype == torch.int32
-    assert [x.shape for x in slopes(empty)] == [(0, 3), (0, 4), (0, 3), (2, 4, 4)]
-    assert not slopes(empty)[3].any()
+    assert [x.shape for x in slopes(empty)] == [(0, 3), (0, 4), (0, 3), (2, 4, 4), (2, 3, 3)]
+    assert not any(x.any() for x in slopes(empty)[3:])
 
 
 def test_strided_inputs_equal_contiguous_ones(scene: Scene) -> None:
@@ -147,12 +147,13 @@ def test_strided_inputs_equal_contiguous_ones(scene: Scene) -> None:
     assert torch.equal(slopes(strided)[0], slopes(scene)[0])
 
 
-def test_gradient_of_the_camera_only(scene: Scene) -> None:
-    """Who optimises poses alone gets the same numbers."""
-    poses = scene.cam_from_world.clone().requires_grad_()
-    p = splats(replace(scene, cam_from_world=poses))
-    total = torch.stack([(getattr(p, name) * weights(getattr(p, name))).sum() for name in OUTPUTS]).sum()
-    assert torch.equal(torch.autograd.grad(total, poses)[0], slopes(scene)[3])
+@pytest.mark.parametrize("name", ["cam_from_world", "intrinsics"])
+def test_gradient_of_one_part_of_the_camera(name: str, scene: Scene) -> None:
+    """Who optimises poses or lenses alone gets the same numbers."""
+    part = getattr(scene, name).clone().requires_grad_()
+    p = splats(replace(scene, **{name: part}))
+    total = torch.stack([(getattr(p, x) * weights(getattr(p, x))).sum() for x in OUTPUTS]).sum()
+    assert torch.equal(torch.autograd.grad(total, part)[0], slopes(scene)[INPUTS.index(name)])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -238,11 +239,11 @@ def test_world_and_camera_moved_together_see_the_same(scene: Scene) -> None:
         assert relative_error(getattr(ours, name), getattr(truth, name)) < 1e-12, name
 
 
-@pytest.mark.parametrize("with_poses", [False, True])
-def test_opcheck(with_poses: bool, scene: Scene) -> None:
+@pytest.mark.parametrize("with_cameras", [False, True])
+def test_opcheck(with_cameras: bool, scene: Scene) -> None:
     leaves = scene.leaves()
-    poses = leaves.cam_from_world if with_poses else scene.cam_from_world
-    tensors = (leaves.means, leaves.quats, leaves.scales, scene.opacities, poses, scene.intrinsics)
+    cameras = leaves if with_cameras else scene
+    tensors = (leaves.means, leaves.quats, leaves.scales, scene.opacities, cameras.cam_from_world, cameras.intrinsics)
     args = (*tensors, list(scene.size), [0.3, 0.2, 1e10, 0.0, 0.0], False)
     torch.library.opcheck(project_op, args)
 
