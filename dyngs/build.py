@@ -74,6 +74,7 @@ from dyngs.training.background import (
     evaluation_background,
     measured_alpha_weight,
 )
+from dyngs.training.camera_refinement import CameraRefinement
 from dyngs.training.exposure import exposures_of
 from dyngs.training.limits import within_cap
 from dyngs.training.loop import Trainable
@@ -189,6 +190,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         priors=priors,
         robust=_robust(config, capture, pictures),
         exposures=exposures_of(config.train, pictures),
+        refinement=_refinement(config, pictures, extent),
     )
 
 
@@ -211,6 +213,15 @@ def _robust(config: Config, capture: Capture, pictures: PictureLoader) -> Robust
             return RobustMasks(pictures, cameras, config.train.steps)
         case _:
             return None
+
+
+def _refinement(config: Config, pictures: PictureLoader, size: float) -> CameraRefinement | None:
+    """Return the refinement of the training cameras, if it is asked for; ``pictures`` have corrected cameras then."""
+    if config.camera.refine != "always":
+        return None
+    refinement = CameraRefinement(pictures.views, size, config.train.steps)
+    pictures.corrected = refinement.corrections.applied
+    return refinement
 
 
 def restored_scene(checkpoint: Checkpoint, model: SceneModel) -> Scene:

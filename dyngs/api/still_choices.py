@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from statistics import fmean
 
-from dyngs.api import exposure_choice, robust_choice
+from dyngs.api import camera_choice, exposure_choice, robust_choice
 from dyngs.api.candidate import Candidate
 from dyngs.api.small_runs import FEWEST_VIEWS, hold_out_every, is_gain, trained
 from dyngs.config import Config, DynamicModel
@@ -19,7 +19,7 @@ from dyngs.training.trainer import Trainer
 
 STEPS, SHARE, FEWEST_STEPS = 1500, 0.2, 400
 """Steps of each small run; at most this share of the run's own. With fewer steps than these it says nothing."""
-CANDIDATES: tuple[Candidate, ...] = (exposure_choice.CANDIDATE, robust_choice.CANDIDATE)
+CANDIDATES: tuple[Candidate, ...] = (camera_choice.CANDIDATE, exposure_choice.CANDIDATE, robust_choice.CANDIDATE)
 
 
 def decided(config: Config) -> Config:

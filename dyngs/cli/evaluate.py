@@ -25,6 +25,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--split", choices=("test", "val", "train", "pose"), default="test", help="default test")
     parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
+    parser.add_argument(
+        "--refine-poses",
+        action="store_true",
+        help="also score from poses refined on the pictures themselves; always done after camera.refine",
+    )
     parser.set_defaults(run=run)
 
 
@@ -34,7 +39,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     from dyngs.evaluate.report import evaluate_run, report_path
 
-    report = evaluate_run(arguments.run_dir, arguments.split, lpips_net=arguments.lpips_net, threads=arguments.threads)
+    report = evaluate_run(
+        arguments.run_dir,
+        arguments.split,
+        lpips_net=arguments.lpips_net,
+        threads=arguments.threads,
+        refine_poses=arguments.refine_poses,
+    )
     Console().print(report_table(report))
     for note in report.notes:
         print(f"note: {note}")
@@ -52,6 +63,8 @@ def report_table(report: EvalReport) -> Table:
     if report.psnr_right is not None and report.psnr_right_fitted is not None:
         right = f"{report.psnr_right:.2f} dB; {report.psnr_right_fitted:.2f} dB with colours fitted on left halves"
         table.add_row("PSNR of right halves", right)
+    if report.psnr_own_poses is not None:
+        table.add_row("PSNR, poses refined on the pictures", f"{report.psnr_own_poses:.2f} dB")
     table.add_row("SSIM", f"{report.ssim:.4f}")
     if report.psnr_person is not None and report.ssim_person is not None:
         table.add_row("in the person's box", f"{report.psnr_person:.2f} dB, SSIM {report.ssim_person:.4f}")

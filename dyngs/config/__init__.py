@@ -1,6 +1,7 @@
 """The configuration of a run: typed keys (``keys``), YAML files and overrides (``io``), keys in words (``schema``)."""
 
 from dyngs.config.keys.budget import BudgetConfig
+from dyngs.config.keys.camera import CameraConfig
 from dyngs.config.keys.colour import AutoColour, ColourSection, NetworkColour, ShColour
 from dyngs.config.keys.config import Config
 from dyngs.config.keys.data import DataConfig
@@ -25,6 +26,7 @@ from dyngs.config.keys.train import TrainConfig
 __all__ = [
     "AutoColour",
     "BudgetConfig",
+    "CameraConfig",
     "ColourSection",
     "Config",
     "ControlNodesField",

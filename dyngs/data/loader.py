@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
@@ -138,6 +138,10 @@ class PictureLoader:
     Once the cache is full, what is in it stays: where every picture is asked for once per epoch, in a new order each
     time, the one used last is the one needed last. The same index always gives the same bytes, cached or not, decoded
     ahead or not. Safe to use from several threads. Tensors are on the CPU.
+
+    Attributes:
+        corrected: returns the camera of a picture, given the index of its view and its camera by the capture; None: the
+            latter.
     """
 
     def __init__(
@@ -169,6 +173,7 @@ class PictureLoader:
         self._small: dict[int, Picture] = {}
         self._small_by, self._small_bytes = 1, 0
         self._last_map: tuple[object, LensMap] | None = None
+        self.corrected: Callable[[int, Cameras], Cameras] | None = None
         self._lock = Lock()
         with pictures_up_to(options.max_megapixels):
             check_files(self._views)
@@ -192,6 +197,16 @@ class PictureLoader:
         Raises:
             DyngsError: the file turns out to be truncated, or its mask has another size.
         """
+        return self._with_camera(index, self._as_stored(index))
+
+    def _with_camera(self, index: int, picture: Picture) -> Picture:
+        """Return ``picture`` with its camera corrected."""
+        if self.corrected is None:
+            return picture
+        return replace(picture, cameras=self.corrected(index % len(self._views), picture.cameras))
+
+    def _as_stored(self, index: int) -> Picture:
+        """Return the picture of view ``index`` with the camera of the capture."""
         view = self._views[index]
         decoded = self._decoded(index % len(self._views))
         height, width = decoded.pixels.shape[:2]
@@ -225,14 +240,14 @@ class PictureLoader:
         index %= len(self._views)
         with self._lock:
             if index in self._small:
-                return self._small[index]
-        picture = self[index].shrunk(factor)
+                return self._with_camera(index, self._small[index])
+        picture = self._as_stored(index).shrunk(factor)
         with self._lock:
             is_new = index not in self._small and factor == self._small_by
             if is_new and self.cached_bytes + picture.num_bytes <= self._options.cache_mb * 1e6:
                 self._small[index] = picture
                 self._small_bytes += picture.num_bytes
-        return picture
+        return self._with_camera(index, picture)
 
     def expect(self, indices: Sequence[int]) -> None:
         """Begin to decode the pictures that are asked for next, in this order, as far as they are not cached."""

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import fmean, median
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ from dyngs.data.read import read_capture
 from dyngs.data.true_tracks import read_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.evaluate.half_fit import right_half_scores
+from dyngs.evaluate.own_poses import pictures_of_split, psnr_from_own_poses
 from dyngs.evaluate.regions import RegionName, Regions, RegionScores
 from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
@@ -104,6 +105,8 @@ class EvalReport:
         psnr_right, psnr_right_fitted: means of the PSNR of right halves, as the scene shows them, and after an affine
             colour fitted on left halves, see ``dyngs.evaluate.half_fit``; None where a half has no pixel that counts.
         track_error_px, track_within_5px, track_motion_px: see ``dyngs.evaluate.tracks``.
+        psnr_own_poses: PSNR from poses refined on the pictures themselves, see ``dyngs.evaluate.own_poses``; None where
+            that was not asked for.
     """
 
     split: str
@@ -144,13 +147,16 @@ class EvalReport:
     track_motion_px: float | None = None
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
+    psnr_own_poses: float | None = None
 
     def to_json(self) -> str:
         """Return the report as strict JSON (no NaN or Infinity), ending in a newline."""
         return json.dumps(asdict(self), indent=2, allow_nan=False) + "\n"
 
 
-def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "alex", threads: int = 0) -> EvalReport:
+def evaluate_run(
+    run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "alex", threads: int = 0, refine_poses: bool = False
+) -> EvalReport:
     """Return the report of a run on one split and write it into its folder: ``metrics.json``, ``metrics_SPLIT.json``.
 
     Args:
@@ -158,6 +164,8 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
         split: "test", "val" or "train".
         lpips_net: "alex", "vgg" or "squeeze".
         threads: for rendering and metrics; 0 leaves the number as it is.
+        refine_poses: also score from poses that were refined on the pictures themselves; always done for a run that
+            refined its cameras.
 
     Raises:
         DyngsError: no such run or split, unreadable pictures, a render or metric that is not finite, unwritable folder.
@@ -169,12 +177,14 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
     scene = scene_of_split(run, capture, split)
     drawing = Drawing(scene, render_options(run.config.model), colour)
     with _num_threads(threads):
-        loader = PictureLoader(views, run.config.data)
+        loader = pictures_of_split(views, split, run_dir, run)
         regions = Regions(views, loader, colour)
         pictures = (loader[i] for i in range(len(loader)))
         scores, reasons = score_views(scene, pictures, drawing.options, colour, load_lpips(lpips_net), regions)
         temporal = _temporal(drawing, loader, views)
         tracks = _track_scores(run, capture, scene, views)
+        asked = split != "train" and (refine_poses or run.config.camera.refine == "always")
+        own_poses = psnr_from_own_poses(drawing, loader, run.info.extent) if asked else None
     reasons |= {name: measured.reason for name, measured in temporal.items() if measured.reason is not None}
     report = EvalReport(
         split=split,
@@ -187,16 +197,8 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
         flip=_mean([s.flip for s in scores]),
         lpips=_mean([s.lpips for s in scores]),
         lpips_net=lpips_net,
-        num_gaussians=len(scene),
-        num_moving=0 if scene.is_still else scene.num_moving,
-        moving_share=scene.moving_share,
-        model_mb=parameter_megabytes(scene),
-        field_mb=4e-6 * scene.num_motion_values,
-        colour_floats=scene.num_colour_values / max(len(scene), 1),
         fps=1 / median(s.render_seconds for s in scores),
         deform_share=median(s.deform_seconds / s.render_seconds for s in scores),
-        seconds_train=run.seconds_train,
-        step=run.step,
         flicker=temporal["flicker"].value,
         flicker_error=temporal["flicker_error"].value,
         psnr_per_time=psnr_per_time((s.time, s.psnr) for s in scores),
@@ -205,11 +207,27 @@ def evaluate_run(run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "a
         per_view=tuple(scores),
         psnr_person=_mean([s.psnr_person for s in scores]),
         ssim_person=_mean([s.ssim_person for s in scores]),
-        stored_mb=1e-6 * (run_dir / SCENE_FILE).stat().st_size if has_only_scene_file(run_dir) else None,
+        psnr_own_poses=own_poses,
+        **_facts(run_dir, run, scene),
     )
     report = _with_parts(report, regions, tracks)
     write_text(report_path(run_dir, split), report.to_json())
     return report
+
+
+def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:
+    """Return the fields of a report that no picture is needed for."""
+    return {
+        "num_gaussians": len(scene),
+        "num_moving": 0 if scene.is_still else scene.num_moving,
+        "moving_share": scene.moving_share,
+        "model_mb": parameter_megabytes(scene),
+        "field_mb": 4e-6 * scene.num_motion_values,
+        "colour_floats": scene.num_colour_values / max(len(scene), 1),
+        "seconds_train": run.seconds_train,
+        "step": run.step,
+        "stored_mb": 1e-6 * (run_dir / SCENE_FILE).stat().st_size if has_only_scene_file(run_dir) else None,
+    }
 
 
 def _with_parts(report: EvalReport, regions: Regions, tracks: TrackScores) -> EvalReport:

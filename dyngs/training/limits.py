@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.config import Config, DeformField
+from dyngs.config import Config, DeformField, HumanModel, HumanPredictorModel
 from dyngs.config.kinds import added_for_motion, field_of, network_of, person_of, stored_sh_degree
 from dyngs.conventions import num_sh_terms
 from dyngs.deform.field import FieldSetup
@@ -26,7 +26,12 @@ FEWEST = 500
 
 
 def require_possible(config: Config) -> None:
-    """Raise DyngsError where limits of ``config`` contradict it or each other."""
+    """Raise DyngsError where limits or choices of ``config`` contradict it or each other."""
+    match config.model:
+        case HumanModel() | HumanPredictorModel() if config.camera.refine == "always":
+            raise DyngsError("camera.refine: cameras of people are not refined, their poses are; leave it out")
+        case _:
+            pass
     budget = config.budget
     given = [name for name, value in budget.model_dump().items() if value is not None]
     if given and network_of(config) is not None:

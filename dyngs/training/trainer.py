@@ -28,6 +28,7 @@ from dyngs.static.densify import Densifier
 from dyngs.static.fixed import FixedDensifier
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.training.background import AlphaWeight, background_colour
+from dyngs.training.camera_refinement import CameraRefinement, watched
 from dyngs.training.events import StepReport
 from dyngs.training.exposure import ViewExposures
 from dyngs.training.priors.used import StepView, UsedPriors
@@ -53,6 +54,7 @@ class Trainer:
         priors: what the user knows about the capture.
         robust: masks of what disagrees with the other views; None: all pixels count.
         exposures: affine colours of the training pictures; None: they agree.
+        refinement: of the cameras; None: they stay as the capture has them.
         done: steps done.
         bad_gradients: how often a Gaussian was left out of a step because its gradient was not finite.
         held_out: indices of the training views that are not trained on up to ``held_out_until``.
@@ -77,6 +79,7 @@ class Trainer:
     priors: UsedPriors = field(default_factory=UsedPriors)
     robust: RobustMasks | None = None
     exposures: ViewExposures | None = None
+    refinement: CameraRefinement | None = None
     done: int = 0
     bad_gradients: int = 0
     held_out: frozenset[int] = frozenset()
@@ -103,6 +106,8 @@ class Trainer:
         picture = self.pictures.shrunk(index, divisor)
         if self.pictures.decoded_ahead:
             self.pictures.expect(self.sampler.coming(self.pictures.decoded_ahead, wanted))
+        if self.refinement is not None:
+            picture = replace(picture, cameras=watched(picture.cameras))
         background = background_colour(self.background, self.generator)
         moment = self.training.moment(scene, picture, step)
         probe = (
@@ -141,6 +146,8 @@ class Trainer:
             self.densifier.after_backward(step, probe.grad / divisor, rendering.radii, size)
         if self.exposures is not None:
             self.bad_gradients += self.exposures.optimize(index, step)
+        if self.refinement is not None:
+            self.bad_gradients += self.refinement.optimize(step, index, picture.cameras)
         found = (self.alpha.finding if step == 1 else None, self._update(step))
         variant = self.training.variant(self.scene, step)
         if variant is not None:
@@ -168,6 +175,8 @@ class Trainer:
             state |= prefixed("robust", with_role(self.robust.state(), Role.TRAINING))
         if self.exposures is not None:
             state |= prefixed("exposures", with_role(self.exposures.state(), Role.TRAINING))
+        if self.refinement is not None:
+            state |= prefixed("cameras", with_role(self.refinement.state(), Role.TRAINING))
         return state | with_role({"rng": self.generator.get_state()}, Role.TRAINING)
 
     def checkpoint(self) -> Checkpoint:
@@ -198,6 +207,8 @@ class Trainer:
                     self.robust.load_state(checkpoint.part("robust"))
                 if self.exposures is not None:
                     self.exposures.load_state(checkpoint.part("exposures"))
+                if self.refinement is not None:
+                    self.refinement.load_state(checkpoint.part("cameras"))
                 self.generator.set_state(checkpoint.tensors["rng"])
             except KeyError as missing:
                 raise DyngsError(f"{checkpoint.name} lacks {missing}; {OTHER_CONFIG}") from None

@@ -25,6 +25,7 @@ from dyngs.config import (
     StaticModel,
     TrainConfig,
 )
+from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import checkpoint_paths
@@ -153,3 +154,10 @@ def test_the_lowest_limit_counts() -> None:
     assert most_gaussians(NOTHING, 0) is None
     assert most_gaussians(limited(max_gaussians=1000, max_mb=5.0), 0) == 1000
     assert most_gaussians(limited(max_gaussians=10**6, max_mb=5.0), 0) == room(NOTHING, 0, 5.0)
+
+
+@pytest.mark.parametrize("preset", ["human", "human_predictor"])
+def test_cameras_of_people_are_not_refined(preset: str) -> None:
+    config = load_config(packaged_preset(preset), ["data.root=capture", "camera.refine=always"])
+    with pytest.raises(DyngsError, match=r"camera\.refine: cameras of people are not refined"):
+        require_possible(config)

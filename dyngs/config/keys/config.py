@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from dyngs.config.keys.budget import BudgetConfig
+from dyngs.config.keys.camera import CameraConfig
 from dyngs.config.keys.colour import AutoColour, NetworkColour, ShColour
 from dyngs.config.keys.data import DataConfig
 from dyngs.config.keys.dynamic import DynamicModel
@@ -24,6 +25,7 @@ class Config(Section):
     """Everything that decides a run."""
 
     data: DataConfig
+    camera: CameraConfig = CameraConfig()
     model: Annotated[
         StaticModel | DynamicModel | HumanModel | HumanPredictorModel,
         Field(discriminator="kind", description="what is trained"),

@@ -10,7 +10,11 @@ import numpy as np
 
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry.poses import camera_center
+from dyngs.data.pictures.lens import is_pinhole, kept_share
 from dyngs.data.times import distinct_times
+
+MOST_LENSES = 20
+"""Different lenses that are looked at; more are not needed to tell how much is lost."""
 
 
 def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
@@ -28,7 +32,7 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         ("cameras", str(len({view.camera_id for view in views}))),
         ("focal length", f"{_range(focal_px)} px"),
         ("field of view", f"{_range(fov_deg)} degrees across"),
-        ("lens", counted(lenses)),
+        ("lens", counted(lenses) + _kept(views)),
         ("alpha", "transparent background" if capture.has_alpha else "none"),
         ("masks", _masks(views)),
         *_prior_facts(capture),
@@ -47,6 +51,16 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         )
         facts.append(("body", f"{next(iter(capture.body.values())).kind}, frames: {frames}"))
     return tuple(facts)
+
+
+def _kept(views: Sequence[View]) -> str:
+    """Return how much of the pictures is left after their lens distortion is removed; empty where there is none."""
+    lenses = {(view.lens, view.intrinsics.tobytes(), view.width, view.height): view for view in views}
+    distorted = [view for view in lenses.values() if not is_pinhole(view.lens)][:MOST_LENSES]
+    if not distorted:
+        return ""
+    shares = [100 * kept_share(view.lens, view.intrinsics, view.width, view.height) for view in distorted]
+    return f"; undistorted with the same focal length, which keeps {_range(shares)} % of each picture"
 
 
 def _masks(views: Sequence[View]) -> str:

@@ -13,6 +13,7 @@ from dyngs.data.capture import Lens
 _ROWS_PER_CHUNK = 256
 _ITERATIONS = 30
 _CLOSE_PX = 0.05
+_GRID = 64
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,23 @@ def undistorted_points(lens: Lens, intrinsics: np.ndarray, points: Tensor) -> Te
         found = found + (wanted - distort(lens, found))
     close = ((distort(lens, found) - wanted) * focal).norm(dim=-1, keepdim=True) < _CLOSE_PX
     return torch.where(close, found * focal + center, torch.nan).to(points.dtype)
+
+
+def kept_share(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> float:
+    """Return the share of the stored picture's pixels that the pinhole picture shows, found on a coarse grid.
+
+    The rest lies beyond its edges: a pinhole of the same focal length sees less than a lens that bulges.
+
+    Args:
+        intrinsics: (3, 3) camera matrix in pixels.
+    """
+    if is_pinhole(lens):
+        return 1.0
+    shares = (torch.arange(_GRID, dtype=torch.float64, device="cpu") + 0.5) / _GRID
+    size = shares.new_tensor([width, height])
+    points = torch.stack(torch.meshgrid(shares, shares, indexing="xy"), dim=-1) * size
+    found = undistorted_points(lens, intrinsics, points)
+    return float(((found >= 0) & (found <= size)).all(-1).double().mean())  # false for NaN
 
 
 def undistort_map(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> LensMap:

@@ -6,7 +6,7 @@ import torch
 
 from dyngs.data.capture import Lens
 from dyngs.data.geometry.intrinsics import pinhole_matrix
-from dyngs.data.pictures.lens import distort, is_pinhole, undistort, undistort_map
+from dyngs.data.pictures.lens import distort, is_pinhole, kept_share, undistort, undistort_map
 
 BARREL = Lens("opencv", (-0.2, 0.05, 0.002, -0.003))
 FISHEYE = Lens("fisheye", (0.05, -0.02, 0.003, 0.0))
@@ -91,3 +91,20 @@ def test_no_ghosts_where_the_polynomial_turns_back() -> None:
     assert bool(inside[32, 60])
     assert not bool(lens_map.valid[32, 60]), "r = 0.95"
     assert bool(lens_map.valid[32, 45]), "r = 0.45"
+
+
+def test_share_of_a_fisheye_picture_that_is_kept() -> None:
+    """Equidistant: a point at a distance r (in focal lengths) from the middle is seen at tan(r) by the pinhole."""
+    intrinsics = pinhole_matrix(200, 200, 200, 200)
+    share = kept_share(Lens("fisheye", (0.0, 0.0, 0.0, 0.0)), intrinsics, 400, 400)
+    x, y = np.meshgrid(*[(np.arange(1000) + 0.5) / 500 - 1] * 2)
+    r = np.hypot(x, y)
+    inside = (np.maximum(abs(x), abs(y)) * np.tan(r) / r <= 1) & (r < np.pi / 2)
+    assert share == pytest.approx(inside.mean(), abs=0.01)
+
+
+def test_lenses_that_keep_everything() -> None:
+    intrinsics = pinhole_matrix(200, 200, 200, 200)
+    assert kept_share(Lens(), intrinsics, 400, 400) == 1
+    assert kept_share(Lens("opencv", (0.1, 0, 0, 0)), intrinsics, 400, 400) == 1  # a cushion: the pinhole sees more
+    assert kept_share(Lens("opencv", (-0.1, 0, 0, 0)), intrinsics, 400, 400) < 1

@@ -1,0 +1,101 @@
+"""What wrong camera poses cost, and what their refinement (`camera.refine`) wins back.
+
+    python benchmarks/cameras.py FOLDER CAPTURE... [--preset static] [--seed 0] [--refine never,always,auto] [key=value]
+
+In a copy of each capture (those with transforms*.json) the cameras of all training pictures are turned by 0.5 degrees
+around a random axis and shifted in a random direction by 1 % of their mean distance from their middle; test cameras
+stay. The preset is trained on the capture as it is and on the copy, and scored on the test pictures: from their given
+poses, and from poses refined on the pictures themselves. FOLDER keeps copies and runs, which are reused.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import resource
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dyngs.api.train import train
+from dyngs.config import DataConfig
+from dyngs.config.io import load_config, packaged_preset
+from dyngs.data.read import read_capture
+from dyngs.evaluate.report import evaluate_run
+from dyngs.files.write import write_text
+from dyngs.ops.native import kernel_threads
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
+
+DEGREES, SHARE = 0.5, 0.01
+
+
+def disturb(capture: Path, out: Path, seed: int) -> None:
+    """Write a copy of ``capture`` whose training cameras are wrong."""
+    shutil.copytree(capture, out)
+    views = read_capture(DataConfig(root=out)).splits["train"]
+    centers = np.stack([np.linalg.inv(view.cam_from_world)[:3, 3] for view in views])
+    shift = SHARE * float(np.linalg.norm(centers - centers.mean(0), axis=1).mean())
+    trained_on, random = {view.image_path.resolve() for view in views}, np.random.default_rng(seed)
+    for path in sorted(out.glob("transforms*.json")):
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            named = (out / frame["file_path"]).resolve()
+            if named in trained_on or named.with_suffix(".png") in trained_on:
+                pose = np.asarray(frame["transform_matrix"], dtype=np.float64)
+                frame["transform_matrix"] = (pose @ _motion(random, shift)).tolist()
+        write_text(path, json.dumps(content))
+
+
+def _motion(random: np.random.Generator, shift: float) -> np.ndarray:
+    """Return a rigid transform (4, 4) by ``DEGREES`` and ``shift`` in random directions."""
+    axis, direction = (x / np.linalg.norm(x) for x in random.normal(size=(2, 3)))
+    cross = np.cross(np.eye(3), -axis)
+    motion, angle = np.eye(4), np.radians(DEGREES)
+    motion[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    motion[:3, 3] = shift * direction
+    return motion
+
+
+def row(root: Path, run: Path, preset: str, keys: Sequence[str]) -> str:
+    """Return the cells of a run, trained where it is not there."""
+    seconds = ""
+    if not checkpoint_paths(run):
+        begun = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+        train(load_config(packaged_preset(preset), [f"data.root={root}", f"run.dir={run}", *keys]))
+        seconds = f"{resource.getrusage(resource.RUSAGE_SELF).ru_utime - begun:.0f}"
+    report = evaluate_run(run, refine_poses=True)
+    used = load_run(run).config.camera.refine
+    return f"{used} | {report.psnr:.2f} | {report.psnr_own_poses:.2f} | {report.num_gaussians:,} | {seconds}"
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("words", nargs="+", help="captures, and key=value")
+    parser.add_argument("--preset", default="static")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--refine", default="never,always,auto")
+    parser.add_argument("--cameras", default="given,disturbed")
+    options = parser.parse_intermixed_args(words)
+    captures = [Path(word) for word in options.words if not re.match(r"[\w.]+=", word)]
+    keys = [word for word in options.words if re.match(r"[\w.]+=", word)]
+    print("| capture | cameras | camera.refine | used | PSNR | own poses | Gaussians | CPU s |\n|" + "---|" * 8)
+    with kernel_threads(torch.get_num_threads()):
+        for capture in captures:
+            copy = options.folder / f"{capture.name}_disturbed"
+            if not copy.exists():
+                disturb(capture, copy, options.seed)
+            for cameras in options.cameras.split(","):
+                root = copy if cameras == "disturbed" else capture
+                for refine in options.refine.split(","):
+                    run = options.folder / f"{capture.name}_{cameras}_{refine}"
+                    cells = row(root, run, options.preset, [f"camera.refine={refine}", *keys])
+                    print(f"| {capture.name} | {cameras} | {refine} | {cells} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""Whether the training cameras are refined: found by one or two small, short runs.
+
+Views held out have no refined cameras. So for each of them both models find the pose from which they look most like one
+half of the picture, and are compared on the other half. Where that helps the run without refinement little, the cameras
+are right, and a second run would not be worth its time.
+"""
+
+from __future__ import annotations
+
+from statistics import fmean
+
+import torch
+
+from dyngs.api.candidate import Candidate, Choice, Comparison, Evidence
+from dyngs.api.small_runs import drawn
+from dyngs.config import Config, DynamicModel, StaticModel
+from dyngs.metrics import psnr
+from dyngs.training.background import background_colour
+from dyngs.training.camera_fit import fitted_to_picture
+from dyngs.training.trainer import Trainer
+
+WRONG = 0.1
+"""Mean gain, dB, of views held out by a fitted pose from which the cameras may be wrong."""
+CLEAR_GAIN = 0.1
+"""Mean gain, dB, that refined training cameras must bring at least."""
+
+
+def evidence(plain: Trainer) -> Evidence:
+    """Return whether the cameras of a small run without refinement may be wrong."""
+    scores = [_scores(plain, index) for index in sorted(plain.held_out)]
+    gain = fmean(fitted - given for given, fitted in scores)
+    text = f"poses fitted on half of each of {len(scores)} pictures change the other half by {gain:+.2f} dB"
+    return Evidence(gain >= WRONG, text)
+
+
+def compared(one: Trainer, other: Trainer) -> Comparison:
+    """Compare two models on the views held out, each after the same fit."""
+    held_out = sorted(one.held_out)
+    return Comparison([(_scores(one, i)[1], _scores(other, i)[1]) for i in held_out])
+
+
+def _scores(trainer: Trainer, index: int) -> tuple[float, float]:
+    """Return PSNR, dB, of the right half of a view: from its own pose, and from one fitted on the left half."""
+    picture, background = trainer.pictures[index], background_colour(trainer.background)
+    left = torch.zeros_like(picture.rgb_premultiplied[..., 0])
+    left[:, : left.shape[1] // 2] = 1
+    right = 1 - left if picture.mask is None else (1 - left) * picture.mask
+    options = trainer.options
+    fitted = fitted_to_picture(trainer.scene, picture, background, trainer.extent, options=options, weights=left)
+    truth = picture.composite(background)
+    plain, moved = (psnr(drawn(trainer.scene, x, options, background), truth, right) for x in (picture, fitted))
+    return plain, moved
+
+
+def _asked(config: Config) -> bool:
+    match config.model:
+        case StaticModel() | DynamicModel():
+            return config.camera.refine == "auto"
+        case _:
+            return False
+
+
+def _decided(config: Config, choice: Choice) -> Config:
+    return config.model_copy(update={"camera": config.camera.model_copy(update={"refine": choice})})
+
+
+CANDIDATE = Candidate(
+    key="camera.refine",
+    does="with refined cameras",
+    asked=_asked,
+    decided=_decided,
+    compared=compared,
+    clear_gain=CLEAR_GAIN,
+    evidence=evidence,
+)

@@ -1,0 +1,60 @@
+"""The pose from which a scene looks most like a picture, found from one nearby (iNeRF, Yen-Chen et al. 2021)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from dyngs.data.loader import Picture
+from dyngs.ops.adam import adam_step_
+from dyngs.ops.loss import l1_ssim_loss
+from dyngs.rendering import RenderOptions
+from dyngs.scene import Scene
+from dyngs.training.camera_refinement import corrected, slopes, watched
+
+UPDATES = 60
+FIRST_RATE, LAST_RATE = 2e-3, 1e-4
+"""Learning rates, rad, and as a share of the scene's size; log-linear between."""
+SSIM_WEIGHT = 0.2
+
+
+def fitted_to_picture(
+    scene: Scene,
+    picture: Picture,
+    background: Tensor,
+    size: float,
+    *,
+    options: RenderOptions | None = None,
+    weights: Tensor | None = None,
+) -> Picture:
+    """Return ``picture`` with its camera moved to where the scene looks most like it; the lens stays.
+
+    Args:
+        scene: stays as it is.
+        picture: with a camera that is nearly right.
+        background: (3,) behind both.
+        size: of the scene, world units.
+        options: as in training; None: those of the scene.
+        weights: (H, W) weights of the pixels beside the picture's mask; None: 1.
+    """
+    options, truth = options or scene.options, picture.composite(background)
+    counts = picture.mask if weights is None or picture.mask is None else weights * picture.mask
+    counts = weights if counts is None else counts
+    correction = torch.zeros(1, 6, device="cpu")
+    first, second = torch.zeros_like(correction), torch.zeros_like(correction)
+    best, least = correction.clone(), float("inf")
+    for update in range(1, UPDATES + 1):
+        camera = watched(corrected(picture.cameras, correction[0], None, size))
+        with torch.enable_grad():
+            rendered = scene.render(camera, picture.time, options=options, background=background).rgb[0]
+            loss = l1_ssim_loss(rendered, truth, SSIM_WEIGHT, counts)
+            by_pose, by_intrinsics = torch.autograd.grad(loss, [camera.cam_from_world, camera.intrinsics])
+        if float(loss.detach()) < least:
+            best, least = correction.clone(), float(loss.detach())
+        rate = FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (update / UPDATES)
+        adam_step_(
+            correction, slopes(camera, by_pose, by_intrinsics, size)[0][None], first, second, lr=rate, step=update
+        )
+    return replace(picture, cameras=corrected(picture.cameras, best[0], None, size))

@@ -1,0 +1,41 @@
+"""Scores from poses refined on the pictures themselves, and training pictures with the cameras that training found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import dyngs
+from dyngs.data.read import read_capture
+from dyngs.evaluate.own_poses import pictures_of_split
+from dyngs.evaluate.report import evaluate_run
+from dyngs.runs.checkpoint import latest_checkpoint, load_run
+
+
+@pytest.fixture(scope="module", params=["always", "never"])
+def run(request: pytest.FixtureRequest, still: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    folder = tmp_path_factory.mktemp("runs") / request.param
+    keys = [f"data.root={still}", f"run.dir={folder}", "train.steps=30", "init.num_random=60", "run.threads=1"]
+    return dyngs.train(dyngs.load_config("static", [*keys, f"camera.refine={request.param}"])), request.param
+
+
+def test_the_second_figure_is_there_where_cameras_were_refined_or_it_is_asked_for(run: tuple[Path, str]) -> None:
+    folder, refine = run
+    report, asked = evaluate_run(folder), evaluate_run(folder, refine_poses=True)
+    assert (report.psnr_own_poses is not None) == (refine == "always")
+    assert asked.psnr_own_poses is not None
+    assert asked.psnr_own_poses > asked.psnr - 0.2  # its loss is not PSNR
+    assert asked.psnr == report.psnr
+    assert evaluate_run(folder, "train", refine_poses=True).psnr_own_poses is None
+
+
+def test_training_pictures_have_the_refined_cameras(run: tuple[Path, str]) -> None:
+    folder, refine = run
+    loaded = load_run(folder)
+    views = read_capture(loaded.config.data).splits["train"]
+    test, train = (pictures_of_split(views, split, folder, loaded)[0].cameras for split in ("test", "train"))
+    moved = float((train.cam_from_world - test.cam_from_world).abs().max())
+    assert (moved > 0) == (refine == "always")
+    if refine == "always":
+        assert bool(latest_checkpoint(folder).part("cameras")["poses"].any())
