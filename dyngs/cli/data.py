@@ -52,11 +52,23 @@ def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
         help="estimate camera poses of photos or a video",
         description="Estimate camera poses with COLMAP's structure from motion. OUT is a capture for `dyngs train`.",
     )
-    parser.add_argument("images", type=Path, metavar="IMAGES", help="folder of photos, or a video file")
+    parser.add_argument(
+        "images",
+        type=Path,
+        metavar="IMAGES",
+        help="folder of photos, a video file, or folder of videos that ran at once",
+    )
     parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
     parser.add_argument(
-        "--frames", type=int, default=100, metavar="N", help="number of frames to take from a video (default 100)"
+        "--frames", type=int, metavar="N", help="frames to take of a video (default 100; of each of several: up to 300)"
+    )
+    parser.add_argument(
+        "--start",
+        action="append",
+        default=[],
+        metavar="NAME=SECONDS",
+        help="when a video of several begins; once for each",
     )
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
     parser.add_argument("overrides", nargs="*", metavar="data.key=value", help="data.follow_links, data.max_megapixels")
@@ -135,11 +147,16 @@ def _data_section(overrides: list[str], capture_format: str = "auto") -> DataCon
 def run_sfm(arguments: argparse.Namespace) -> int:
     """Estimate poses and print the next commands."""
     from dyngs.data.prepare.sfm import SfmOptions, estimate_poses
+    from dyngs.data.prepare.unposed import is_several_videos
 
     limits = _data_section(arguments.overrides)
+    if is_several_videos(arguments.images):
+        return _run_sfm_of_videos(arguments, limits)
+    if arguments.start:
+        raise DyngsError(f"{arguments.images}: --start is for a folder of several videos")
     options = SfmOptions(
         matching=arguments.matching,
-        num_frames=arguments.frames,
+        num_frames=arguments.frames or SfmOptions.num_frames,
         num_threads=arguments.threads,
         follow_links=limits.follow_links,
         max_megapixels=limits.max_megapixels,
@@ -150,6 +167,45 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     print(f"next: dyngs data inspect {result.root} --picture cameras.png")
     print(f"      dyngs train configs/static.yaml data.root={result.root}")
     return 0
+
+
+def _run_sfm_of_videos(arguments: argparse.Namespace, limits: DataConfig) -> int:
+    """Estimate the poses of several cameras and print the next commands."""
+    from dyngs.data.prepare.several.estimate import VideosOptions, poses_of_videos
+
+    if arguments.matching != "auto":
+        raise DyngsError(
+            f"{arguments.images}: --matching is for one video or photos; cameras are compared in all pairs"
+        )
+    if arguments.frames is not None and arguments.frames < 2:
+        raise DyngsError("--frames must be at least 2")
+    options = VideosOptions(
+        num_moments=arguments.frames,
+        starts=_starts(arguments.start),
+        num_threads=arguments.threads,
+        follow_links=limits.follow_links,
+        max_megapixels=limits.max_megapixels,
+    )
+    with ProgressBar() as report:
+        result = poses_of_videos(arguments.images, arguments.out, options, report)
+    print(result.summary())
+    print(f"next: dyngs data inspect {result.root} --picture cameras.png")
+    print(f"      dyngs train configs/dynamic.yaml data.root={result.root}")
+    return 0
+
+
+def _starts(words: list[str]) -> dict[str, float] | None:
+    """Return the seconds of ``NAME=SECONDS``, None without any."""
+    starts: dict[str, float] = {}
+    for word in words:
+        name, _, seconds = word.rpartition("=")
+        try:
+            starts[name] = float(seconds)
+        except ValueError:
+            name = ""
+        if not name:
+            raise DyngsError(f"--start {word!r}: give the name of a video without its suffix and seconds, as cam01=0.5")
+    return starts or None
 
 
 def run_motion(arguments: argparse.Namespace) -> int:

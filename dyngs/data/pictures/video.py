@@ -89,7 +89,7 @@ def probe_video(path: Path) -> VideoInfo:
         raise _broken(path, 0, "it holds no picture")
     height, width = _turned_rgb(first).shape[:2]
     counted = hidden = 0
-    with _reading(path), _opened(path) as container:
+    with _reading(path), opened_video(path) as container:
         stream = container.streams.video[0]
         promised, fps = stream.frames, float(stream.average_rate or 0)
         try:
@@ -116,7 +116,7 @@ def frame_seconds(path: Path, num_frames: int) -> list[float]:
     from av.error import FFmpegError
 
     stamps: list[float] = []
-    with _reading(path), _opened(path) as container:
+    with _reading(path), opened_video(path) as container:
         stream = container.streams.video[0]
         fps = float(stream.average_rate or 0) or 30.0
         try:
@@ -143,7 +143,7 @@ def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterato
     index = 0
     with _reading(path):
         try:
-            with _opened(path) as container:
+            with opened_video(path) as container:
                 stream = container.streams.video[0]
                 stream.thread_type = threads
                 for frame in container.decode(stream):
@@ -158,8 +158,8 @@ def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterato
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[InputContainer]:
-    """Open the file, which must contain the video itself: playlists, which name other files, are refused.
+def opened_video(path: Path) -> Iterator[InputContainer]:
+    """Open the file for PyAV, which must contain the video itself: playlists, which name other files, are refused.
 
     Raises:
         DyngsError: no video in it, or one larger than ``data.max_megapixels``.

@@ -5,12 +5,15 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.pictures.video import VIDEO_SUFFIXES
+from dyngs.data.prepare.several.estimate import VideosOptions, poses_of_videos
+from dyngs.data.prepare.several.films import videos_in
+from dyngs.data.prepare.several.given import NAME as VIDEOS_FILE
 from dyngs.data.prepare.sfm import SfmOptions, estimate_poses, photos_below
 from dyngs.data.read import FORMATS
 from dyngs.errors import DyngsError, reading
@@ -39,31 +42,43 @@ def with_poses(
         report: is told how far structure from motion has come.
 
     Raises:
-        DyngsError: photos without times where they are needed, several videos, or poses that cannot be found.
+        DyngsError: photos without times where they are needed, several videos where nothing is to move, or poses that
+            cannot be found.
     """
     if not _is_unposed(data):
         return data
     source = data.root / "images" if (data.root / "images").is_dir() else data.root
-    if source.is_dir() and needs_times and data.times == "files":
+    videos = videos_in(source) if is_several_videos(source) else []
+    if videos and not needs_times:
+        raise DyngsError(
+            f"{source}: holds {len(videos)} videos, which a still scene cannot be made of; give `dyngs train dynamic "
+            f"data.root={source}`, or one video of a camera that moves"
+        )
+    if source.is_dir() and not videos and needs_times and data.times == "files":
         raise DyngsError(
             f"{source}: photos have no times, so nothing can move; give data.times=order if their names are in the "
             "order of time, a video, or train configs/static.yaml"
         )
-    folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{_digest(source)}"
+    files = [*videos, source / VIDEOS_FILE] if videos else [source] if source.is_file() else photos_below(source)
+    folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{_digest(source, files)}"
     if folder.is_dir():
         say(f"{source} has no poses; those of before are in {folder}")
+        return data.model_copy(update={"root": folder})
+    say(f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}")
+    if videos:
+        several = VideosOptions(follow_links=data.follow_links, max_megapixels=data.max_megapixels)
+        say(poses_of_videos(source, folder, several, report).summary())
     else:
-        say(f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}")
         options = SfmOptions(follow_links=data.follow_links, max_megapixels=data.max_megapixels)
         say(estimate_poses(source, folder, options, report).summary())
     return data.model_copy(update={"root": folder})
 
 
 def _is_unposed(data: DataConfig) -> bool:
-    """Whether ``data.root`` is a video, or a folder of photos that no reader of captures knows.
+    """Whether ``data.root`` is a video, or a folder of photos or of videos that no reader of captures knows.
 
     Raises:
-        DyngsError: a folder of several videos and nothing else: the poses of standing cameras are not estimated.
+        DyngsError: a folder of a single video: names it.
     """
     root = data.root
     if root.is_file():
@@ -73,27 +88,40 @@ def _is_unposed(data: DataConfig) -> bool:
     with reading(root, "choose another folder or change its permissions"):
         if any(format.recognise(root) for format in FORMATS):
             return False
-        if len(photos_below(root)) >= FEWEST_PHOTOS:
-            return True
-        videos = [path.name for path in sorted(root.iterdir()) if path.suffix.lower() in VIDEO_SUFFIXES]
-    if videos:
-        more = f" and {len(videos) - 1} more" if len(videos) > 1 else ""
-        raise DyngsError(
-            f"{root}: holds videos ({videos[0]}{more}) without poses; give one video as data.root, or the poses of "
-            "cameras that stand still in a cameras.json (docs/formats.md)"
-        )
-    return False
+    if _holds_photos(root):
+        return True
+    videos = videos_in(root)
+    if len(videos) == 1:
+        raise DyngsError(f"{root}: holds one video; give that: data.root={videos[0]}")
+    return bool(videos)
 
 
-def _digest(source: Path) -> str:
-    """Return 16 hexadecimal digits of a video's or of photos' names, sizes, beginnings and times of change."""
+def is_several_videos(source: Path) -> bool:
+    """Whether ``source`` is a folder of two videos or more, and not of photos."""
+    return source.is_dir() and not _holds_photos(source) and len(videos_in(source)) > 1
+
+
+def _holds_photos(folder: Path) -> bool:
+    with reading(folder, "choose another folder or change its permissions"):
+        return len(photos_below(folder)) >= FEWEST_PHOTOS
+
+
+def _digest(source: Path, files: Sequence[Path]) -> str:
+    """Return 16 hexadecimal digits of the names, sizes and times of change of files, and of the beginnings of videos.
+
+    Args:
+        source: the file, or a folder that holds all of them.
+        files: photos, or videos with what is known of them, which need not be there.
+    """
     digest = hashlib.sha256()
-    for path in [source] if source.is_file() else photos_below(source):
+    for path in files:
+        if path.name == VIDEOS_FILE and not path.is_file():
+            continue
         with reading(path):
             status = path.stat()
             digest.update(os.fsencode(path.relative_to(source.parent)))
             digest.update(f"{status.st_size} {status.st_mtime_ns}".encode())
-            if source.is_file():
+            if path.suffix.lower() in VIDEO_SUFFIXES:
                 with path.open("rb") as file:
                     digest.update(file.read(_SAMPLE_BYTES))
     return digest.hexdigest()[:16]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from dyngs.data.capture import Capture, Lens, PointCloud, View
+from dyngs.data.capture import Capture, Lens, PointCloud, Splits, View
 from dyngs.data.frame_seconds import read_seconds
 from dyngs.data.geometry.intrinsics import match_size, pinhole_matrix, rescale_warning
 from dyngs.data.geometry.poses import checked_pose, repair_warning
@@ -21,6 +21,9 @@ from dyngs.files.containment import inside
 if TYPE_CHECKING:
     import pycolmap
 
+TEST_LIST = "test.txt"
+"""Names of the pictures for testing, a line each, in the model's folder (as 3DGS has it)."""
+MAX_LIST_BYTES = 10_000_000
 MODEL_FOLDERS = ("sparse/0", "sparse", ".")
 _EXTENSIONS = (".bin", ".txt")
 # Number of focal lengths and the formula, per camera model. COLMAP orders the coefficients as OpenCV does.
@@ -55,7 +58,8 @@ def is_colmap(root: Path) -> bool:
 def read_colmap(root: Path) -> Capture:
     """Read a COLMAP model with pictures below ``images/``, and with ``masks/`` and ``times.json`` where they are.
 
-    All registered images become training views; distorted camera models are kept as ``View.lens``.
+    Registered images become training views, but for those that ``test.txt`` in the model's folder lists; distorted
+    camera models are kept as ``View.lens``.
 
     Raises:
         DyngsError: incomplete or inconsistent model files, no ``images`` folder, an unsupported camera model, pictures
@@ -88,13 +92,14 @@ def read_colmap(root: Path) -> Capture:
         second = seconds.get(image.name)
         views.append(View(name, path, pose, intrinsics, *size, lens, int(image.camera_id), mask_path=mask, time=second))
     warnings = repair_warning(repaired) + rescale_warning(rescaled) + _warnings(folder, model, views, bool(masks))
+    splits, notes = _splits(folder, [image.name for image in posed], views)
     return Capture(
         root,
         "colmap",
-        {"train": tuple(views)},
+        splits,
         _points(model),
         in_seconds=bool(seconds),
-        warnings=tuple(warnings),
+        warnings=(*warnings, *notes),
     )
 
 
@@ -135,6 +140,23 @@ def _load_model(folder: Path) -> pycolmap.Reconstruction:
     with reading(folder, "the COLMAP model is inconsistent; export it again"):
         (model.read_binary if extension == ".bin" else model.read_text)(str(folder))
     return model
+
+
+def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, list[str]]:
+    """Return the views, those listed in ``test.txt`` for testing, and warnings; ``names`` are those of the images."""
+    path = folder / TEST_LIST
+    if not path.is_file():
+        return {"train": tuple(views)}, []
+    with reading(path, "it must list names of pictures, a line each; repair or remove it"):
+        text = inside(path).read_bytes()[:MAX_LIST_BYTES].decode()
+    listed = {line.strip() for line in text.splitlines() if line.strip()}
+    test = tuple(view for name, view in zip(names, views, strict=True) if name in listed)
+    unknown = sorted(listed - set(names))
+    notes = [f"{path}: {len(unknown)} listed pictures have no pose, first {unknown[0]:.80}"] if unknown else []
+    if not test:
+        return {"train": tuple(views)}, notes
+    train = tuple(view for name, view in zip(names, views, strict=True) if name not in listed)
+    return {"train": train, "test": test}, notes
 
 
 def _find_masks(folder: Path) -> dict[str, Path]:

@@ -10,6 +10,7 @@ from tiny_captures import write_colmap
 
 from dyngs.config import DataConfig
 from dyngs.data.prepare import unposed
+from dyngs.data.prepare.several.estimate import VideosOptions, VideosResult
 from dyngs.data.prepare.sfm import SfmOptions, SfmResult
 from dyngs.data.prepare.unposed import with_poses
 from dyngs.errors import DyngsError
@@ -28,13 +29,26 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         write_colmap(out)
         return SfmResult(out, 3, 3, (), 8, 0.5)
 
+    def several(source: Path, out: Path, options: VideosOptions, report: object) -> VideosResult:
+        sources.append(source)
+        write_colmap(out)
+        return VideosResult(out, ())
+
     monkeypatch.setattr(unposed, "estimate_poses", estimate)
+    monkeypatch.setattr(unposed, "poses_of_videos", several)
     return sources
 
 
 def _photos(folder: Path, count: int = 3) -> Path:
     for i in range(count):
         write_image(folder / f"photo_{i}.png", np.full((4, 6, 3), i, np.uint8))
+    return folder
+
+
+def _videos(folder: Path, count: int) -> Path:
+    folder.mkdir()
+    for i in range(count):
+        (folder / f"cam{i}.mp4").write_bytes(b"")
     return folder
 
 
@@ -68,6 +82,15 @@ def test_a_video_gets_poses_and_has_times(tmp_path: Path, asked: list[Path]) -> 
     assert asked == [tmp_path / "clip.mp4"]
 
 
+def test_several_videos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:
+    data = DataConfig(root=_videos(tmp_path / "rig", 2))
+    first = with_poses(data, needs_times=True, say=lambda _: None)
+    assert with_poses(data, needs_times=True, say=lambda _: None) == first
+    assert asked == [tmp_path / "rig"]
+    (tmp_path / "rig" / "videos.json").write_text('{"starts": 0}')
+    assert with_poses(data, needs_times=True, say=lambda _: None).root != first.root, "offsets are given now"
+
+
 def test_captures_and_other_folders_stay_as_they_are(tmp_path: Path, asked: list[Path]) -> None:
     write_colmap(tmp_path / "capture")
     (tmp_path / "empty").mkdir()
@@ -86,11 +109,10 @@ def test_what_cannot_work_is_said_before_poses_are_estimated(tmp_path: Path, ask
     photos = DataConfig(root=_photos(tmp_path / "photos"))
     with pytest.raises(DyngsError, match=r"no times.*data\.times=order"):
         with_poses(photos, needs_times=True)
-    (tmp_path / "rig").mkdir()
-    for name in ("cam0.mp4", "cam1.mp4"):
-        (tmp_path / "rig" / name).write_bytes(b"")
-    with pytest.raises(DyngsError, match=r"cam0\.mp4 and 1 more.*cameras\.json"):
-        with_poses(DataConfig(root=tmp_path / "rig"))
+    with pytest.raises(DyngsError, match=r"2 videos.*dyngs train dynamic"):
+        with_poses(DataConfig(root=_videos(tmp_path / "rig", 2)))
+    with pytest.raises(DyngsError, match=r"one video; give that: data\.root=.*cam0\.mp4"):
+        with_poses(DataConfig(root=_videos(tmp_path / "single", 1)), needs_times=True)
     assert asked == []
     ordered = photos.model_copy(update={"times": "order"})
     assert with_poses(ordered, needs_times=True, say=lambda _: None).root != photos.root

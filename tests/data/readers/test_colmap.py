@@ -12,7 +12,7 @@ from tiny_captures import opengl_pose, random_pixels, write_colmap, write_pictur
 from dyngs.config import DataConfig
 from dyngs.data.pictures.lens import distort
 from dyngs.data.read import read_capture
-from dyngs.data.readers.colmap import is_colmap, pinhole_and_lens, read_colmap
+from dyngs.data.readers.colmap import find_model, is_colmap, pinhole_and_lens, read_colmap
 from dyngs.data.readers.shared.colmap_check import check_model_file
 from dyngs.errors import DyngsError
 
@@ -207,3 +207,16 @@ def test_counts_that_no_file_has(colmap_root: Path, name: str) -> None:
         path.write_bytes(struct.pack("<Q", count) + data[8:])
         with pytest.raises(DyngsError, match=rf"{name}\.bin: the COLMAP file is truncated"):
             read_colmap(colmap_root)
+
+
+def test_listed_pictures_are_for_testing(tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    images = tmp_path / "images"
+    names = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
+    model = find_model(tmp_path)
+    assert model is not None
+    (model / "test.txt").write_text(f"{names[1]}\n\nnowhere.png\n")
+    capture = read_capture(tmp_path)
+    assert [view.image_path for view in capture.splits["test"]] == [images / names[1]]
+    assert len(capture.splits["train"]) == len(names) - 1
+    assert any("1 listed pictures have no pose, first nowhere.png" in line for line in capture.warnings)

@@ -1,0 +1,118 @@
+"""One capture of several videos: pictures, a COLMAP model with a pose for each, and their seconds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dyngs.conventions import ReportProgress
+from dyngs.data.frame_seconds import write_seconds
+from dyngs.data.pictures.video import read_numbered_frames
+from dyngs.data.prepare.several.films import Film
+from dyngs.data.prepare.several.given import NAME
+from dyngs.data.prepare.several.moments import Taken
+from dyngs.data.prepare.several.standing_poses import camera_name
+from dyngs.data.readers.colmap import TEST_LIST
+from dyngs.files.write import write_image, write_text
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+def write_pictures(
+    root: Path, films: Sequence[Film], taken: Sequence[Taken], report: ReportProgress
+) -> list[list[str]]:
+    """Write the frames as ``root/images/CAMERA/frame_NNNNN.png``; return their names below ``images`` by camera.
+
+    Raises:
+        DyngsError: damage in a video, or the folder cannot be written.
+    """
+    total, done = sum(len(frames.numbers) for frames in taken), 0
+    names: list[list[str]] = []
+    for film, frames in zip(films, taken, strict=True):
+        own = []
+        for number, rgb in read_numbered_frames(film.path, [int(number) for number in frames.numbers]):
+            own.append(f"{film.name}/frame_{number:05d}.png")
+            write_image(root / "images" / own[-1], rgb)
+            done += 1
+            report("frames of the videos", done, total)
+        names.append(own)
+    return names
+
+
+def write_model(
+    root: Path, films: Sequence[Film], names: Sequence[Sequence[str]], standing: pycolmap.Reconstruction
+) -> None:
+    """Write ``root/sparse/0``: a lens for each camera, its one pose for all its pictures, and the points.
+
+    The first picture of each camera has the observations of the points.
+
+    Args:
+        root: the capture.
+        films: the videos.
+        names: pictures of each.
+        standing: poses, one image for each camera.
+    """
+    import pycolmap
+
+    whole = pycolmap.Reconstruction()
+    posed = {camera_name(image): image for image in standing.images.values() if image.has_pose}
+    first_ids: dict[int, int] = {}
+    image_id = 0
+    for number, (film, own) in enumerate(zip(films, names, strict=True)):
+        image = posed[film.name]
+        lens = standing.cameras[image.camera_id]
+        camera = pycolmap.Camera(
+            camera_id=number + 1, model=lens.model, width=lens.width, height=lens.height, params=lens.params
+        )
+        whole.add_camera_with_trivial_rig(camera)
+        places = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
+        for place, name in enumerate(own):
+            image_id += 1
+            seen = places if place == 0 else np.zeros((0, 2))
+            new = pycolmap.Image(name=name, keypoints=seen, camera_id=number + 1, image_id=image_id)
+            whole.add_image_with_trivial_frame(new, image.cam_from_world())
+        first_ids[image.image_id] = image_id - len(own) + 1
+    for number in sorted(standing.points3D):
+        point = standing.points3D[number]
+        track = pycolmap.Track()
+        for element in point.track.elements:
+            if element.image_id in first_ids:
+                track.add_element(first_ids[element.image_id], element.point2D_idx)
+        whole.add_point3D(point.xyz, track, point.color)
+    whole.update_point_3d_errors()
+    folder = root / "sparse" / "0"
+    folder.mkdir(parents=True)
+    whole.write(folder)
+
+
+def write_facts(
+    root: Path, films: Sequence[Film], taken: Sequence[Taken], names: Sequence[Sequence[str]], test: Sequence[str]
+) -> None:
+    """Write the seconds of the pictures, which of them are for testing, and when each video begins.
+
+    Args:
+        root: the capture.
+        films: the videos.
+        taken: their frames.
+        names: pictures of each.
+        test: cameras that are held out.
+    """
+    pictures = [
+        (name, second)
+        for own, frames in zip(names, taken, strict=True)
+        for name, second in zip(own, frames.seconds, strict=True)
+    ]
+    write_seconds(root, {name: round(float(second), 6) for name, second in pictures})
+    held_out = [name for film, own in zip(films, names, strict=True) if film.name in test for name in own]
+    if held_out:
+        write_text(root / "sparse" / "0" / TEST_LIST, "".join(f"{name}\n" for name in held_out))
+    starts = {
+        film.name: round(float(frames.seconds[0] - film.seconds[frames.numbers[0]]), 6)
+        for film, frames in zip(films, taken, strict=True)
+    }
+    write_text(root / NAME, json.dumps({"starts": starts, "test": list(test)}, indent=1) + "\n")
