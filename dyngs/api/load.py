@@ -7,6 +7,7 @@ from pathlib import Path
 from dyngs.errors import DyngsError
 from dyngs.export.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.export.avatar import read_avatar
+from dyngs.files.wrong_place import command_for
 from dyngs.runs.checkpoint import SCENE_FILE, load_run
 from dyngs.scene import Scene
 from dyngs.splats.formats import all_suffixes, known_format, read_splats
@@ -38,6 +39,7 @@ def load(path: Path | str) -> Scene:
         return read_avatar(path).scene
     if known_format(path) is None:
         known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()})"
-        raise DyngsError(f"{path}: not a scene; give {known}")
+        other = command_for(path)
+        raise DyngsError(f"{path}: not a scene; {f'{other}; then ' if other else ''}give {known}")
     splat = read_splats(path)
     return StaticScene(gaussians=splat.gaussians, options=splat_options(splat))

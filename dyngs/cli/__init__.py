@@ -47,6 +47,8 @@ _OUT_OF_MEMORY = "out of memory; use smaller pictures (data.longest_side) or a s
 _TORCH_OUT_OF_MEMORY = "DefaultCPUAllocator: can't allocate memory"
 _RENAMED = {"compact": "prune"}
 """Commands of earlier versions and what they are called now."""
+_OF_DATA = ("inspect", "sfm", "motion", "synth")
+"""Commands of ``dyngs data``."""
 _OVERRIDE = re.compile(r"[a-z]\w*(\.\w+)+=.*", re.DOTALL)
 
 
@@ -93,6 +95,8 @@ def _dispatch(arguments: list[str]) -> int:
     if arguments and arguments[0] in _RENAMED:
         new = _RENAMED[arguments[0]]
         raise DyngsError(f"the command {arguments[0]!r} is called {new!r} now: run `dyngs {new}` with the same options")
+    if arguments and arguments[0] in _OF_DATA:
+        raise DyngsError(f"the command {arguments[0]!r} belongs to data: run `dyngs data {arguments[0]}`")
     parser = make_parser()
     try:
         parsed = _parsed(parser, arguments)

@@ -33,10 +33,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def _add_inspect(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "inspect",
-        help="report what a capture holds and what is suspicious about it",
-        description="Report views, sizes, intrinsics, times, points, masks, and everything suspicious.",
+        help="report what a capture or a video holds and what is suspicious about it",
+        description="Report views, sizes, intrinsics, times, points, masks, and everything suspicious. Of videos "
+        "without poses: size, rate, length, sound, sharpness, motion, and what to run next.",
     )
-    parser.add_argument("path", type=Path, metavar="PATH", help="capture folder")
+    parser.add_argument("path", type=Path, metavar="PATH", help="capture folder, video file, or folder of videos")
     parser.add_argument(
         "overrides", nargs="*", metavar="data.key=value", help="keys of data, such as data.follow_links=true"
     )
@@ -116,7 +117,10 @@ def _add_synth(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Print a report on a capture, and draw it if asked to."""
     from dyngs.data.inspection.report import format_report, inspect_capture
+    from dyngs.data.prepare.unposed import is_videos
 
+    if is_videos(arguments.path):
+        return _inspect_videos(arguments)
     options = _data_section(arguments.overrides, arguments.format).model_copy(update={"root": arguments.path})
     report = inspect_capture(options, arguments.deep)
     if report.capture is None:
@@ -129,6 +133,18 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
         draw_cameras(report.capture, arguments.picture)
         print(f"written: {arguments.picture}")
+    return 0
+
+
+def _inspect_videos(arguments: argparse.Namespace) -> int:
+    """Print a report on a video, or a folder of videos, without poses."""
+    from dyngs.data.inspection.video_report import video_report
+    from dyngs.files.containment import pictures_up_to
+
+    if arguments.picture is not None:
+        raise DyngsError(f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first")
+    with pictures_up_to(_data_section(arguments.overrides).max_megapixels):
+        print(video_report(arguments.path))
     return 0
 
 

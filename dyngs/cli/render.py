@@ -17,6 +17,7 @@ from dyngs.cli.arguments import (
 )
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import DyngsError
+from dyngs.files.wrong_place import command_for
 
 if TYPE_CHECKING:
     from dyngs.output.render_job import RenderJob
@@ -121,6 +122,9 @@ def _checked(arguments: argparse.Namespace) -> argparse.Namespace:
     Raises:
         DyngsError: nothing to render, nowhere to write, or an option that does not apply.
     """
+    known = command_for(arguments.source)
+    if known is not None and not (arguments.source / "config.yaml").is_file():
+        raise DyngsError(f"{arguments.source}: nothing that can be drawn; {known}")
     arguments.source = run_of_scene_file(arguments.source)
     is_file = arguments.source.is_file()
     if is_file and arguments.split:

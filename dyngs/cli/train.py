@@ -94,9 +94,14 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
 def _with_poses(config: Config) -> Config:
     """Return the configuration with poses for photos or a video; people need a capture with body parameters."""
     from dyngs.config.kinds import field_of, network_of, person_of
-    from dyngs.data.prepare.unposed import with_poses
+    from dyngs.data.prepare.unposed import is_unposed, with_poses
 
     if network_of(config) is not None or person_of(config) is not None:
+        if is_unposed(config.data):
+            raise DyngsError(
+                f"{config.data.root}: a person needs a capture with body parameters (docs/human.md); of photos or "
+                f"videos alone a scene can be made: `dyngs train static data.root={config.data.root}`, or dynamic"
+            )
         return config
     with ProgressBar() as report:
         data = with_poses(config.data, needs_times=field_of(config) is not None, report=report)
@@ -139,6 +144,9 @@ def parse_config(words: Sequence[str], resume: Path | None) -> Config:
 
     has_preset = bool(words) and "=" not in words[0]
     preset, overrides = (Path(words[0]), words[1:]) if has_preset else (None, words)
+    paths = [word for word in overrides if "=" not in word and Path(word).exists()]
+    if paths:
+        raise DyngsError(f"{paths[0]!r}: a capture, photos or a video are given as data.root={paths[0]}")
     if resume is None:
         if not words:
             raise DyngsError("give a config, for instance `dyngs train configs/static.yaml data.root=FOLDER`")

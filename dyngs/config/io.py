@@ -32,6 +32,7 @@ from dyngs.config.schema import (
 from dyngs.config.yaml_reader import Leaf, read_file, read_override, require_usable
 from dyngs.errors import DyngsError, printable
 from dyngs.files.write import write_text
+from dyngs.files.wrong_place import command_for
 
 RESOLVED_NAME = "config.yaml"
 """Name of the resolved configuration inside a run folder."""
@@ -84,8 +85,11 @@ def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
     file = path / RESOLVED_NAME if path.is_dir() else path
     if not file.is_file():
         raise DyngsError(
-            f"{path}: not a run folder (no {RESOLVED_NAME} there); give the folder that `dyngs train` wrote"
+            f"{path}: not a run folder (no {RESOLVED_NAME} there); {_instead(path)}give the folder that `dyngs train` "
+            "wrote"
         )
+    if file == path and command_for(path):
+        raise DyngsError(f"{path}: not a run folder; {command_for(path)}")
     layers = _Layers()
     layers.add(present(read_file(file)))
     if not layers.tree.get("data"):
@@ -109,18 +113,38 @@ def find_preset(path: Path) -> Path:
     Only a bare name or one below ``configs/`` is looked for in the package, so that a mistyped path of the user's own
     is an error. In a source checkout the package's presets are those in the repository's ``configs``.
     """
-    if path.is_file():
+    if path.is_file() and command_for(path) is None:
         return path
     packaged = packaged_presets()
     if path.parent.name in ("", "configs") and path.suffix in ("", ".yaml", ".yml") and path.stem in packaged:
         return packaged[path.stem]
+    found = command_for(path)
+    if found is not None:
+        raise DyngsError(f"{path}: no configuration; {found}")
     if path.exists() and not path.is_dir():
         raise DyngsError(f"{path}: not a regular file; give a YAML preset")
     if path.stem in PRESETS:
         raise DyngsError(f"{path}: this preset is called {PRESETS[path.stem]} now; write that")
-    close = get_close_matches(path.stem, packaged, n=1)
+    close = _close_presets(path.stem, packaged)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
     raise DyngsError(f"{path}: no such preset{hint}; the packaged ones are {', '.join(sorted(packaged))}")
+
+
+def _close_presets(name: str, packaged: Iterable[str]) -> list[str]:
+    """Return the packaged preset that is meant by another name, if one is."""
+    usual = {"3dgs": "static", "gaussian": "static", "splat": "static", "photos": "static"}
+    usual |= {"4dgs": "dynamic", "video": "dynamic", "avatar": "human", "body": "human"}
+    names = sorted(packaged)
+    within = [preset for preset in names if len(name) > 2 and name.lower() in preset]
+    return [usual[name.lower()]] if name.lower() in usual else get_close_matches(name, names, n=1) or within[:1]
+
+
+def _instead(path: Path) -> str:
+    """Return what ``path`` is if it is no run, and the command for it, to be followed by more; may be empty."""
+    if path.stem in _packaged_presets() and not path.is_dir():
+        return f"it is a configuration, for `dyngs train {path} data.root=FOLDER`; "
+    found = command_for(path)
+    return f"{found}; then " if found else ""
 
 
 def packaged_preset(name: str) -> Path:

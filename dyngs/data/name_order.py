@@ -14,7 +14,7 @@ from dyngs.errors import DyngsError
 _NUMBERS = re.compile(r"(\d+)")
 
 
-def times_by_name(root: Path, splits: Splits) -> tuple[Splits, str]:
+def times_by_name(root: Path, splits: Splits, per_second: float | None = None) -> tuple[Splits, str]:
     """Return the views with times by their names, and a line that says how.
 
     Where the name of every picture ends in a number, and no two of a camera in the same, that number is the time:
@@ -25,6 +25,7 @@ def times_by_name(root: Path, splits: Splits) -> tuple[Splits, str]:
     Args:
         root: the capture, for messages.
         splits: views; times that they have are replaced.
+        per_second: numbers, or places in the order, in a second: times become seconds; None leaves them as they are.
 
     Raises:
         DyngsError: fewer than two pictures, or folders with different numbers of pictures and names without numbers.
@@ -39,7 +40,7 @@ def times_by_name(root: Path, splits: Splits) -> tuple[Splits, str]:
     if all(_all_differ([numbers[view.name] for view in seen]) for seen in folders.values()):
         times = {name: float(number or 0) for name, number in numbers.items()}
         line = f"times are the numbers in the names of the pictures, from {min(times.values()):g} to "
-        line += f"{max(times.values()):g} (data.times=order)"
+        line += f"{max(times.values()):g} (data.times=order{_in_seconds(times, per_second)})"
     else:
         lengths = {len(seen) for seen in folders.values()}
         if len(lengths) > 1:
@@ -49,11 +50,20 @@ def times_by_name(root: Path, splits: Splits) -> tuple[Splits, str]:
             )
         orders = [sorted(seen, key=lambda view: _natural(view.image_path.name)) for seen in folders.values()]
         times = {view.name: float(place) for order in orders for place, view in enumerate(order)}
-        line = f"times are the order of the names, {orders[0][0].name} first (data.times=order)"
+        line = f"times are the order of the names, {orders[0][0].name} first (data.times=order"
+        line += f"{_in_seconds(times, per_second)})"
     timed: Splits = {
-        split: tuple(replace(view, time=times[view.name]) for view in kept) for split, kept in splits.items()
+        split: tuple(replace(view, time=times[view.name] / (per_second or 1.0)) for view in kept)
+        for split, kept in splits.items()
     }
     return timed, line
+
+
+def _in_seconds(times: dict[str, float], per_second: float | None) -> str:
+    if per_second is None:
+        return ""
+    length = (max(times.values()) - min(times.values())) / per_second
+    return f" at {per_second:g} per second: {length:.4g} s"
 
 
 def _last_number(stem: str) -> int | None:

@@ -31,6 +31,7 @@ from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.times import clip_seconds, sequence_warnings, span_in_files, still_if_constant, unit_times
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside, pictures_up_to, staying_within
+from dyngs.files.wrong_place import command_for
 
 FARTHEST = 1e18
 """Points with larger coordinates are dropped as mistakes; their squares would not fit into float32."""
@@ -107,6 +108,9 @@ def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFo
     """The format that ``options.format`` names, with "auto" the first one that was ``found`` in the folder."""
     if options.format == "auto":
         if not found:
+            known = command_for(options.root, captures=False)
+            if known is not None:
+                raise DyngsError(f"{options.root}: no capture found; {known}")
             wanted = "; ".join(f"{format.name}: {format.files}" for format in FORMATS)
             raise DyngsError(f"{options.root}: no capture found; looked for {wanted}")
         return found[0]
@@ -123,9 +127,14 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         raise DyngsError(f"{capture.root}: the {capture.format} capture has no training views; add posed pictures")
     new_poses = splits.pop("pose", None)
     by_name: list[str] = []
+    rate = options.frames_per_second
     if options.times == "order":
-        splits, line = times_by_name(capture.root, splits)
-        by_name, capture = [line], replace(capture, in_seconds=False)
+        splits, line = times_by_name(capture.root, splits, rate)
+        by_name, capture = [line], replace(capture, in_seconds=rate is not None, fps=rate or capture.fps)
+    elif rate is not None:
+        raise DyngsError(
+            f"{capture.root}: data.frames_per_second={rate:g} needs data.times=order, which takes times from the names"
+        )
     written = splits
     splits, notes = _timed(capture, splits, options.frames)
     span = span_in_files(written, splits)

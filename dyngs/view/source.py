@@ -9,6 +9,7 @@ from pathlib import Path
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.config.kinds import network_of
 from dyngs.errors import DyngsError
+from dyngs.files.wrong_place import command_for
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.view.network import PeopleNetwork, open_network
 from dyngs.view.viewed import Viewed, load_viewed
@@ -56,7 +57,9 @@ def open_source(path: Path, up: str | None = None, capture: Path | None = None) 
         return Source((name,), lambda _: load_viewed(path, up))
     runs = {run.relative_to(path).as_posix(): run for run in runs_in(path)}
     if not runs:
-        raise DyngsError(f"{path}: no runs there; give a run, a file, or a folder of runs")
+        known = command_for(path)
+        instead = f"{known}; then " if known else ""
+        raise DyngsError(f"{path}: no runs there; {instead}give a run, a file, or a folder of runs")
     return Source(tuple(runs), lambda name: replace(load_viewed(runs[name], up), name=name))
 
 

@@ -45,6 +45,13 @@ def test_the_same_number_twice_is_no_time() -> None:
     assert _times("a_1", "b_1", "c_1")[0] == {"a_1": 0, "b_1": 1, "c_1": 2}
 
 
+def test_a_frame_rate_makes_seconds_of_numbers() -> None:
+    splits: Splits = {"train": _views("frame_10", "frame_25", "frame_60")}
+    timed, line = times_by_name(ROOT, splits, 25.0)
+    assert [view.time for view in timed["train"]] == [0.4, 1.0, 2.4]
+    assert "data.times=order at 25 per second: 2 s" in line
+
+
 @pytest.mark.parametrize("names", [("one",), ("left/a", "left/b", "right/a")])
 def test_what_has_no_order_is_one_line(names: tuple[str, ...]) -> None:
     with pytest.raises(DyngsError, match=r"data\.times=order"):

@@ -223,6 +223,20 @@ def test_one_time_for_all_is_a_still_scene(blender_root: Path) -> None:
     assert capture.warnings == ("all pictures have time 0.5: treated as a still scene",)
 
 
+def test_seconds_of_numbered_pictures(tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    ordered = DataConfig(root=tmp_path, times="order", frames_per_second=10)
+    capture = read_capture(ordered)
+    assert capture.in_seconds
+    assert capture.span is not None
+    assert capture.seconds == pytest.approx(capture.span[1] - capture.span[0])
+    plain = read_capture(ordered.model_copy(update={"frames_per_second": None}))
+    assert plain.span is not None
+    assert capture.span == pytest.approx(np.array(plain.span) / 10)
+    with pytest.raises(DyngsError, match=r"frames_per_second=10 needs data\.times=order"):
+        read_capture(ordered.model_copy(update={"times": "files"}))
+
+
 def test_order_of_times_does_not_matter(blender_root: Path) -> None:
     set_times(blender_root, "train", [(7 * i % 16) / 15 for i in range(16)])
     set_times(blender_root, "test", [1.0, 0.0])

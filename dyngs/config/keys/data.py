@@ -36,6 +36,10 @@ class DataConfig(Section):
         description="when the pictures were taken; files: as the capture says; order: in the order of their names, by "
         "the numbers that these end in",
     )
+    frames_per_second: Positive | None = Field(
+        default=None,
+        description="with times=order: so many numbers, or places in the order, are a second; null: not known",
+    )
     downscale: float = Field(default=1.0, ge=1.0, description="divide width and height of the pictures by this")
     longest_side: int | None = Field(
         default=None, ge=1, description="shrink pictures so that the longer side has at most this many px; null: do not"

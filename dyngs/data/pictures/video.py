@@ -13,12 +13,12 @@ import numpy as np
 
 from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.containment import check_size
+from dyngs.files.wrong_place import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 
 if TYPE_CHECKING:
     import av
     from av.container import InputContainer
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 MAX_FRAMES = 1_000_000
 """Limit on the frames of one video: ten hours."""
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,m4v,flv,ogg,asf,dv,mxf,h264,hevc"

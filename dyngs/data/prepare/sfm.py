@@ -21,11 +21,10 @@ from dyngs.files.containment import MAX_MEGAPIXELS, check_size, inside, pictures
 from dyngs.files.picture_errors import any_text, picture_error
 from dyngs.files.temporary import temporary_folder_beside
 from dyngs.files.write import write_image
+from dyngs.files.wrong_place import PHOTO_SUFFIXES
 
 if TYPE_CHECKING:
     import pycolmap
-
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 
 
 @dataclass(frozen=True)
@@ -291,7 +290,7 @@ def photos_below(folder: Path) -> list[Path]:
     """Return all photos below the folder, sorted; hidden files and folders are left out."""
     return sorted(
         path for path in folder.rglob("*")
-        if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
+        if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)
     )  # fmt: skip
 

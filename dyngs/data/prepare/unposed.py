@@ -45,7 +45,7 @@ def with_poses(
         DyngsError: photos without times where they are needed, several videos where nothing is to move, or poses that
             cannot be found.
     """
-    if not _is_unposed(data):
+    if not is_unposed(data):
         return data
     source = data.root / "images" if (data.root / "images").is_dir() else data.root
     videos = videos_in(source) if is_several_videos(source) else []
@@ -74,7 +74,7 @@ def with_poses(
     return data.model_copy(update={"root": folder})
 
 
-def _is_unposed(data: DataConfig) -> bool:
+def is_unposed(data: DataConfig) -> bool:
     """Whether ``data.root`` is a video, or a folder of photos or of videos that no reader of captures knows.
 
     Raises:
@@ -99,6 +99,15 @@ def _is_unposed(data: DataConfig) -> bool:
 def is_several_videos(source: Path) -> bool:
     """Whether ``source`` is a folder of two videos or more, and not of photos."""
     return source.is_dir() and not _holds_photos(source) and len(videos_in(source)) > 1
+
+
+def is_videos(source: Path) -> bool:
+    """Whether ``source`` is a video file, or a folder of videos that is no capture and holds no photos."""
+    if source.is_file():
+        return source.suffix.lower() in VIDEO_SUFFIXES
+    if not source.is_dir() or any(format.recognise(source) for format in FORMATS):
+        return False
+    return not _holds_photos(source) and bool(videos_in(source))
 
 
 def _holds_photos(folder: Path) -> bool:

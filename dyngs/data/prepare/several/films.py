@@ -81,11 +81,17 @@ def open_films(folder: Path) -> list[Film]:
     Raises:
         DyngsError: one of them cannot be read.
     """
-    films = []
-    for path in videos_in(folder):
-        info = probe_video(inside(path))
-        films.append(Film(path.stem, path, info, np.array(frame_seconds(path, info.num_frames))))
-    return films
+    return [open_film(inside(path)) for path in videos_in(folder)]
+
+
+def open_film(path: Path) -> Film:
+    """Return a video.
+
+    Raises:
+        DyngsError: it cannot be read.
+    """
+    info = probe_video(path)
+    return Film(path.stem, path, info, np.array(frame_seconds(path, info.num_frames)))
 
 
 def small_pictures(films: Sequence[Film], report: ReportProgress = report_nothing) -> list[SmallPictures]:

@@ -27,6 +27,12 @@ MEDIAN_BYTES = 400_000_000
 """Memory that they take at most."""
 STARTS = (0, 1, 2)
 """Random seeds of mapping: repeated patterns lead some astray, and then fewer points are seen."""
+FEW_OBSERVATIONS = 400
+"""Observations per camera below which other features are tried, too."""
+LARGEST_ERROR = 2.0
+"""Observations with a larger reprojection error, in px, are left out in the end,"""
+ENOUGH_TRACKS = 60
+"""and points that only two cameras see, where each camera sees so many others."""
 LONE_LENSES = 1.0
 """Mean reprojection error in px above which cameras of one size are also tried with a lens each."""
 _LESS = 0.7
@@ -95,8 +101,9 @@ def standing_model(
     """Return the poses of cameras that stand, None where no two cameras match.
 
     SIFT features, all pairs matched, incremental mapping from several random seeds; of the models, that with most
-    cameras, then with most observations. Where a camera is missing, features are also found with affine shapes and
-    lower thresholds, which match over wider angles. Cameras of one size share a lens unless that fits badly.
+    cameras, then with most observations. Where a camera or observations are missing, features are also found with
+    affine shapes and matched under guidance, which works over wider angles. Cameras of one size share a lens unless
+    that fits badly.
 
     Args:
         films: the videos.
@@ -122,6 +129,7 @@ def standing_model(
             found = _attempt(work / f"{features}_{shared}", images, features == "affine", shared, options)
             report("poses of the cameras, attempts", number + 1, len(attempts))
             if found is not None:
+                _refine(found, options)
                 tried = StandingModel(found, shared, f"{features} features")
                 best = tried if best is None or _is_better(tried, best) else best
         report("poses of the cameras, attempts", len(attempts), len(attempts))
@@ -137,7 +145,7 @@ def _worth_trying(best: StandingModel | None, features: str, shared: bool, count
     if best is None or best.registered < count:
         return True
     if shared:
-        return False
+        return best.model.compute_num_observations() < FEW_OBSERVATIONS * count
     return best.tries.startswith(features) and best.model.compute_mean_reprojection_error() > LONE_LENSES
 
 
@@ -185,6 +193,47 @@ def _attempt(
                 best = model
         shutil.rmtree(folder)
     return best
+
+
+def _refine(model: pycolmap.Reconstruction, options: StandingOptions) -> None:
+    """Adjust poses, lenses and points once more, with a robust loss, and without what fits badly or two cameras see.
+
+    Repeated patterns give matches that only two cameras agree on; those bend the model.
+    """
+    import pycolmap
+
+    adjustment = pycolmap.BundleAdjustmentOptions()
+    adjustment.print_summary = False
+    adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    adjustment.ceres.loss_function_scale = 0.5
+    adjustment.ceres.solver_options.num_threads = options.num_threads or -1
+    for _ in range(2):
+        problem = pycolmap.BundleAdjustmentConfig()
+        for image in model.images.values():
+            if image.has_pose:
+                problem.add_image(image.image_id)
+        problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        # Not pycolmap.bundle_adjustment, which turns COLMAP's log on.
+        pycolmap.create_default_bundle_adjuster(adjustment, problem, model).solve()
+        model.update_point_3d_errors()
+        _drop_poor_points(model)
+    model.update_point_3d_errors()
+
+
+def _drop_poor_points(model: pycolmap.Reconstruction) -> None:
+    """Remove observations with large errors, and points of two cameras where each camera has enough others."""
+    import pycolmap
+
+    manager = pycolmap.ObservationManager(model)
+    manager.filter_all_points3D(LARGEST_ERROR, 1.5)
+    counts = dict.fromkeys((image.image_id for image in model.images.values() if image.has_pose), 0)
+    for point in model.points3D.values():
+        if point.track.length() > 2:
+            for element in point.track.elements:
+                counts[element.image_id] += 1
+    if min(counts.values(), default=0) >= ENOUGH_TRACKS:
+        for number in [number for number, point in model.points3D.items() if point.track.length() == 2]:
+            model.delete_point3D(number)
 
 
 def _extent(model: pycolmap.Reconstruction) -> tuple[int, int]:

@@ -10,7 +10,7 @@ from dyngs.data.frame_selection import evenly_spaced
 
 STANDS = 0.002
 """A camera stands if its picture is never displaced by more than this share of its longer side."""
-SAMPLES = 24
+SAMPLES = 16
 """Pictures that are compared with the typical one."""
 SWEEPING = 0.02
 """Share of the longer side by which each picture is displaced against the last one where the camera moves fast."""
@@ -74,6 +74,8 @@ def displacement(one: np.ndarray, other: np.ndarray) -> float:
     x, y = (columns - width / 2) / max(width, height), (rows - height / 2) / max(width, height)
     slope = np.hypot(*np.gradient(one))
     told = slope >= max(float(np.quantile(slope, 1 - _TOLD)), _FLAT)  # even areas fit any displacement
+    if not told.any():
+        return np.inf
     parameters, residual = np.zeros(6), np.zeros(0)
     for round_number in range(_ITERATIONS):
         flow_x, flow_y = _flow(parameters, x, y)
@@ -92,7 +94,7 @@ def displacement(one: np.ndarray, other: np.ndarray) -> float:
         parameters += step[:6]
         if round_number >= len(_SCALES) and np.abs(step[:6]).max() < 1e-3:
             break
-    if not told.any() or float((np.abs(residual) < _FITS).mean()) < _MOST_PIXELS:
+    if float((np.abs(residual) < _FITS).mean()) < _MOST_PIXELS:
         return np.inf
     at_x, at_y = (
         np.array(corners) * size / max(width, height)
