@@ -29,7 +29,9 @@ def camera(azimuth_deg: float, height: float = 1.0) -> np.ndarray:
 def corner(pose: np.ndarray, time: float) -> np.ndarray:
     """Return the (H, W, 3) uint8 picture of two walls and a floor, with a disc that faces the camera at ``time``."""
     rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
-    disc = pose[:3, :3] @ (np.array([0.6 * np.cos(5 * time), 0.5 * np.sin(7 * time), 0.5 + 0.25 * np.sin(11 * time)]))
+    disc = pose[:3, :3] @ (
+        np.array([0.6 * np.cos(2 * time), 0.5 * np.sin(3.1 * time), 0.5 + 0.25 * np.sin(4.7 * time)])
+    )
     disc += pose[:3, 3]
     across = np.hypot(columns - WIDTH / 2 - FOCAL * disc[0] / disc[2], rows - HEIGHT / 2 - FOCAL * disc[1] / disc[2])
     picture = np.where(across < 0.22 * FOCAL / disc[2], 245.0, _scenery(pose.tobytes()))

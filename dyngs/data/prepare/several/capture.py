@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -90,29 +90,18 @@ def write_model(
     whole.write(folder)
 
 
-def write_facts(
-    root: Path, films: Sequence[Film], taken: Sequence[Taken], names: Sequence[Sequence[str]], test: Sequence[str]
-) -> None:
+def write_facts(root: Path, seconds: Mapping[str, float], starts: Mapping[str, float], test: Sequence[str]) -> None:
     """Write the seconds of the pictures, which of them are for testing, and when each video begins.
 
     Args:
         root: the capture.
-        films: the videos.
-        taken: their frames.
-        names: pictures of each.
+        seconds: picture below ``images`` to the second at which it was taken, in the clock of all videos.
+        starts: camera to the second at which its video begins.
         test: cameras that are held out.
     """
-    pictures = [
-        (name, second)
-        for own, frames in zip(names, taken, strict=True)
-        for name, second in zip(own, frames.seconds, strict=True)
-    ]
-    write_seconds(root, {name: round(float(second), 6) for name, second in pictures})
-    held_out = [name for film, own in zip(films, names, strict=True) if film.name in test for name in own]
+    write_seconds(root, {name: round(second, 6) for name, second in seconds.items()})
+    held_out = [name for name in seconds if name.partition("/")[0] in test]
     if held_out:
         write_text(root / "sparse" / "0" / TEST_LIST, "".join(f"{name}\n" for name in held_out))
-    starts = {
-        film.name: round(float(frames.seconds[0] - film.seconds[frames.numbers[0]]), 6)
-        for film, frames in zip(films, taken, strict=True)
-    }
-    write_text(root / NAME, json.dumps({"starts": starts, "test": list(test)}, indent=1) + "\n")
+    rounded = {name: round(start, 6) for name, start in starts.items()}
+    write_text(root / NAME, json.dumps({"starts": rounded, "test": list(test)}, indent=1) + "\n")

@@ -130,7 +130,12 @@ def _made_in(work: Path, source: Path, options: VideosOptions, report: ReportPro
     names = write_pictures(work, films, taken, report)
     write_model(work, films, names, found.model)
     test = _held_out(films, given.test)
-    write_facts(work, films, taken, names, test)
+    seconds = {
+        name: float(second)
+        for own, frames in zip(names, taken, strict=True)
+        for name, second in zip(own, frames.seconds, strict=True)
+    }
+    write_facts(work, seconds, {film.name: float(x) for film, x in zip(films, begun.seconds, strict=True)}, test)
     if test:
         lines.append(f"held out for testing: {first_few(test)}")
     return lines

@@ -112,7 +112,7 @@ def correlate(a: np.ndarray, b: np.ndarray) -> Correlation | None:
     return Correlation(int(shifts[0]), np.where(norm > floor, products[shifts] / np.maximum(norm, 1e-12), 0.0))
 
 
-def align(pairs: Mapping[tuple[int, int], Correlation], count: int) -> Alignment:
+def align(pairs: Mapping[tuple[int, int], Correlation], count: int, near: np.ndarray | None = None) -> Alignment:
     """Return the shifts at which all pairs together correlate best.
 
     The pairs with the highest peaks join all recordings first; then each recording is shifted to where the sum of its
@@ -121,12 +121,13 @@ def align(pairs: Mapping[tuple[int, int], Correlation], count: int) -> Alignment
     Args:
         pairs: correlation of recordings i and j, i < j: shift of j less shift of i.
         count: of recordings.
+        near: (C,) shifts that are only to be improved, by less than ``PEAK_WIDTH``; None: nothing is known.
     """
-    shifts = _spanning(pairs, count)
+    shifts = _spanning(pairs, count) if near is None else near.copy()
     for _ in range(_ROUNDS):
         before = shifts.copy()
         for i in range(1, count):
-            shifts[i] = _best_shift(i, shifts, pairs)
+            shifts[i] = _best_shift(i, shifts, pairs, None if near is None else float(near[i]))
         if np.abs(shifts - before).max() < 1e-3:
             break
     own = {pair: found.best for pair, found in pairs.items()}
@@ -180,7 +181,7 @@ def _spanning(pairs: Mapping[tuple[int, int], Correlation], count: int) -> np.nd
     return shifts
 
 
-def _best_shift(i: int, shifts: np.ndarray, pairs: Mapping[tuple[int, int], Correlation]) -> float:
+def _best_shift(i: int, shifts: np.ndarray, pairs: Mapping[tuple[int, int], Correlation], near: float | None) -> float:
     """Return the shift of recording ``i`` with the highest sum of correlations, the others as they are."""
     curves = []
     for (first, second), found in pairs.items():
@@ -192,6 +193,8 @@ def _best_shift(i: int, shifts: np.ndarray, pairs: Mapping[tuple[int, int], Corr
     if not curves:
         return float(shifts[i])
     low, high = min(own[0] for own, _ in curves), max(own[-1] for own, _ in curves)
+    if near is not None:
+        low, high = near - PEAK_WIDTH, near + PEAK_WIDTH
     grid = np.arange(np.floor(low), np.ceil(high) + 1)
     total = np.sum([np.interp(grid, own, values, left=0.0, right=0.0) for own, values in curves], axis=0)
     return float(grid[0] + peak_place(total))

@@ -65,30 +65,35 @@ def even_rate(values: np.ndarray, seconds: np.ndarray, rate: float) -> np.ndarra
     return values[before] * (1 - share) + values[after] * share
 
 
-def correlated_motion(a: Watcher, b: Watcher, rate: float) -> Correlation | None:
+def correlated_motion(a: Watcher, b: Watcher, rate: float, blur: float) -> Correlation | None:
     """Return how alike the motion of two cameras is at every shift; None where they share no planes.
 
     Args:
         a, b: cameras that stand.
         rate: samples per second of the shifts.
+        blur: standard deviation in samples by which motion is blurred in time: what moves by more than its size from
+            frame to frame is not alike otherwise.
     """
     bins = _bins_of(a, b)
     if bins is None:
         return None
     signals = [
-        even_rate(_binned(watcher.motion, own), watcher.seconds, rate)
+        _blurred(even_rate(_binned(watcher.motion, own), watcher.seconds, rate), blur)
         for watcher, own in zip((a, b), bins, strict=True)
     ]
     return correlate(signals[0], signals[1])
 
 
-def correlations(watchers: Sequence[Watcher], rate: float, most: int) -> dict[tuple[int, int], Correlation]:
+def correlations(
+    watchers: Sequence[Watcher], rate: float, most: int, blur: float
+) -> dict[tuple[int, int], Correlation]:
     """Return the correlation of each camera with at most ``most`` others, those that look at it most alike.
 
     Args:
         watchers: cameras that stand.
         rate: samples per second of the shifts.
         most: others per camera.
+        blur: in time, see ``correlated_motion``.
     """
     axes = np.stack([watcher.rays.mean(axis=0) for watcher in watchers])
     axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-9)
@@ -96,7 +101,7 @@ def correlations(watchers: Sequence[Watcher], rate: float, most: int) -> dict[tu
     for i, likeness in enumerate(axes @ axes.T):
         nearest = [int(j) for j in np.argsort(-likeness, kind="stable") if j != i][:most]
         pairs |= {(min(i, j), max(i, j)) for j in nearest}
-    found = {pair: correlated_motion(watchers[pair[0]], watchers[pair[1]], rate) for pair in sorted(pairs)}
+    found = {pair: correlated_motion(watchers[pair[0]], watchers[pair[1]], rate, blur) for pair in sorted(pairs)}
     return {pair: value for pair, value in found.items() if value is not None}
 
 
@@ -121,6 +126,15 @@ def _bins_of(a: Watcher, b: Watcher) -> tuple[np.ndarray, np.ndarray] | None:
     placed = [np.floor((angle - low) / (high - low) * BINS).astype(int) for angle in angles]
     first, second = (np.where((place >= 0) & (place < BINS), place, -1) for place in placed)
     return first, second
+
+
+def _blurred(values: np.ndarray, blur: float) -> np.ndarray:
+    """Return (T, B) values blurred in time by a Gaussian, ``blur`` samples wide."""
+    reach = int(np.ceil(3 * blur))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / blur) ** 2)
+    padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
+    windows = (padded[i : i + len(values)] * weight for i, weight in enumerate(kernel / kernel.sum()))
+    return sum(windows, np.zeros(values.shape))
 
 
 def _binned(motion: np.ndarray, bins: np.ndarray) -> np.ndarray:

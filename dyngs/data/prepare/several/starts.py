@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -17,6 +17,8 @@ from dyngs.errors import DyngsError
 
 NEIGHBOURS = 8
 """Other cameras that the motion seen by a camera is compared with."""
+COARSE, FINE = 1.2, 0.7
+"""Blur of motion in time, in frames, with which the offsets are found, and then measured."""
 WHOLE = 0.15
 """Offsets so near to whole frames, in frames, are taken as whole: they are not known better."""
 TOGETHER = 0.97
@@ -59,8 +61,7 @@ def found_starts(films: Sequence[Film], watchers: Sequence[Watcher]) -> Starts:
     rate = min(max(film.rate for film in films), MAX_RATE)
     found, hertz = by_sound, RATE
     if found is None:
-        pairs = correlations(watchers, rate, NEIGHBOURS)
-        found, hertz = align(pairs, len(films)), rate
+        found, hertz = align(correlations(watchers, rate, NEIGHBOURS, COARSE), len(films)), rate
         if not found.holds:
             raise DyngsError(
                 f"the offsets between the videos are not known: {why_not}, and the motion seen agrees for "
@@ -68,6 +69,8 @@ def found_starts(films: Sequence[Film], watchers: Sequence[Watcher]) -> Starts:
                 f'in {NAME} beside them, {{"starts": {{"{films[0].name}": 0, "{films[1].name}": 0.5, ..}}}}, or '
                 '{"starts": 0} if all began at once'
             )
+        fine = align(correlations(watchers, rate, NEIGHBOURS, FINE), len(films), found.shifts)
+        found = replace(found, shifts=fine.shifts, correlation=fine.correlation, together=fine.together)
     what = "the motion seen" if by_sound is None else "the sound"
     sure = f"{found.agreeing} of {found.pairs} pairs agree, correlation {found.correlation:.2f}"
     frames = found.shifts / hertz * rate
