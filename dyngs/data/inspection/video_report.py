@@ -63,7 +63,10 @@ def video_report(path: Path) -> str:
     if path.is_file():
         found = video_facts(path)
         return "\n".join([*_lines(found), *_next(path, found)])
-    reports = [video_facts(video) for video in videos_in(path)]
+    videos = videos_in(path)
+    if len(videos) == 1:
+        return video_report(videos[0])
+    reports = [video_facts(video) for video in videos]
     lines = [line for found in reports for line in _lines(found)]
     return "\n".join([*lines, *_next_of_folder(path, reports)])
 

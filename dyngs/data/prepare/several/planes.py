@@ -130,6 +130,8 @@ def _bins_of(a: Watcher, b: Watcher) -> tuple[np.ndarray, np.ndarray] | None:
 
 def _blurred(values: np.ndarray, blur: float) -> np.ndarray:
     """Return (T, B) values blurred in time by a Gaussian, ``blur`` samples wide."""
+    if blur == 0:
+        return values
     reach = int(np.ceil(3 * blur))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / blur) ** 2)
     padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")

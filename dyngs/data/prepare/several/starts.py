@@ -17,9 +17,9 @@ from dyngs.errors import DyngsError
 
 NEIGHBOURS = 8
 """Other cameras that the motion seen by a camera is compared with."""
-COARSE, FINE = 1.2, 0.7
+COARSE, FINE = 1.2, 0.0
 """Blur of motion in time, in frames, with which the offsets are found, and then measured."""
-WHOLE = 0.15
+WHOLE = 0.2
 """Offsets so near to whole frames, in frames, are taken as whole: they are not known better."""
 TOGETHER = 0.97
 """Videos begin together if that explains them as well as the offsets found, to this share."""
