@@ -141,7 +141,7 @@ def _close_presets(name: str, packaged: Iterable[str]) -> list[str]:
 
 def _instead(path: Path) -> str:
     """Return what ``path`` is if it is no run, and the command for it, to be followed by more; may be empty."""
-    if path.stem in _packaged_presets() and not path.is_dir():
+    if path.stem in packaged_presets() and not path.is_dir():
         return f"it is a configuration, for `dyngs train {path} data.root=FOLDER`; "
     found = command_for(path)
     return f"{found}; then " if found else ""
