@@ -61,6 +61,8 @@ def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
     )
     parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
+    parser.add_argument("--mapper", choices=("auto", "global", "incremental"), default="auto", help="COLMAP's mapping")
+    parser.add_argument("--masks", type=Path, metavar="DIR", help="masks of the photos, white = keep")
     parser.add_argument(
         "--frames", type=int, metavar="N", help="frames to take of a video (default 100; of each of several: up to 300)"
     )
@@ -172,6 +174,8 @@ def run_sfm(arguments: argparse.Namespace) -> int:
         raise DyngsError(f"{arguments.images}: --start is for a folder of several videos")
     options = SfmOptions(
         matching=arguments.matching,
+        mapper=arguments.mapper,
+        masks=arguments.masks,
         num_frames=arguments.frames or SfmOptions.num_frames,
         num_threads=arguments.threads,
         follow_links=limits.follow_links,

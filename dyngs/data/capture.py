@@ -76,6 +76,8 @@ class View:
         motion_mask_labels: the mask holds labels instead: all but 0 moves.
         flow_path: optical flow to the view ``flow_to``, see ``pictures.flow``; None without one.
         flow_to: name of the next view of this camera in its file, None for the last one.
+        exposure: light let in by the EXIF tags, see ``pictures.exif``: comparable among views of one capture; None
+            where the file does not say.
     """
 
     name: str
@@ -96,6 +98,7 @@ class View:
     motion_mask_labels: bool = False
     flow_path: Path | None = None
     flow_to: str | None = None
+    exposure: float | None = None
 
 
 Splits = dict[Split, tuple[View, ...]]

@@ -327,7 +327,7 @@ class PictureLoader:
             return self._decode(self._views[index])
 
     def _decode(self, view: View) -> _Decoded:
-        pixels = read_picture(view.image_path)
+        pixels = read_picture(view.image_path, (view.width, view.height))
         if view.silhouette is not None:
             pixels = cut_out(pixels, view.silhouette)
         mask = None if view.mask_path is None else read_mask(view.mask_path)
@@ -396,7 +396,7 @@ def check_files(views: Sequence[View]) -> None:
         )
     for view in views:
         header = check_picture(view.image_path)
-        if (header.width, header.height) != (view.width, view.height):
+        if header.size_for((view.width, view.height)) != (view.width, view.height):
             raise DyngsError(
                 f"{view.image_path}: the picture is {header.width}x{header.height}, but {view.width}x{view.height} was "
                 f"expected; restore the original or correct its intrinsics"

@@ -99,7 +99,7 @@ def _picture_problems(capture: Capture, deep: bool) -> list[str]:
             except DyngsError as error:
                 unreadable.append(str(error))
                 continue
-            if (header.width, header.height) != (view.width, view.height):
+            if header.size_for((view.width, view.height)) != (view.width, view.height):
                 camera = f"its camera says {view.width}x{view.height}"
                 sizes.append(f"{path} has {header.width}x{header.height} pixels, {camera}")
             if path == view.image_path:

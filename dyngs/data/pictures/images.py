@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.data.pictures.exif import PhotoTags, is_lying, tags_of, turned_upright
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import check_size, inside, max_decoded_mb
 from dyngs.files.picture_errors import picture_error
@@ -32,15 +33,39 @@ class PictureHeader:
     """Header of a picture file.
 
     Attributes:
-        width, height: pixels.
+        width, height: pixels, as stored.
         channels: number of stored channels.
         has_alpha: whether one of them is alpha.
+        tags: what the camera wrote.
     """
 
     width: int
     height: int
     channels: int
     has_alpha: bool
+    tags: PhotoTags = field(default_factory=PhotoTags)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) as stored."""
+        return self.width, self.height
+
+    @property
+    def upright_size(self) -> tuple[int, int]:
+        """(width, height) when it is shown as its EXIF tag says."""
+        return (self.height, self.width) if is_lying(self.tags.orientation) else self.size
+
+    def size_for(self, described: tuple[int, int] | None) -> tuple[int, int]:
+        """Return the stored or the upright (width, height), that which has the shape of a camera's ``described`` one.
+
+        Programs that find poses take pictures as stored or upright, and their cameras say which. Where both have that
+        shape it is the stored one, which is what COLMAP takes.
+        """
+        if described is None:
+            return self.upright_size
+        wide, tall = described
+        lies = (wide > tall) != (self.width > self.height) and wide != tall
+        return self.upright_size if lies else self.size
 
 
 def read_header(path: Path) -> PictureHeader:
@@ -53,7 +78,7 @@ def read_header(path: Path) -> PictureHeader:
         source = _open(path)
         spec = source.spec()
         source.close()
-        return PictureHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0)
+        return PictureHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0, tags_of(spec))
 
 
 def header_if_readable(path: Path) -> PictureHeader | None:
@@ -71,28 +96,35 @@ def header_if_readable(path: Path) -> PictureHeader | None:
     return header
 
 
-def read_picture(path: Path) -> Tensor:
+def read_picture(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> Tensor:
     """Read a picture as (H, W, 3) or, with alpha, (H, W, 4) uint8: sRGB, straight alpha.
 
     8-bit files are returned bit for bit, 16-bit ones rounded. Floating-point files (EXR) are linear with premultiplied
     alpha: they are clamped to [0, 1] and encoded as sRGB. Grey becomes RGB.
 
+    Args:
+        path: a file.
+        size: (width, height) of its camera; a picture that has this shape only when it is turned as its EXIF tag says
+            is turned. None: as stored.
+        upright: turn it as its EXIF tag says in any case.
+
     Raises:
         DyngsError: the file is missing, truncated, no picture, or larger than ``data.max_megapixels``.
     """
     with _reading(path):
-        return _decoded(path)
+        return _decoded(path, size, upright)
 
 
 def _reading(path: Path) -> AbstractContextManager[None]:
     return reading(path, "the picture is damaged or of an unknown kind; copy or convert it again")
 
 
-def _decoded(path: Path) -> Tensor:
+def _decoded(path: Path, size: tuple[int, int] | None, upright: bool) -> Tensor:
     import OpenImageIO as oiio
 
     source = _open(path)
     spec = source.spec()
+    tags = tags_of(spec)
     check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
     is_linear = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
     pixels = source.read_image(oiio.FLOAT if is_linear else oiio.UINT8)
@@ -103,6 +135,9 @@ def _decoded(path: Path) -> Tensor:
         reason = message or "the data ends early"
         raise DyngsError(f"{path}: the picture is truncated or damaged ({reason}); copy it again")
     pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
+    header = PictureHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0, tags)
+    if upright or (size is not None and header.size_for(size) != header.size):
+        pixels = turned_upright(pixels, tags.orientation)
     alpha = pixels[..., spec.alpha_channel] if spec.alpha_channel >= 0 else None
     colour_channels = [i for i in range(spec.nchannels) if i != spec.alpha_channel]
     if not colour_channels:

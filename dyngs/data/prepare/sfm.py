@@ -2,29 +2,46 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
-from dataclasses import dataclass
-from functools import partial
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.frame_seconds import write_seconds
 from dyngs.data.pictures.images import read_header
-from dyngs.data.pictures.video import frame_seconds, read_frames
-from dyngs.data.prepare.sfm_progress import sequential_pairs, watched
-from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import MAX_MEGAPIXELS, check_size, inside, pictures_up_to, staying_within
-from dyngs.files.picture_errors import any_text, picture_error
-from dyngs.files.temporary import temporary_folder_beside
-from dyngs.files.write import write_image
-from dyngs.files.wrong_place import PHOTO_SUFFIXES
+from dyngs.data.pictures.video import frame_seconds, read_frames, read_numbered_frames
+from dyngs.data.prepare.frame_choice import STILL, FrameChoice, chosen_frames, measured
+from dyngs.data.prepare.photos import Photo, digest_of, gather_photos, lay_out, link_or_copy
+from dyngs.data.prepare.sfm_check import angles_deg, turning_share
+from dyngs.data.prepare.sfm_features import FeatureTask, find_features, match_pairs, matched_pictures
+from dyngs.data.prepare.sfm_mapping import MappingTask, Model, better, mapped, needs_more
+from dyngs.data.prepare.sfm_movers import without_movers
+from dyngs.data.prepare.sfm_pairs import ALIKE, ALIKE_PHOTOS, alike_pairs, all_pairs, neighbour_pairs
+from dyngs.data.prepare.sfm_report import SfmResult, advice, write_report
+from dyngs.data.prepare.sfm_work import working
+from dyngs.data.readers.colmap import find_masks, mask_of
+from dyngs.errors import DyngsError
+from dyngs.files.containment import MAX_MEGAPIXELS, inside, pictures_up_to, staying_within
+from dyngs.files.json_files import read_json_object
+from dyngs.files.write import write_image, write_text
 
 if TYPE_CHECKING:
     import pycolmap
+
+_EXHAUSTIVE_PHOTOS = 60
+_EXHAUSTIVE_FRAMES = 24
+_SMALL_ANGLE_DEG = 1.0
+_TURNS = 0.8
+_FEWEST_MATCHED = 3
+_MOVING_SHARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -35,13 +52,16 @@ class SfmOptions:
         camera_model: COLMAP's name of the lens model to fit.
         single_camera: one camera took all pictures, so they share its lens; None = yes for a video, and for photos that
             agree in size, camera model and focal length (EXIF); else every photo has a lens of its own.
-        matching: which pairs are compared; auto = all pairs up to 60 photos, neighbours by name beyond and for videos.
-        overlap: neighbours on either side in sequential matching.
+        matching: which pairs are compared; auto = all pairs up to 60 photos or 24 frames, beyond that neighbours by
+            name (some far ones, too) and those that look alike; sequential = the same without what looks alike.
+        overlap: neighbours on either side in sequential matching; None = near ones densely, far ones sparsely.
+        mapper: COLMAP's mapping; auto = global, and incremental where that finds less.
         max_features: SIFT features per picture.
         longest_side: pictures are shrunk to this, in pixels, for finding features (poses refer to the full size).
-        num_frames: pictures to take from a video, evenly spaced, the sharpest around each place.
+        num_frames: pictures to take from a video, by motion seen and sharpness.
+        masks: folder of masks of the photos, named as in captures; white = keep. None without.
         seed: of everything random.
-        num_threads: 0 = all cores; other numbers may give other last digits.
+        num_threads: for features and matches, 0 = all cores; mapping has one, so that the result is always the same.
         follow_links: photos may be links that lead out of their folder.
         max_megapixels: larger pictures and videos are refused.
     """
@@ -51,46 +71,16 @@ class SfmOptions:
     )
     single_camera: bool | None = None
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    overlap: int = 10
+    overlap: int | None = None
+    mapper: Literal["auto", "global", "incremental"] = "auto"
     max_features: int = 8192
     longest_side: int = 1600
     num_frames: int = 100
+    masks: Path | None = None
     seed: int = 0
     num_threads: int = 0
     follow_links: bool = False
     max_megapixels: float = MAX_MEGAPIXELS
-
-
-@dataclass(frozen=True)
-class SfmResult:
-    """Result of pose estimation.
-
-    Attributes:
-        root: the capture folder in COLMAP's layout, to be trained on.
-        num_images: pictures given.
-        num_registered: pictures with a pose.
-        unregistered: names of the others.
-        num_points: sparse points.
-        mean_error_px: mean reprojection error.
-    """
-
-    root: Path
-    num_images: int
-    num_registered: int
-    unregistered: tuple[str, ...]
-    num_points: int
-    mean_error_px: float
-
-    def summary(self) -> str:
-        """The result as one or two lines of text."""
-        line = (
-            f"{self.num_registered} of {self.num_images} pictures registered, {self.num_points} points, "
-            f"mean error {self.mean_error_px:.2f} px: {self.root}"
-        )
-        if not self.unregistered:
-            return line
-        shown = ", ".join(self.unregistered[:5]) + (", ..." if len(self.unregistered) > 5 else "")
-        return f"{line}\nno pose for {shown}"
 
 
 def estimate_poses(
@@ -98,8 +88,9 @@ def estimate_poses(
 ) -> SfmResult:
     """Estimate poses of the pictures in ``source`` and write a COLMAP capture (``out/images``, ``out/sparse/0``).
 
-    All work is done in a folder beside ``out`` which is renamed at the end, so ``out`` is whole or absent. SIFT
-    features, matches, incremental mapping; of several models the one with most pictures is kept.
+    Work is done in a hidden folder beside ``out``; the capture is renamed at the end, so ``out`` is whole or absent. A
+    stopped run leaves that folder, and the next one with the same pictures and options goes on with its features and
+    matches. Of several models the one with most pictures is kept.
 
     Args:
         source: a folder of photos (subfolders included) or a video file.
@@ -108,233 +99,261 @@ def estimate_poses(
         report: is told of frames read from a video, of pictures with features, of pairs matched, of poses found.
 
     Raises:
-        DyngsError: too few pictures, an ``out`` in use, or nothing could be registered, with advice.
+        DyngsError: too few pictures, an ``out`` in use, a camera that stands still or only turns, or nothing could be
+            registered, with advice.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DyngsError(f"{out} exists already; name a new folder for the poses")
     if not source.exists():
         raise DyngsError(f"no such folder of photos or video: {source}")
-    work = temporary_folder_beside(out)
+    if options.masks is not None and not options.masks.is_dir():
+        raise DyngsError(f"no such folder of masks: {options.masks}")
     try:
-        with staying_within(source, options.follow_links or source.is_file()), pictures_up_to(options.max_megapixels):
-            result = _posed_in(work, source, options, _To(out, report))
-        work.chmod(0o755)
-        if out.exists():
-            out.rmdir()
-        os.replace(work, out)
+        task = f"{digest_of(source)} {replace(options, num_threads=0)}"
+        with (
+            working(out, task) as (work, _),
+            staying_within(source, options.follow_links or source.is_file()),
+            pictures_up_to(options.max_megapixels),
+        ):
+            result = _posed_in(work, source, out, options, report)
+            if out.exists():
+                out.rmdir()
+            os.replace(work / "capture", out)
         return result
     except OSError as error:
         raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+
+
+class _Clock:
+    """Seconds of each stage, by its name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the seconds of the block to a stage."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
 
 
 @dataclass(frozen=True)
-class _To:
-    """Where the capture will be, and who is told how far it is."""
+class _Pictures:
+    """The pictures in ``capture/images``, and what is known of them before matching."""
 
-    out: Path
-    report: ReportProgress
-
-
-def _posed_in(work: Path, source: Path, options: SfmOptions, to: _To) -> SfmResult:
-    """Write the capture for ``to.out`` in the folder ``work`` and return the result."""
-    images, is_video = work / "images", source.is_file()
-    names = _extract_frames(source, images, options, to.report) if is_video else _gather_photos(source, images, to.out)
-    if len(names) < 3:
-        raise DyngsError(f"{source} has {len(names)} pictures; structure from motion needs at least 3, better 30")
-    return _run_colmap(work, names, is_video, options, to)
+    photos: list[Photo]
+    is_video: bool
+    blurred: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
-def _run_colmap(work: Path, names: list[str], is_video: bool, options: SfmOptions, to: _To) -> SfmResult:
-    """Extract features, match and map in ``work``; write ``work/sparse/0`` and return the result."""
+def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: ReportProgress) -> SfmResult:
+    """Write the capture for ``out`` in ``work/capture`` and return the result."""
+    clock = _Clock()
+    capture = work / "capture"
+    with clock.stage("pictures"):
+        if source.is_file():
+            pictures = _frames_of(source, capture, options, report)
+        else:
+            pictures = _Pictures(gather_photos(source, capture / "images", out), is_video=False)
+    photos = pictures.photos
+    if len(photos) < 3:
+        raise DyngsError(f"{source} has {len(photos)} pictures; structure from motion needs at least 3, better 30")
     import pycolmap
 
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(options.seed)
     try:
-        database, models = work / "database.db", work / "models"
-        models.mkdir()
-        with watched(database, "keypoints", len(names), to.report):
-            _find_features(database, work / "images", names, is_video, options)
-        sequential = _is_sequential(len(names), is_video, options)
-        every = len(names) * (len(names) - 1) // 2
-        pairs = min(every, sequential_pairs(len(names), options.overlap)) if sequential else every
-        with watched(database, "two_view_geometries", pairs, to.report):
-            _match(database, sequential, options)
-        found = _map(database, work / "images", models, _mapping_options(options), _PosesFound(len(names), to.report))
+        features = _feature_task(work, pictures, options)
+        _matched(features, pictures.is_video, options, (clock, report))
+        with clock.stage("poses"):
+            model, notes = _mapped(work, features, options, report)
     except (RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()
         raise DyngsError(f"structure from motion failed: {reason[-1] if reason else error}") from error
     finally:
         pycolmap.logging.minloglevel = level
-    best = max(found.values(), key=lambda model: model.num_reg_images(), default=None)
-    if best is None or best.num_reg_images() < 2:
-        raise DyngsError(
-            f"no poses could be found for {len(names)} pictures: take sharper ones that overlap by two thirds, move "
-            "the camera sideways rather than only turning it, avoid bare or moving surfaces, or try matching=exhaustive"
-        )
-    sparse = work / "sparse" / "0"
-    sparse.mkdir(parents=True)
-    best.write(sparse)
-    registered = {image.name for image in best.images.values() if image.has_pose}
-    shutil.rmtree(models)
-    database.unlink()
-    missing = tuple(name for name in names if name not in registered)
-    points, error_px = best.num_points3D(), float(best.compute_mean_reprojection_error())
-    return SfmResult(to.out, len(names), len(registered), missing, points, error_px)
+    _require_depth(model, features.database, pictures.is_video)
+    names = dict(zip(features.names, (photo.name for photo in photos), strict=True))
+    matched = {names[name]: count for name, count in matched_pictures(features.database).items()}
+    lonely = [name for name, count in matched.items() if count < _FEWEST_MATCHED]
+    missing = _write_model(model, capture, names)
+    notes = (*pictures.notes, *notes, *advice(missing, lonely, pictures.blurred, pictures.is_video))
+    found = model.reconstruction
+    result = SfmResult(
+        out, len(photos), len(photos) - len(missing), missing, found.num_points3D(), model.error_px,
+        float(found.compute_mean_track_length()), model.mapper, clock.seconds, notes,
+    )  # fmt: skip
+    write_report(capture, result)
+    capture.chmod(0o755)
+    return result
 
 
-def _find_features(database: Path, images: Path, names: list[str], is_video: bool, options: SfmOptions) -> None:
-    import pycolmap
-
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.use_gpu = False
-    extraction.num_threads = options.num_threads or -1
-    extraction.max_image_size = options.longest_side
-    extraction.sift.max_num_features = options.max_features
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = options.camera_model
-    single = options.single_camera
-    if single is None:
-        single = is_video or _same_camera([images / name for name in names])
-    mode = pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.AUTO
-    pycolmap.extract_features(
-        database, images, names, camera_mode=mode, reader_options=reader, extraction_options=extraction,
-        device=pycolmap.Device.cpu,
+def _feature_task(work: Path, pictures: _Pictures, options: SfmOptions) -> FeatureTask:
+    """Lay the pictures out for COLMAP."""
+    images, photos = work / "capture" / "images", pictures.photos
+    found = {} if options.masks is None else find_masks(options.masks)
+    masks = {photo.name: mask for photo in photos if (mask := mask_of(photo.name, found)) is not None}
+    if options.masks is not None and not masks:
+        raise DyngsError(f"{options.masks}: no mask is named as a picture is (a.jpg.png, a.jpg or a.png for a.jpg)")
+    names = lay_out(photos, images, work / "pictures", masks)
+    for name, mask in masks.items():
+        target = images.with_name("masks") / (name + mask.suffix)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if not target.exists():
+            link_or_copy(inside(mask).resolve(), target)
+    return FeatureTask(
+        work / "database.db", work / "pictures", names, photos, work / "masks" if masks else None,
+        options.camera_model, _is_single(pictures, options), options.max_features, options.longest_side,
+        options.seed, options.num_threads,
     )  # fmt: skip
 
 
-class _PosesFound:
-    """Callback of incremental mapping: a picture has got its pose."""
-
-    def __init__(self, total: int, report: ReportProgress) -> None:
-        self._total, self._report, self._done = total, report, 0
-
-    def __call__(self) -> None:
-        self._done = min(self._done + 1, self._total)
-        self._report("poses, pictures", self._done, self._total)
+def _is_single(pictures: _Pictures, options: SfmOptions) -> bool:
+    """Whether all pictures share one lens: told so, a video, or the same size, camera and focal length."""
+    if options.single_camera is not None:
+        return options.single_camera
+    kinds = {(p.header.upright_size, p.header.tags.model, p.header.tags.focal_px) for p in pictures.photos}
+    return pictures.is_video or len(kinds) == 1
 
 
-def _map(
-    database: Path, images: Path, models: Path, options: pycolmap.IncrementalPipelineOptions, found: _PosesFound
-) -> dict[int, pycolmap.Reconstruction]:
-    """Return the models of incremental mapping; ``found`` is called for each picture that gets a pose."""
-    import pycolmap
+def _matched(task: FeatureTask, is_video: bool, options: SfmOptions, told: tuple[_Clock, ReportProgress]) -> None:
+    """Find features and match pairs; those of a stopped run are kept."""
+    clock, report = told
+    with clock.stage("features"):
+        find_features(task, report)
+    with clock.stage("matching"):
+        match_pairs(task, _pairs(task, is_video, options), report)
 
-    found()  # the second one of the first pair is told by COLMAP
-    return pycolmap.incremental_mapping(
-        database, images, models, options, initial_image_pair_callback=found, next_image_callback=found
+
+def _pairs(task: FeatureTask, is_video: bool, options: SfmOptions) -> list[tuple[int, int]]:
+    """Return the pairs to match, by places in the order of names."""
+    count = len(task.names)
+    limit = _EXHAUSTIVE_FRAMES if is_video else _EXHAUSTIVE_PHOTOS
+    if options.matching == "exhaustive" or (options.matching == "auto" and count <= limit):
+        return all_pairs(count)
+    near = neighbour_pairs(count, options.overlap)
+    if options.matching == "sequential":
+        return near
+    return near + alike_pairs(task.database, task.names, ALIKE if is_video else ALIKE_PHOTOS)
+
+
+def _mapped(
+    work: Path, features: FeatureTask, options: SfmOptions, report: ReportProgress
+) -> tuple[Model, tuple[str, ...]]:
+    """Return the model, and lines about what was done for it.
+
+    Where it is not good, features that disagree with most of their pictures are left out, and the better one is kept.
+
+    Raises:
+        DyngsError: none could be found.
+    """
+    count = len(features.names)
+    task = MappingTask(
+        features.database, features.pictures, work / "models", count, features.side, options.seed, report,
+    )  # fmt: skip
+    model, notes = mapped(task, options.mapper), ()
+    if model is None or needs_more(model, task):
+        still = work / "still.db"
+        shutil.copyfile(features.database, still)
+        share = without_movers(still, features.side)
+        if share >= _MOVING_SHARE:
+            second = mapped(replace(task, database=still), options.mapper)
+            best = better(model, second)
+            if best is second and second is not None:
+                before = "none" if model is None else f"{model.registered} pictures, {model.error_px:.2f} px"
+                notes = (
+                    f"{share:.0%} of the features move with something else than the scene and were left out: "
+                    f"{second.registered} pictures, {second.error_px:.2f} px; with them {before}",
+                )
+            model = best
+    if model is None:
+        if turning_share(features.database) >= _TURNS:
+            raise DyngsError(_TURNING)
+        raise DyngsError(
+            f"no poses could be found for {count} pictures: take sharper ones that overlap by two thirds, move "
+            "the camera sideways rather than only turning it, avoid bare or moving surfaces, or try matching=exhaustive"
+        )
+    return model, notes
+
+
+_TURNING = (
+    "the pictures differ only as if the camera turned on the spot (or all show one flat surface), which gives no "
+    "depth; walk sideways around the scene by about a quarter of its distance, and keep it in view"
+)
+
+
+def _require_depth(model: Model, database: Path, is_video: bool) -> None:
+    """Check that points are seen from directions that differ.
+
+    Raises:
+        DyngsError: the camera turned without moving, or moved too little.
+    """
+    angles = angles_deg(model.reconstruction)
+    angle = float(np.median(angles)) if len(angles) else 0.0
+    if angle >= _SMALL_ANGLE_DEG:
+        return
+    if turning_share(database) >= _TURNS:
+        raise DyngsError(_TURNING)
+    raise DyngsError(
+        f"the camera hardly moved: half of the points are seen from directions less than {max(angle, 0.1):.1f} degrees "
+        f"apart, which gives no depth; {'film' if is_video else 'take photos'} while walking sideways by about a "
+        "quarter of the distance to the scene"
     )
 
 
-def _is_sequential(num_images: int, is_video: bool, options: SfmOptions) -> bool:
-    """Whether only neighbours by name are compared."""
-    return options.matching == "sequential" or (options.matching == "auto" and (is_video or num_images > 60))
+def _write_model(model: Model, capture: Path, names: dict[str, str]) -> tuple[str, ...]:
+    """Write the model with the pictures' own names; return the names of pictures without a pose."""
+    found: pycolmap.Reconstruction = model.reconstruction
+    registered = set()
+    for image in found.images.values():
+        image.name = names[image.name]
+        if image.has_pose:
+            registered.add(image.name)
+    sparse = capture / "sparse" / "0"
+    shutil.rmtree(sparse, ignore_errors=True)
+    sparse.mkdir(parents=True)
+    found.write(sparse)
+    return tuple(name for name in names.values() if name not in registered)
 
 
-def _match(database: Path, sequential: bool, options: SfmOptions) -> None:
-    import pycolmap
+def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportProgress) -> _Pictures:
+    """Frames of a video, chosen by ``frame_choice``; their seconds are written, too.
 
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu = False
-    matching.num_threads = options.num_threads or -1
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = options.seed
-    if sequential:
-        pairing = pycolmap.SequentialPairingOptions()
-        pairing.overlap = options.overlap
-        pairing.num_threads = options.num_threads or -1
-        pycolmap.match_sequential(database, matching, pairing, verification, device=pycolmap.Device.cpu)
-    else:
-        pycolmap.match_exhaustive(
-            database, matching, verification_options=verification, device=pycolmap.Device.cpu
-        )  # fmt: skip
+    Two passes, so that only one picture is held in memory: the first one measures. Frames of a stopped run are kept.
 
-
-def _mapping_options(options: SfmOptions) -> pycolmap.IncrementalPipelineOptions:
-    import pycolmap
-
-    mapping = pycolmap.IncrementalPipelineOptions()
-    mapping.num_threads = options.num_threads or -1
-    mapping.random_seed = options.seed
-    mapping.mapper.random_seed = options.seed
-    mapping.triangulation.random_seed = options.seed
-    mapping.min_model_size = 3
-    mapping.mapper.init_min_num_inliers = 50
-    mapping.ba_use_gpu = False
-    return mapping
-
-
-def _gather_photos(source: Path, images: Path, out: Path) -> list[str]:
-    """Copy (hard-link where possible) all photos below ``source``; return their names below ``images``, sorted."""
-    result = out.resolve()
-    names = []
-    for photo in photos_below(source):
-        if result in photo.resolve().parents:
-            continue
-        header = read_header(inside(photo))
-        check_size(photo, header.width, header.height, header.channels)
-        name = photo.relative_to(source)
-        target = images / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            os.link(photo.resolve(), target)
-        except OSError:
-            shutil.copyfile(photo, target)
-        names.append(name.as_posix())
-    return names
-
-
-def photos_below(folder: Path) -> list[Path]:
-    """Return all photos below the folder, sorted; hidden files and folders are left out."""
-    return sorted(
-        path for path in folder.rglob("*")
-        if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    )  # fmt: skip
-
-
-def _extract_frames(video: Path, images: Path, options: SfmOptions, report: ReportProgress) -> list[str]:
-    """Pictures of a video: of ``num_frames`` equal windows the sharpest picture each; their names, in order.
-
-    Two passes, so that only one picture is held in memory: the first one measures. Their seconds are written, too.
+    Raises:
+        DyngsError: nothing moves.
     """
-    sharpness = np.array([_sharpness(rgb) for rgb in read_frames(video)])
-    windows = np.array_split(np.arange(len(sharpness)), min(options.num_frames, max(len(sharpness), 1)))
-    chosen = {int(w[sharpness[w].argmax()]) for w in windows if len(w)}
-    names = []
-    for index, rgb in enumerate(read_frames(video)):
-        if index in chosen:
-            names.append(f"frame_{index:05d}.png")
-            write_image(images / names[-1], rgb)
-            report("frames of the video", len(names), len(chosen))
-    seconds = frame_seconds(video, len(sharpness))
-    write_seconds(images.parent, {name: seconds[index] for name, index in zip(names, sorted(chosen), strict=True)})
-    return names
+    images, done = capture / "images", capture.parent / "frames.json"
+    if not done.is_file():
+        measures = measured(read_frames(video))
+        choice = chosen_frames(measures, options.num_frames)
+        _require_motion(video, choice)
+        for place, (index, rgb) in enumerate(read_numbered_frames(video, choice.numbers)):
+            write_image(images / _frame_name(index), rgb)
+            report("frames of the video", place + 1, len(choice.numbers))
+        seconds = frame_seconds(video, len(measures))
+        write_seconds(capture, {_frame_name(index): seconds[index] for index in choice.numbers})
+        fields = {"names": map(_frame_name, choice.numbers), "blurred": map(_frame_name, choice.blurred)}
+        write_text(
+            done, json.dumps({key: list(names) for key, names in fields.items()} | {"notes": [choice.summary()]})
+        )
+    stored = {key: tuple(map(str, cast("list[object]", value))) for key, value in read_json_object(done).items()}
+    photos = [Photo(name, read_header(images / name)) for name in stored["names"]]
+    return _Pictures(photos, True, stored["blurred"], stored["notes"])
 
 
-def _same_camera(photos: list[Path]) -> bool:
-    """Whether all photos have the same size, and the same camera and focal length in their EXIF tags."""
-    import OpenImageIO as oiio
-
-    kinds = set()
-    for photo in photos:
-        with reading(photo, "remove or replace it"):
-            picture = oiio.ImageInput.open(str(photo))
-            if picture is None:
-                raise DyngsError(f"cannot read the picture {photo.name}: {picture_error(oiio)}; remove or replace it")
-            spec = picture.spec()
-            model = any_text(partial(spec.get_string_attribute, "Model"))
-            kinds.add((spec.width, spec.height, model, spec.get_float_attribute("Exif:FocalLength")))
-            picture.close()
-    return len(kinds) == 1
+def _frame_name(index: int) -> str:
+    return f"frame_{index:05d}.png"
 
 
-def _sharpness(rgb: np.ndarray) -> float:
-    """Variance of the Laplacian of the brightness: higher is sharper."""
-    grey = rgb[..., 1].astype(np.float32)
-    laplacian = (
-        4 * grey[1:-1, 1:-1] - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
-    )  # fmt: skip
-    return float(laplacian.var()) if laplacian.size else 0.0
+def _require_motion(video: Path, choice: FrameChoice) -> None:
+    if choice.num_frames >= 3 and choice.path < STILL:
+        raise DyngsError(
+            f"{video}: the camera stands still (the picture moves by {choice.path:.2%} of its width in all), which "
+            "gives no depth; film while walking sideways around the scene"
+        )

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.pictures.video import VIDEO_SUFFIXES
+from dyngs.data.prepare.photos import digest_of, photos_below
 from dyngs.data.prepare.several.estimate import VideosOptions, poses_of_videos
 from dyngs.data.prepare.several.films import videos_in
 from dyngs.data.prepare.several.given import NAME as VIDEOS_FILE
-from dyngs.data.prepare.sfm import SfmOptions, estimate_poses, photos_below
+from dyngs.data.prepare.sfm import SfmOptions, estimate_poses
 from dyngs.data.read import FORMATS
 from dyngs.errors import DyngsError, reading
 from dyngs.files.cache import cache_folder
 
 FEWEST_PHOTOS = 3
-_SAMPLE_BYTES = 2**20
 
 
 def with_poses(
@@ -59,8 +57,8 @@ def with_poses(
             f"{source}: photos have no times, so nothing can move; give data.times=order if their names are in the "
             "order of time, a video, or train configs/static.yaml"
         )
-    files = [*videos, source / VIDEOS_FILE] if videos else [source] if source.is_file() else photos_below(source)
-    folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{_digest(source, files)}"
+    files = [*videos, *(path for path in [source / VIDEOS_FILE] if path.is_file())] if videos else None
+    folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{digest_of(source, files)}"
     if folder.is_dir():
         say(f"{source} has no poses; those of before are in {folder}")
         return data.model_copy(update={"root": folder})
@@ -69,7 +67,9 @@ def with_poses(
         several = VideosOptions(follow_links=data.follow_links, max_megapixels=data.max_megapixels)
         say(poses_of_videos(source, folder, several, report).summary())
     else:
-        options = SfmOptions(follow_links=data.follow_links, max_megapixels=data.max_megapixels)
+        beside = data.root / "masks"
+        masks = beside if source != data.root and beside.is_dir() else None
+        options = SfmOptions(masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels)
         say(estimate_poses(source, folder, options, report).summary())
     return data.model_copy(update={"root": folder})
 
@@ -113,24 +113,3 @@ def is_videos(source: Path) -> bool:
 def _holds_photos(folder: Path) -> bool:
     with reading(folder, "choose another folder or change its permissions"):
         return len(photos_below(folder)) >= FEWEST_PHOTOS
-
-
-def _digest(source: Path, files: Sequence[Path]) -> str:
-    """Return 16 hexadecimal digits of the names, sizes and times of change of files, and of the beginnings of videos.
-
-    Args:
-        source: the file, or a folder that holds all of them.
-        files: photos, or videos with what is known of them, which need not be there.
-    """
-    digest = hashlib.sha256()
-    for path in files:
-        if path.name == VIDEOS_FILE and not path.is_file():
-            continue
-        with reading(path):
-            status = path.stat()
-            digest.update(os.fsencode(path.relative_to(source.parent)))
-            digest.update(f"{status.st_size} {status.st_mtime_ns}".encode())
-            if path.suffix.lower() in VIDEO_SUFFIXES:
-                with path.open("rb") as file:
-                    digest.update(file.read(_SAMPLE_BYTES))
-    return digest.hexdigest()[:16]

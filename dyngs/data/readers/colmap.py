@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -73,7 +74,7 @@ def read_colmap(root: Path) -> Capture:
         raise DyngsError(f"{root / 'images'}: no such folder; put the model's pictures there")
     with reading(folder, "names of images must be UTF-8; rename the pictures and export the model again"):
         posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
-    masks, seconds = _find_masks(root / "masks"), read_seconds(root)
+    masks, seconds = find_masks(root / "masks"), read_seconds(root)
     repaired: dict[str, float] = {}
     rescaled: list[str] = []
     views = []
@@ -84,13 +85,19 @@ def read_colmap(root: Path) -> Capture:
         intrinsics, lens = pinhole_and_lens(camera, where)
         path = root / "images" / image.name
         header = header_if_readable(path)
-        stored = None if header is None else (header.width, header.height)
+        stored = None if header is None else header.size_for((camera.width, camera.height))
         intrinsics, size, changed = match_size(intrinsics, (camera.width, camera.height), stored, where)
         if changed:
             rescaled.append(where)
-        name, mask = view_name(path, root / "images"), _mask_of(image.name, masks)
+        name, mask = view_name(path, root / "images"), mask_of(image.name, masks)
         second = seconds.get(image.name)
-        views.append(View(name, path, pose, intrinsics, *size, lens, int(image.camera_id), mask_path=mask, time=second))
+        exposure = None if header is None else header.tags.exposure
+        views.append(
+            View(
+                name, path, pose, intrinsics, *size, lens, int(image.camera_id), mask_path=mask, time=second,
+                exposure=exposure,
+            )
+        )  # fmt: skip
     warnings = repair_warning(repaired) + rescale_warning(rescaled) + _warnings(folder, model, views, bool(masks))
     splits, notes = _splits(folder, [image.name for image in posed], views)
     return Capture(
@@ -159,7 +166,7 @@ def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, 
     return {"train": train, "test": test}, notes
 
 
-def _find_masks(folder: Path) -> dict[str, Path]:
+def find_masks(folder: Path) -> dict[str, Path]:
     """Map paths below ``folder``, with and without the last extension, to masks."""
     found: dict[str, Path] = {}
     for path in sorted(inside(folder).rglob("*")) if folder.is_dir() else ():
@@ -170,7 +177,7 @@ def _find_masks(folder: Path) -> dict[str, Path]:
     return found
 
 
-def _mask_of(image_name: str, masks: dict[str, Path]) -> Path | None:
+def mask_of(image_name: str, masks: Mapping[str, Path]) -> Path | None:
     """Find the mask of ``a/b.jpg``: ``a/b.jpg.png``, else ``a/b.jpg``, else ``a/b`` with any picture extension."""
     stem = image_name.rpartition(".")[0]
     return masks.get(f"{image_name}.png") or masks.get(image_name) or masks.get(stem)

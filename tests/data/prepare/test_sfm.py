@@ -72,7 +72,7 @@ def test_poses_of_the_demo_scene_are_found_from_a_video(tmp_path: Path) -> None:
     # An arc of 49 degrees fixes the focal length, and with it the angle, to some 5%.
     assert _rotation_errors_deg(result, truth).max() < 4.0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["arc.mp4", "capture"]
-    assert sorted(p.name for p in out.iterdir()) == ["images", "sparse", "times.json"]
+    assert sorted(p.name for p in out.iterdir()) == ["images", "sfm_report.json", "sparse", "times.json"]
     seconds = {view.name: view.time for view in all_views(read_capture(out).splits)}
     registered = [i for i, name in enumerate(names) if name.removesuffix(".png") in seconds]
     first, last = registered[0], registered[-1]

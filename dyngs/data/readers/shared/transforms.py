@@ -132,8 +132,10 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
     notes = _Warnings()
     views = {}
     for frame, path, header in zip(file.frames, paths, headers, strict=True):
-        stored = (header.width, header.height) if header else None
-        views[str(frame.own["file_path"])] = _view(frame, root, path, stored, common, notes)
+        described = _described_size(frame)
+        stored = header.size_for(described) if header else None
+        view = _view(frame, root, path, stored, common, notes)
+        views[str(frame.own["file_path"])] = replace(view, exposure=header.tags.exposure if header else None)
     return _with_flow_targets(views), notes.lines()
 
 
@@ -162,7 +164,7 @@ def _view(
     described = _described_size(frame) or stored or common
     if described is None:
         header = read_header(path)  # raises the error
-        described = header.width, header.height
+        described = header.upright_size
     intrinsics, size, rescaled = match_size(_intrinsics(frame, *described), described, stored, frame.where)
     if rescaled:
         notes.rescaled.append(frame.where)
@@ -251,7 +253,7 @@ def _common_size(file: FrameFile, paths: list[Path], headers: list[PictureHeader
     for frame, path, header in zip(file.frames, paths, headers, strict=True):
         has_own = any(key in frame.own for key in _FOCAL_KEYS)
         if header and not has_own and _described_size(frame) is None:
-            sizes.setdefault((header.width, header.height), path)
+            sizes.setdefault(header.upright_size, path)
     if len(sizes) > 1:
         (first, path), (second, other) = list(sizes.items())[:2]
         raise DyngsError(

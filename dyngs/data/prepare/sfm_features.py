@@ -1,0 +1,149 @@
+"""Features and matches of pictures, in COLMAP's database; what a stopped run found is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from dyngs.conventions import ReportProgress
+from dyngs.data.prepare.photos import Photo
+from dyngs.files.write import write_text
+
+_AT_ONCE, _MATCHING_CALLS = 8, 16
+_SMALL_PX = 1000
+"""Pictures up to this long are doubled in size for finding features: they have few otherwise."""
+
+
+@dataclass(frozen=True)
+class FeatureTask:
+    """Input of finding and matching features.
+
+    Attributes:
+        database: COLMAP's; made where it is missing.
+        pictures: folder of upright pictures.
+        names: of the pictures in it, in order.
+        photos: the same ones, with their tags.
+        masks: folder of masks ``NAME.png``, white = keep; None without.
+        camera_model: COLMAP's name of the lens.
+        single_camera: all pictures share a lens.
+        max_features: per picture.
+        longest_side: pictures are shrunk to this for finding features.
+        seed, num_threads: as in ``SfmOptions``.
+    """
+
+    database: Path
+    pictures: Path
+    names: Sequence[str]
+    photos: Sequence[Photo]
+    masks: Path | None
+    camera_model: str
+    single_camera: bool
+    max_features: int
+    longest_side: int
+    seed: int
+    num_threads: int
+
+    @property
+    def side(self) -> int:
+        """Longest side of a picture, in pixels."""
+        return max((max(photo.header.size) for photo in self.photos), default=0)
+
+
+def find_features(task: FeatureTask, report: ReportProgress) -> None:
+    """Find SIFT features of all pictures that have none in the database yet.
+
+    COLMAP is called for some pictures at a time: it has no callbacks, and its database must not be opened by another
+    copy of SQLite in the same process, whose end would take away COLMAP's locks.
+
+    Pictures and cameras are entered first, in order: with several threads COLMAP would number them as they are done,
+    and what follows depends on the numbers. Focal lengths of the EXIF tags are taken as first values.
+    """
+    import pycolmap
+
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = task.camera_model
+    if task.masks is not None:
+        reader.mask_path = task.masks
+    mode = pycolmap.CameraMode.SINGLE if task.single_camera else pycolmap.CameraMode.PER_IMAGE
+    if _num_images(task.database) < len(task.names):
+        task.database.unlink(missing_ok=True)
+        pycolmap.Database.open(task.database).close()
+        pycolmap.import_images(task.database, task.pictures, mode, task.names, reader)
+        _enter_focal_lengths(task)
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu = False
+    extraction.num_threads = task.num_threads or -1
+    extraction.max_image_size = task.longest_side
+    extraction.sift.max_num_features = task.max_features
+    extraction.sift.first_octave = -1 if min(task.side, task.longest_side) <= _SMALL_PX else 0
+    count = len(task.names)
+    for first in range(0, count, _AT_ONCE):
+        pycolmap.extract_features(
+            task.database, task.pictures, task.names[first : first + _AT_ONCE], camera_mode=mode,
+            reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
+        )  # fmt: skip
+        report("features, pictures", min(first + _AT_ONCE, count), count)
+
+
+def match_pairs(task: FeatureTask, pairs: Sequence[tuple[int, int]], report: ReportProgress) -> None:
+    """Match pairs of pictures, given by their places in the order, and verify them; those of before are left."""
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.num_threads = task.num_threads or -1
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = task.seed
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = task.database.with_name("pairs.txt")
+    ordered = sorted(set(pairs))  # of few pictures at a time: COLMAP prepares each one anew in every call
+    step = max(len(ordered) // _MATCHING_CALLS, _AT_ONCE)
+    for first in range(0, len(ordered), step):
+        part = ordered[first : first + step]
+        write_text(pairing.match_list_path, "".join(f"{task.names[i]} {task.names[j]}\n" for i, j in part))
+        pycolmap.match_image_pairs(task.database, matching, pairing, verification, device=pycolmap.Device.cpu)
+        report("matching, pairs", first + len(part), len(ordered))
+
+
+def matched_pictures(database: Path) -> dict[str, int]:
+    """Return how many other pictures each one was matched with, by name."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        counts = {image.image_id: 0 for image in opened.read_all_images()}
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        ids, geometries = opened.read_two_view_geometries()
+        for key, geometry in zip(ids, geometries, strict=True):
+            if len(geometry.inlier_matches):
+                for image in pycolmap.pair_id_to_image_pair(key):
+                    counts[image] += 1
+    return {names[image]: count for image, count in counts.items()}
+
+
+def _num_images(database: Path) -> int:
+    import pycolmap
+
+    if not database.is_file():
+        return 0
+    with closing(pycolmap.Database.open(database)) as opened:
+        return int(opened.num_images())
+
+
+def _enter_focal_lengths(task: FeatureTask) -> None:
+    import pycolmap
+
+    tags = dict(zip(task.names, (photo.header.tags for photo in task.photos), strict=True))
+    with pycolmap.Database.open(task.database) as opened:
+        first: dict[int, str] = {}
+        for image in sorted(opened.read_all_images(), key=lambda image: image.name):
+            first.setdefault(image.camera_id, image.name)
+        for camera in opened.read_all_cameras():
+            focal = tags[first[camera.camera_id]].focal_px
+            camera.has_prior_focal_length = focal is not None
+            if focal is not None:
+                params = camera.params.copy()
+                params[list(camera.focal_length_idxs())] = focal
+                camera.params = params
+            opened.update_camera(camera)
