@@ -101,13 +101,7 @@ class Trainer:
         """
         config, step, scene = self.config, self.done + 1, self.scene
         divisor = picture_divisor(config.train, step)
-        wanted = self._wanted(step)
-        index = self.sampler.next(self.generator, wanted)
-        picture = self.pictures.shrunk(index, divisor)
-        if self.pictures.decoded_ahead:
-            self.pictures.expect(self.sampler.coming(self.pictures.decoded_ahead, wanted))
-        if self.refinement is not None:
-            picture = replace(picture, cameras=watched(picture.cameras))
+        index, picture = self._next_picture(step, divisor)
         background = background_colour(self.background, self.generator)
         moment = self.training.moment(scene, picture, step)
         probe = (
@@ -219,6 +213,17 @@ class Trainer:
         """Return what draws the scene with its expected depth."""
         options = replace(self.options, depth="expected", absgrad=False)
         return partial(self.scene.render, options=options, background=background)
+
+    def _next_picture(self, step: int, divisor: int) -> tuple[int, Picture]:
+        """Return the index and the picture of the view that ``step`` trains on; those after it begin to be decoded."""
+        wanted = self._wanted(step)
+        index = self.sampler.next(self.generator, wanted)
+        picture = self.pictures.shrunk(index, divisor)
+        if self.pictures.decoded_ahead:
+            self.pictures.expect(self.sampler.coming(self.pictures.decoded_ahead, wanted))
+        if self.refinement is not None:
+            picture = replace(picture, cameras=watched(picture.cameras))
+        return index, picture
 
     def _options(self, step: int) -> RenderOptions:
         """Return how pictures are drawn in ``step``."""
