@@ -15,7 +15,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "and what it means. The output is a preset itself: save it, change it, train with it.",
     )
     parser.add_argument("source", type=Path, metavar="CONFIG_OR_RUN", help="preset, YAML file or run folder")
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="overrides, as for `dyngs train`")
+    parser.add_argument("overrides", nargs="*", default=[], metavar="key=value", help="overrides, as for `dyngs train`")
     parser.set_defaults(run=run)
 
 

@@ -39,7 +39,11 @@ def _add_inspect(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     )
     parser.add_argument("path", type=Path, metavar="PATH", help="capture folder, video file, or folder of videos")
     parser.add_argument(
-        "overrides", nargs="*", metavar="data.key=value", help="keys of data, such as data.follow_links=true"
+        "overrides",
+        nargs="*",
+        default=[],
+        metavar="data.key=value",
+        help="keys of data, such as data.follow_links=true",
     )
     parser.add_argument("--format", default="auto", help="format of the capture (default: detected; docs/formats.md)")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw cameras and points to this picture file")
@@ -74,7 +78,9 @@ def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
         help="when a video of several begins; once for each",
     )
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
-    parser.add_argument("overrides", nargs="*", metavar="data.key=value", help="data.follow_links, data.max_megapixels")
+    parser.add_argument(
+        "overrides", nargs="*", default=[], metavar="data.key=value", help="data.follow_links, data.max_megapixels"
+    )
     parser.set_defaults(run=run_sfm)
 
 

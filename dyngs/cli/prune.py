@@ -60,7 +60,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument("--steps", metavar="N", help="fine-tuning steps: of each trial 1000, with --prune 2000")
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="other config keys of the run (docs/cli.md)")
+    parser.add_argument(
+        "overrides", nargs="*", default=[], metavar="key=value", help="other config keys of the run (docs/cli.md)"
+    )
     parser.set_defaults(run=run)
 
 

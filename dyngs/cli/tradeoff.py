@@ -45,7 +45,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("target", metavar="RUN_OR_CONFIG", help="run folder, or a config to train first")
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="overrides of the config")
+    parser.add_argument("overrides", nargs="*", default=[], metavar="key=value", help="overrides of the config")
     parser.add_argument("--out", type=Path, metavar="DIR", help="output folder (default RUN/tradeoff)")
     parser.add_argument(
         "--vary",

@@ -50,7 +50,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("overrides", nargs="*", metavar="CONFIG key=value", help="preset or YAML file, and overrides")
+    parser.add_argument(
+        "overrides", nargs="*", default=[], metavar="CONFIG key=value", help="preset or YAML file, and overrides"
+    )
     parser.add_argument(
         "--resume",
         type=Path,

@@ -36,8 +36,9 @@ class DataConfig(Section):
         description="when the pictures were taken; files: as the capture says; order: in the order of their names, by "
         "the numbers that these end in",
     )
-    frames_per_second: Positive | None = Field(
+    frames_per_second: float | None = Field(
         default=None,
+        gt=0,
         description="with times=order: so many numbers, or places in the order, are a second; null: not known",
     )
     downscale: float = Field(default=1.0, ge=1.0, description="divide width and height of the pictures by this")
