@@ -23,10 +23,10 @@ from dyngs.tensor_checks import require_tensor
 
 STARTS = 0.05
 """Share of the run in which cameras stay as they are: a scene that is not there yet says nothing about them."""
-FIRST_RATE, LAST_RATE = 1e-3, 1e-5
+FIRST_RATE, LAST_RATE = 3e-3, 1e-5
 """Learning rates after ``STARTS`` and at the end, rad, and as a share of the scene's size; log-linear between."""
-LENS_RATE = 0.2
-"""Rate of focal lengths and principal points, as a share of that of poses: many views share a lens."""
+LENS_RATE = 0.01
+"""Rate of focal lengths and principal points, as a share of that of poses: a lens is updated in every step."""
 MIN_POSES = 8
 """Fewer poses do not tell a lens from a shift of the cameras; theirs stays as it is."""
 POSES, LENSES = "poses", "lenses"
