@@ -27,6 +27,8 @@ FIRST_RATE, LAST_RATE = 3e-3, 1e-5
 """Learning rates after ``STARTS`` and at the end, rad, and as a share of the scene's size; log-linear between."""
 LENS_RATE = 0.01
 """Rate of focal lengths and principal points, as a share of that of poses: a lens is updated in every step."""
+LENS_STARTS = 0.3
+"""Share of the run in which lenses stay: a wrong pose pulls at a lens that all share."""
 MIN_POSES = 8
 """Fewer poses do not tell a lens from a shift of the cameras; theirs stays as it is."""
 POSES, LENSES = "poses", "lenses"
@@ -183,9 +185,9 @@ class CameraRefinement:
         if rate == 0 or by_pose is None or by_intrinsics is None:
             return 0
         gradients = slopes(cameras, by_pose, by_intrinsics, self.corrections.size)
-        rates = (rate, LENS_RATE * rate)
+        rates = (rate, LENS_RATE * rate if step >= LENS_STARTS * self._steps else 0.0)
         for name, row, gradient, lr in zip(self._values(), self.corrections.rows(index), gradients, rates, strict=True):
-            if row is not None:
+            if row is not None and lr > 0:
                 arrays = self._values()[name], self._adam.exp_avg[name], self._adam.exp_avg_sq[name]
                 x, first, second = (a[row : row + 1] for a in arrays)
                 self._updates[name][row] += 1
