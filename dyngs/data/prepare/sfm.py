@@ -22,7 +22,7 @@ from dyngs.data.prepare.frame_choice import STILL, FrameChoice, chosen_frames, m
 from dyngs.data.prepare.photos import Photo, digest_of, gather_photos, lay_out, link_or_copy
 from dyngs.data.prepare.sfm_check import angles_deg, turning_share
 from dyngs.data.prepare.sfm_features import FeatureTask, find_features, match_pairs, matched_pictures
-from dyngs.data.prepare.sfm_mapping import MappingTask, Model, better, mapped, needs_more
+from dyngs.data.prepare.sfm_mapping import Mapper, MappingTask, Model, better, mapped, needs_more
 from dyngs.data.prepare.sfm_movers import without_movers
 from dyngs.data.prepare.sfm_pairs import ALIKE, ALIKE_PHOTOS, alike_pairs, all_pairs, neighbour_pairs
 from dyngs.data.prepare.sfm_report import SfmResult, advice, write_report
@@ -170,7 +170,8 @@ def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: 
         features = _feature_task(work, pictures, options)
         _matched(features, pictures.is_video, options, (clock, report))
         with clock.stage("poses"):
-            model, notes = _mapped(work, features, options, report)
+            first = "global" if pictures.is_video else "incremental"
+            model, notes = _mapped(work, features, options, first, report)
     except (RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()
         raise DyngsError(f"structure from motion failed: {reason[-1] if reason else error}") from error
@@ -242,18 +243,19 @@ def _pairs(task: FeatureTask, is_video: bool, options: SfmOptions) -> list[tuple
 
 
 def _mapped(
-    work: Path, features: FeatureTask, options: SfmOptions, report: ReportProgress
+    work: Path, features: FeatureTask, options: SfmOptions, first: Mapper, report: ReportProgress
 ) -> tuple[Model, tuple[str, ...]]:
     """Return the model, and lines about what was done for it.
 
     Where it is not good, features that disagree with most of their pictures are left out, and the better one is kept.
+    ``first`` is the mapping that is tried first.
 
     Raises:
         DyngsError: none could be found.
     """
     count = len(features.names)
     task = MappingTask(
-        features.database, features.pictures, work / "models", count, features.side, options.seed, report,
+        features.database, features.pictures, work / "models", count, features.side, options.seed, report, first,
     )  # fmt: skip
     model, notes = mapped(task, options.mapper), ()
     if model is None or needs_more(model, task):

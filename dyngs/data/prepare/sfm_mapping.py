@@ -62,6 +62,8 @@ class MappingTask:
         longest_side: of the pictures, in pixels.
         seed: of everything random.
         report: is told of pictures that got a pose.
+        first: mapping that is tried first. Incremental mapping of photos is as fast, and its poses are nearer to given
+            ones; it breaks videos into pieces.
     """
 
     database: Path
@@ -71,20 +73,21 @@ class MappingTask:
     longest_side: int
     seed: int
     report: ReportProgress
+    first: Mapper = "global"
 
 
 def mapped(task: MappingTask, wanted: Literal["auto", "global", "incremental"]) -> Model | None:
     """Return the model with most pictures; None where none could be found.
 
-    "auto" is global mapping, and incremental mapping beside it only where the first leaves pictures out, its poses do
+    "auto" is ``task.first``, and the other mapping beside it only where the first leaves pictures out, its poses do
     not fit the matches of all pairs, or its mean reprojection error is large: see ``better``.
     """
     if wanted != "auto":
         return _found(task, wanted)
-    first = _found(task, "global")
+    first = _found(task, task.first)
     if first is not None and not needs_more(first, task):
         return first
-    return better(first, _found(task, "incremental"))
+    return better(first, _found(task, "incremental" if task.first == "global" else "global"))
 
 
 def needs_more(model: Model, task: MappingTask) -> bool:
