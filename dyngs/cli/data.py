@@ -191,7 +191,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
         result = estimate_poses(arguments.images, arguments.out, options, report)
     print(result.summary())
     print(f"next: dyngs data inspect {result.root} --picture cameras.png")
-    print(f"      dyngs train configs/static.yaml data.root={result.root}")
+    print(f"      dyngs train static data.root={result.root}")
     return 0
 
 
@@ -199,10 +199,15 @@ def _run_sfm_of_videos(arguments: argparse.Namespace, limits: DataConfig) -> int
     """Estimate the poses of several cameras and print the next commands."""
     from dyngs.data.prepare.several.estimate import VideosOptions, poses_of_videos
 
-    if arguments.matching != "auto":
-        raise DyngsError(
-            f"{arguments.images}: --matching is for one video or photos; cameras are compared in all pairs"
-        )
+    for option, given in (
+        ("--matching", arguments.matching != "auto"),
+        ("--mapper", arguments.mapper != "auto"),
+        ("--masks", arguments.masks is not None),
+    ):
+        if given:
+            raise DyngsError(
+                f"{arguments.images}: {option} is for one video or photos; leave it out for several videos"
+            )
     if arguments.frames is not None and arguments.frames < 2:
         raise DyngsError("--frames must be at least 2")
     options = VideosOptions(
@@ -216,7 +221,7 @@ def _run_sfm_of_videos(arguments: argparse.Namespace, limits: DataConfig) -> int
         result = poses_of_videos(arguments.images, arguments.out, options, report)
     print(result.summary())
     print(f"next: dyngs data inspect {result.root} --picture cameras.png")
-    print(f"      dyngs train configs/dynamic.yaml data.root={result.root}")
+    print(f"      dyngs train dynamic data.root={result.root}")
     return 0
 
 

@@ -169,3 +169,14 @@ def test_inspect_takes_keys_of_data(tmp_path: Path, capsys: PrintedOutput) -> No
     assert "give keys of data" in error_line(capsys, "data", "inspect", str(root), "train.steps=3")
     assert "give keys of data" in error_line(capsys, "data", "inspect", str(root), "data.root=elsewhere")
     assert "did you mean" in error_line(capsys, "data", "inspect", str(root), "data.follow_link=true")
+
+
+@pytest.mark.parametrize("words", [["--matching", "sequential"], ["--mapper", "global"], ["--masks", "masks"]])
+def test_options_of_one_video_are_refused_for_several(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a.mp4", "b.mp4"):
+        (tmp_path / name).write_bytes(b"")
+    assert main(["data", "sfm", str(tmp_path), str(tmp_path / "out"), *words]) == 2
+    assert f"{words[0]} is for one video or photos" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
