@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 STILL = 0.003
-"""Motion over a whole clip, as a share of the picture's width, below which the camera stands still."""
+"""Largest motion since the first frame, as a share of the picture's width, below which the camera stands still."""
 _WIDTH = 96
 _TILES = 6
 _TEXTURE = 1.0
@@ -26,11 +26,13 @@ class FrameMeasures:
         sharpness: (F,) variance of the Laplacian of the brightness.
         motion: (F,) motion of most of the picture since the frame before, as a share of its width; 0 for the first.
         most: (F,) the same of the part of the picture that moves most.
+        away: (F,) motion of most of the picture since the first frame: noise does not add up in it.
     """
 
     sharpness: np.ndarray
     motion: np.ndarray
     most: np.ndarray
+    away: np.ndarray
 
     def __len__(self) -> int:
         return len(self.sharpness)
@@ -45,14 +47,14 @@ class FrameChoice:
         num_frames: frames that the video has.
         num_still: those of them at which nothing had moved since the frame before.
         blurred: chosen ones much less sharp than the others.
-        path: motion over the whole video, as a share of the picture's width.
+        reach: largest motion since the first frame, as a share of the picture's width.
     """
 
     numbers: tuple[int, ...]
     num_frames: int
     num_still: int
     blurred: tuple[int, ...]
-    path: float
+    reach: float
 
     def summary(self) -> str:
         """The choice in a line."""
@@ -61,16 +63,18 @@ class FrameChoice:
 
 
 def measured(frames: Iterable[np.ndarray]) -> FrameMeasures:
-    """Measure all frames, (H, W, 3) uint8; two small pictures are held in memory."""
-    sharpness, motions = [], []
-    before = None
+    """Measure all frames, (H, W, 3) uint8; three small pictures are held in memory."""
+    sharpness, motions, away = [], [], []
+    first = before = None
     for rgb in frames:
         small = shrunk(rgb)
+        first = small if first is None else first
         sharpness.append(sharpness_of(rgb))
         motions.append((0.0, 0.0) if before is None else motion_between(before, small))
+        away.append(motion_between(first, small)[0])
         before = small
     motion, most = np.array(motions).reshape(-1, 2).T
-    return FrameMeasures(np.array(sharpness), motion, most)
+    return FrameMeasures(np.array(sharpness), motion, most, np.array(away))
 
 
 def chosen_frames(measures: FrameMeasures, wanted: int) -> FrameChoice:
@@ -102,7 +106,7 @@ def chosen_frames(measures: FrameMeasures, wanted: int) -> FrameChoice:
     sharp = measures.sharpness[numbers]
     limit = _BLURRED * float(np.median(sharp)) if numbers else 0.0
     blurred = tuple(number for number, value in zip(numbers, sharp, strict=True) if value < limit)
-    return FrameChoice(tuple(numbers), count, int(still.sum()), blurred, float(measures.motion.sum()))
+    return FrameChoice(tuple(numbers), count, int(still.sum()), blurred, float(measures.away.max(initial=0.0)))
 
 
 def sharpness_of(rgb: np.ndarray) -> float:

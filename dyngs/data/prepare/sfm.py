@@ -25,6 +25,7 @@ from dyngs.data.prepare.sfm_features import FeatureTask, find_features, match_pa
 from dyngs.data.prepare.sfm_mapping import Mapper, MappingTask, Model, better, mapped, needs_more
 from dyngs.data.prepare.sfm_movers import without_movers
 from dyngs.data.prepare.sfm_pairs import ALIKE, ALIKE_PHOTOS, alike_pairs, all_pairs, neighbour_pairs
+from dyngs.data.prepare.sfm_parallax import Parallax, matched_pairs, parallax_of
 from dyngs.data.prepare.sfm_report import SfmResult, advice, write_report
 from dyngs.data.prepare.sfm_work import working
 from dyngs.data.readers.colmap import find_masks, mask_of
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 _EXHAUSTIVE_PHOTOS = 60
 _EXHAUSTIVE_FRAMES = 24
+_ENOUGH_FEATURES = 4000
 _SMALL_ANGLE_DEG = 1.0
 _TURNS = 0.8
 _FEWEST_MATCHED = 3
@@ -168,7 +170,7 @@ def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: 
     pycolmap.set_random_seed(options.seed)
     try:
         features = _feature_task(work, pictures, options)
-        _matched(features, pictures.is_video, options, (clock, report))
+        seen = _matched(features, pictures.is_video, options, (clock, report))
         with clock.stage("poses"):
             first = "global" if pictures.is_video else "incremental"
             model, notes = _mapped(work, features, options, first, report)
@@ -182,7 +184,7 @@ def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: 
     matched = {names[name]: count for name, count in matched_pictures(features.database).items()}
     lonely = [name for name, count in matched.items() if count < _FEWEST_MATCHED]
     missing = _write_model(model, capture, names)
-    notes = (*pictures.notes, *notes, *advice(missing, lonely, pictures.blurred, pictures.is_video))
+    notes = (*pictures.notes, *seen, *notes, *advice(missing, lonely, pictures.blurred, pictures.is_video))
     found = model.reconstruction
     result = SfmResult(
         out, len(photos), len(photos) - len(missing), missing, found.num_points3D(), model.error_px,
@@ -209,7 +211,7 @@ def _feature_task(work: Path, pictures: _Pictures, options: SfmOptions) -> Featu
     return FeatureTask(
         work / "database.db", work / "pictures", names, photos, work / "masks" if masks else None,
         options.camera_model, _is_single(pictures, options), options.max_features, options.longest_side,
-        options.seed, options.num_threads,
+        options.seed, options.num_threads, _ENOUGH_FEATURES if pictures.is_video else 0,
     )  # fmt: skip
 
 
@@ -221,13 +223,23 @@ def _is_single(pictures: _Pictures, options: SfmOptions) -> bool:
     return pictures.is_video or len(kinds) == 1
 
 
-def _matched(task: FeatureTask, is_video: bool, options: SfmOptions, told: tuple[_Clock, ReportProgress]) -> None:
-    """Find features and match pairs; those of a stopped run are kept."""
+def _matched(
+    task: FeatureTask, is_video: bool, options: SfmOptions, told: tuple[_Clock, ReportProgress]
+) -> tuple[str, ...]:
+    """Find features and match pairs; those of a stopped run are kept. Return lines about them.
+
+    Raises:
+        DyngsError: the camera only turned.
+    """
     clock, report = told
     with clock.stage("features"):
-        find_features(task, report)
+        stronger = find_features(task, report)
     with clock.stage("matching"):
         match_pairs(task, _pairs(task, is_video, options), report)
+        notes = _parallax_seen(task, is_video)
+    if stronger > 1:
+        notes = (f"features with {stronger:g} times the usual contrast were taken: frames have many", *notes)
+    return notes
 
 
 def _pairs(task: FeatureTask, is_video: bool, options: SfmOptions) -> list[tuple[int, int]]:
@@ -286,6 +298,24 @@ _TURNING = (
     "the pictures differ only as if the camera turned on the spot (or all show one flat surface), which gives no "
     "depth; walk sideways around the scene by about a quarter of its distance, and keep it in view"
 )
+
+
+def _parallax_seen(task: FeatureTask, is_video: bool) -> tuple[str, ...]:
+    """Return a line where the camera hardly moved, none where it moved enough.
+
+    Raises:
+        DyngsError: it only turned. Mapping would not notice: it finds a lens and points that fit.
+    """
+    found = parallax_of(matched_pairs(task.database), task.side)
+    if found.kind is Parallax.NONE:
+        raise DyngsError(_TURNING)
+    if found.kind is Parallax.ENOUGH:
+        return ()
+    return (
+        f"the camera hardly moved: near and far things shift by {found.share:.1%} of the picture against each other, "
+        f"so depth and focal length are uncertain; {'film' if is_video else 'take photos'} while walking sideways by "
+        "about a quarter of the distance to the scene",
+    )
 
 
 def _require_depth(model: Model, database: Path, is_video: bool) -> None:
@@ -354,8 +384,8 @@ def _frame_name(index: int) -> str:
 
 
 def _require_motion(video: Path, choice: FrameChoice) -> None:
-    if choice.num_frames >= 3 and choice.path < STILL:
+    if choice.num_frames >= 3 and choice.reach < STILL:
         raise DyngsError(
-            f"{video}: the camera stands still (the picture moves by {choice.path:.2%} of its width in all), which "
+            f"{video}: the camera stands still (the picture moves by {choice.reach:.2%} of its width), which "
             "gives no depth; film while walking sideways around the scene"
         )

@@ -6,14 +6,23 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from dyngs.conventions import ReportProgress
 from dyngs.data.prepare.photos import Photo
 from dyngs.files.write import write_text
 
+if TYPE_CHECKING:
+    import pycolmap
+
 _AT_ONCE, _MATCHING_CALLS = 8, 16
 _SMALL_PX = 1000
 """Pictures up to this long are doubled in size for finding features: they have few otherwise."""
+_PEAK = 0.02 / 3
+_STRONGER = (1.0, 1.5, 2.0, 3.0, 4.0)
+_TRIED = 3
 
 
 @dataclass(frozen=True)
@@ -31,6 +40,7 @@ class FeatureTask:
         max_features: per picture.
         longest_side: pictures are shrunk to this for finding features.
         seed, num_threads: as in ``SfmOptions``.
+        enough: features of a picture, on average over three of them, above which weak ones are left out; 0 = never.
     """
 
     database: Path
@@ -44,6 +54,7 @@ class FeatureTask:
     longest_side: int
     seed: int
     num_threads: int
+    enough: int = 0
 
     @property
     def side(self) -> int:
@@ -51,8 +62,11 @@ class FeatureTask:
         return max((max(photo.header.size) for photo in self.photos), default=0)
 
 
-def find_features(task: FeatureTask, report: ReportProgress) -> None:
+def find_features(task: FeatureTask, report: ReportProgress) -> float:
     """Find SIFT features of all pictures that have none in the database yet.
+
+    Returns how many times the usual contrast a feature must have: more than 1 where pictures have more than
+    ``task.enough``. The largest features (``max_features``) would be the coarse ones, whose places are not exact.
 
     COLMAP is called for some pictures at a time: it has no callbacks, and its database must not be opened by another
     copy of SQLite in the same process, whose end would take away COLMAP's locks.
@@ -62,29 +76,63 @@ def find_features(task: FeatureTask, report: ReportProgress) -> None:
     """
     import pycolmap
 
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = task.camera_model
-    if task.masks is not None:
-        reader.mask_path = task.masks
-    mode = pycolmap.CameraMode.SINGLE if task.single_camera else pycolmap.CameraMode.PER_IMAGE
+    reader, mode = _reader(task)
     if _num_images(task.database) < len(task.names):
         task.database.unlink(missing_ok=True)
         pycolmap.Database.open(task.database).close()
         pycolmap.import_images(task.database, task.pictures, mode, task.names, reader)
         _enter_focal_lengths(task)
+    stronger = _stronger(task) if task.enough else 1.0
+    count = len(task.names)
+    for first in range(0, count, _AT_ONCE):
+        _extract(task, task.database, task.names[first : first + _AT_ONCE], stronger)
+        report("features, pictures", min(first + _AT_ONCE, count), count)
+    return stronger
+
+
+def _reader(task: FeatureTask) -> tuple[pycolmap.ImageReaderOptions, pycolmap.CameraMode]:
+    import pycolmap
+
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = task.camera_model
+    if task.masks is not None:
+        reader.mask_path = task.masks
+    return reader, pycolmap.CameraMode.SINGLE if task.single_camera else pycolmap.CameraMode.PER_IMAGE
+
+
+def _extract(task: FeatureTask, database: Path, names: Sequence[str], stronger: float) -> None:
+    """Find features of some pictures, with ``stronger`` times the usual contrast."""
+    import pycolmap
+
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.use_gpu = False
     extraction.num_threads = task.num_threads or -1
     extraction.max_image_size = task.longest_side
     extraction.sift.max_num_features = task.max_features
+    extraction.sift.peak_threshold = stronger * _PEAK
     extraction.sift.first_octave = -1 if min(task.side, task.longest_side) <= _SMALL_PX else 0
-    count = len(task.names)
-    for first in range(0, count, _AT_ONCE):
-        pycolmap.extract_features(
-            task.database, task.pictures, task.names[first : first + _AT_ONCE], camera_mode=mode,
-            reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
-        )  # fmt: skip
-        report("features, pictures", min(first + _AT_ONCE, count), count)
+    reader, mode = _reader(task)
+    pycolmap.extract_features(
+        database, task.pictures, names, camera_mode=mode, reader_options=reader,
+        extraction_options=extraction, device=pycolmap.Device.cpu,
+    )  # fmt: skip
+
+
+def _stronger(task: FeatureTask) -> float:
+    """Return the least contrast, in multiples of the usual one, at which pictures have at most ``task.enough``."""
+    import pycolmap
+
+    places = np.linspace(0, len(task.names) - 1, _TRIED + 2).round()[1:-1]
+    names = [task.names[place] for place in sorted({int(place) for place in places})]
+    trial = task.database.with_name("trial.db")
+    for stronger in _STRONGER:
+        trial.unlink(missing_ok=True)
+        pycolmap.Database.open(trial).close()
+        _extract(task, trial, names, stronger)
+        with pycolmap.Database.open(trial) as opened:
+            if opened.num_keypoints() <= task.enough * len(names):
+                return stronger
+    return _STRONGER[-1]
 
 
 def match_pairs(task: FeatureTask, pairs: Sequence[tuple[int, int]], report: ReportProgress) -> None:

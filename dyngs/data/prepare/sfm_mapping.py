@@ -19,6 +19,9 @@ GOOD_ERROR_PX = 1.5
 """Mean reprojection error, in pixels of pictures up to 1,000 px long, above which the other mapping is tried, too."""
 GOOD_AGREEMENT = 0.9
 """Share of matched pairs that fit the poses, below which the other mapping is tried, too."""
+_TRACKS_PER_PICTURE = 400
+"""Points of a picture that global mapping places at first, those seen in most pictures; the others are added to the
+poses found. All of them take two to three times as long, for the same points in the end."""
 _THREADS = 1  # with more, sums are added in another order on each run, and the model differs
 _SAME_ERROR, _SAME_AGREEMENT = 0.05, 0.02
 
@@ -141,6 +144,7 @@ def _global(task: MappingTask, folder: Path) -> dict[int, pycolmap.Reconstructio
     seeded = (options, mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation)
     for part in seeded:
         part.random_seed = task.seed
+    mapper.track_required_tracks_per_view = _TRACKS_PER_PICTURE
     mapper.bundle_adjustment.ceres.use_gpu = mapper.global_positioning.use_gpu = False
     found = pycolmap.global_mapping(task.database, task.pictures, folder, options)
     best = max(found.values(), key=lambda model: model.num_reg_images(), default=None)

@@ -31,13 +31,13 @@ def test_a_pause_is_skipped_and_frames_are_spread_over_the_motion() -> None:
     assert choice.num_still == 19
     assert len(set(taken)) == len(taken) == 10
     assert np.diff(taken).max() <= 2
-    assert choice.path > STILL
+    assert choice.reach > STILL
 
 
 def test_the_sharpest_of_a_window_is_taken_and_blur_is_told() -> None:
     sharpness = np.array([1.0, 9.0, 1.0] * 6)
     sharpness[9:12] = 1.0
-    choice = chosen_frames(FrameMeasures(sharpness, np.full(18, 0.01), np.full(18, 0.01)), 6)
+    choice = chosen_frames(FrameMeasures(sharpness, *[np.full(18, 0.01)] * 3), 6)
     assert [number for number in choice.numbers if not 9 <= number < 12] == [1, 4, 7, 13, 16]
     assert len(choice.blurred) == 1
 
@@ -45,5 +45,14 @@ def test_the_sharpest_of_a_window_is_taken_and_blur_is_told() -> None:
 def test_a_camera_that_stands_has_no_motion() -> None:
     choice = chosen_frames(measured(_wave(0) for _ in range(8)), 5)
     assert choice.numbers == (0,)
-    assert choice.path < STILL
+    assert choice.reach < STILL
     assert chosen_frames(measured([]), 5).numbers == ()
+
+
+def test_noise_of_a_long_clip_is_no_motion_of_the_camera() -> None:
+    rng = np.random.default_rng(0)
+    noisy = (np.clip(_wave(0) + rng.normal(0, 4, (144, 192, 3)), 0, 255).astype(np.uint8) for _ in range(60))
+    measures = measured(noisy)
+    assert measures.motion.sum() > 3 * STILL
+    assert chosen_frames(measures, 20).reach < STILL
+    assert chosen_frames(measured(_wave(shift) for shift in range(4)), 4).reach > STILL

@@ -1,0 +1,122 @@
+"""Parallax of matched pictures: what a turn of the camera cannot explain, known before any pose is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+
+_WELL = 30
+_MOST_PAIRS, _MOST_MATCHES = 120, 200
+_FOCALS = np.geomspace(0.4, 3.0, 13)
+"""Focal lengths that are tried, as shares of the picture's longest side."""
+_FINE = 9
+_ROUNDS = 3
+_WIDEST = 90
+_FAR = 75
+
+
+_NONE, _NONE_PX = 0.0015, 1.0
+_SMALL, _SMALL_PX = 0.005, 2.0
+
+
+class Parallax(Enum):
+    """Whether the camera moved."""
+
+    NONE = "it turned on the spot"
+    SMALL = "it hardly moved"
+    ENOUGH = "it moved"
+
+
+@dataclass(frozen=True)
+class SeenParallax:
+    """Parallax of a set of pictures.
+
+    Attributes:
+        share: of the longest side of a picture.
+        kind: what that says about the camera.
+    """
+
+    share: float
+    kind: Parallax
+
+
+@dataclass(frozen=True)
+class MatchedPair:
+    """Matched places of two pictures.
+
+    Attributes:
+        first, second: (M, 2) from the middle of the picture, as shares of its longest side.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+
+
+def parallax_of(pairs: list[MatchedPair], longest_side: int) -> SeenParallax:
+    """Return the parallax of the pairs that have most of it (90 % have less).
+
+    The parallax of a pair is the distance that three quarters of its matches stay below after the turn of the camera
+    that explains them best, with the focal length, common to all, that leaves least. It is that of noise where the
+    camera only turned, however far, and about the focal length times the shift over the depth where it moved.
+    Without pairs nothing is known, and it is 1.
+
+    Args:
+        pairs: well matched ones.
+        longest_side: of a picture, in pixels: noise of the matches is about half a pixel.
+    """
+    if not pairs:
+        return SeenParallax(1.0, Parallax.ENOUGH)
+    coarse = np.array([_left_of(pairs, focal) for focal in _FOCALS])
+    best = int(coarse.mean(1).argmin())
+    low, high = _FOCALS[max(best - 1, 0)], _FOCALS[min(best + 1, len(_FOCALS) - 1)]
+    fine = np.array([_left_of(pairs, focal) for focal in np.linspace(low, high, _FINE)])
+    share = float(np.percentile(fine[fine.mean(1).argmin()], _WIDEST))
+    if share < max(_NONE, _NONE_PX / longest_side):
+        return SeenParallax(share, Parallax.NONE)
+    small = share < max(_SMALL, _SMALL_PX / longest_side)
+    return SeenParallax(share, Parallax.SMALL if small else Parallax.ENOUGH)
+
+
+def matched_pairs(database: Path) -> list[MatchedPair]:
+    """Return up to 120 well matched pairs of COLMAP's database, evenly chosen."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        ids, geometries = opened.read_two_view_geometries()
+        found = [(i, np.asarray(g.inlier_matches)) for i, g in zip(ids, geometries, strict=True)]
+        found = [(pycolmap.pair_id_to_image_pair(i), matches) for i, matches in found if len(matches) >= _WELL]
+        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+        owners = {image.image_id: cameras[image.camera_id] for image in opened.read_all_images()}
+
+        def places(image: int, rows: np.ndarray) -> np.ndarray:
+            camera = owners[image]
+            xy = np.asarray(opened.read_keypoints(image))[rows, :2].astype(np.float64)
+            return (xy - (camera.width / 2, camera.height / 2)) / max(camera.width, camera.height)
+
+        pairs = []
+        for (a, b), matches in found[:: -(-len(found) // _MOST_PAIRS) or 1]:
+            few = matches[:: -(-len(matches) // _MOST_MATCHES)]
+            pairs.append(MatchedPair(places(a, few[:, 0]), places(b, few[:, 1])))
+    return pairs
+
+
+def _left_of(pairs: list[MatchedPair], focal: float) -> list[float]:
+    return [_left(pair, focal) for pair in pairs]
+
+
+def _left(pair: MatchedPair, focal: float) -> float:
+    """Return the distance that three quarters of the matches stay below after the best turn."""
+    first, second = (np.c_[xy / focal, np.ones(len(xy))] for xy in (pair.first, pair.second))
+    a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (first, second))
+    kept = np.ones(len(a), bool)
+    distances = np.zeros(len(a))
+    for _ in range(_ROUNDS):
+        u, _, vt = np.linalg.svd(b[kept].T @ a[kept])
+        turned = a @ ((u * (1, 1, np.sign(np.linalg.det(u @ vt)))) @ vt).T
+        depth = np.maximum(turned[:, 2], 1e-3)
+        distances = np.linalg.norm(turned[:, :2] / depth[:, None] * focal - pair.second, axis=1)
+        kept = distances <= np.percentile(distances, _FAR)
+    return float(np.percentile(distances, _FAR))
