@@ -20,6 +20,7 @@ _FAR = 75
 
 _NONE, _NONE_PX = 0.0015, 1.0
 _SMALL, _SMALL_PX = 0.005, 2.0
+_COVERED, _CELLS = 0.5, 8
 
 
 class Parallax(Enum):
@@ -49,10 +50,12 @@ class MatchedPair:
 
     Attributes:
         first, second: (M, 2) from the middle of the picture, as shares of its longest side.
+        covered: share of the first picture, as far as it has features, in which some match.
     """
 
     first: np.ndarray
     second: np.ndarray
+    covered: float = 1.0
 
 
 def parallax_of(pairs: list[MatchedPair], longest_side: int) -> SeenParallax:
@@ -61,7 +64,8 @@ def parallax_of(pairs: list[MatchedPair], longest_side: int) -> SeenParallax:
     The parallax of a pair is the distance that three quarters of its matches stay below after the turn of the camera
     that explains them best, with the focal length, common to all, that leaves least. It is that of noise where the
     camera only turned, however far, and about the focal length times the shift over the depth where it moved.
-    Without pairs nothing is known, and it is 1.
+    Without pairs nothing is known, and it is 1. Nor is it where matches cover less than half of the pictures: what
+    else is in them may be elsewhere in the other ones, and the matches those of a thing that moves.
 
     Args:
         pairs: well matched ones.
@@ -74,6 +78,8 @@ def parallax_of(pairs: list[MatchedPair], longest_side: int) -> SeenParallax:
     low, high = _FOCALS[max(best - 1, 0)], _FOCALS[min(best + 1, len(_FOCALS) - 1)]
     fine = np.array([_left_of(pairs, focal) for focal in np.linspace(low, high, _FINE)])
     share = float(np.percentile(fine[fine.mean(1).argmin()], _WIDEST))
+    if np.median([pair.covered for pair in pairs]) < _COVERED:
+        return SeenParallax(share, Parallax.ENOUGH)
     if share < max(_NONE, _NONE_PX / longest_side):
         return SeenParallax(share, Parallax.NONE)
     small = share < max(_SMALL, _SMALL_PX / longest_side)
@@ -99,8 +105,15 @@ def matched_pairs(database: Path) -> list[MatchedPair]:
         pairs = []
         for (a, b), matches in found[:: -(-len(found) // _MOST_PAIRS) or 1]:
             few = matches[:: -(-len(matches) // _MOST_MATCHES)]
-            pairs.append(MatchedPair(places(a, few[:, 0]), places(b, few[:, 1])))
+            every = places(a, np.arange(opened.num_keypoints_for_image(a)))
+            covered = _cells(every[matches[:, 0]]) / _cells(every)
+            pairs.append(MatchedPair(every[few[:, 0]], places(b, few[:, 1]), covered))
     return pairs
+
+
+def _cells(places: np.ndarray) -> int:
+    """Return in how many cells, an eighth of the longest side wide, there are places."""
+    return len(np.unique(np.floor(places * _CELLS).astype(int), axis=0))
 
 
 def _left_of(pairs: list[MatchedPair], focal: float) -> list[float]:

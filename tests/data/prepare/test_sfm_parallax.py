@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -39,6 +41,11 @@ def test_a_small_shift_is_seen_and_a_large_one_is_enough() -> None:
     assert small.kind is Parallax.SMALL, small
     assert large.kind is Parallax.ENOUGH, large
     assert parallax_of(_pairs(0.0, 0.6), SIDE).kind is Parallax.ENOUGH
+
+
+def test_matches_of_a_small_part_of_the_pictures_refuse_nothing() -> None:
+    part = [replace(pair, covered=0.3) for pair in _pairs(8.0, 0.0)]
+    assert parallax_of(part, SIDE).kind is Parallax.ENOUGH, "they may be those of a thing that moves"
 
 
 def test_coarse_pictures_have_more_noise_and_no_pairs_say_nothing() -> None:
