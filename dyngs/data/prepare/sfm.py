@@ -7,7 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
@@ -111,7 +111,8 @@ def estimate_poses(
     if options.masks is not None and not options.masks.is_dir():
         raise DyngsError(f"no such folder of masks: {options.masks}")
     try:
-        task = f"{digest_of(source)} {replace(options, num_threads=0)}"
+        masks = "" if options.masks is None else digest_of(options.masks)
+        task = f"{digest_of(source)} {masks} {replace(options, num_threads=0)}"
         with (
             working(out, task) as (work, _),
             staying_within(source, options.follow_links or source.is_file()),
@@ -169,7 +170,8 @@ def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: 
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(options.seed)
     try:
-        features = _feature_task(work, pictures, options)
+        with nullcontext() if options.masks is None else staying_within(options.masks, options.follow_links):
+            features = _feature_task(work, pictures, options)
         seen = _matched(features, pictures.is_video, options, (clock, report))
         with clock.stage("poses"):
             first = "global" if pictures.is_video else "incremental"

@@ -107,6 +107,20 @@ def test_nothing_to_register_gives_advice_and_no_folder(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["photos"]
 
 
+def test_masks_beside_the_photos_are_read_and_links_out_of_their_folder_are_not(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for i in range(3):
+        write_image(tmp_path / "photos" / f"{i}.png", rng.integers(0, 256, (64, 64, 3), dtype=np.uint8))
+        write_image(tmp_path / "masks" / f"{i}.png", np.full((64, 64, 1), 255, np.uint8))
+    options = replace(FAST, masks=tmp_path / "masks")
+    with pytest.raises(DyngsError, match="overlap"):  # as without masks: nothing in them fits together
+        estimate_poses(tmp_path / "photos", tmp_path / "out", options)
+    (tmp_path / "masks" / "0.png").rename(tmp_path / "private.png")
+    (tmp_path / "masks" / "0.png").symlink_to("../private.png")
+    with pytest.raises(DyngsError, match=r"0\.png: leads to .*private\.png"):
+        estimate_poses(tmp_path / "photos", tmp_path / "out", options)
+
+
 def test_bad_requests_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="no such"):
         estimate_poses(tmp_path / "none", tmp_path / "out")
