@@ -321,11 +321,16 @@ def _parallax_seen(task: FeatureTask, is_video: bool) -> tuple[str, ...]:
 
 
 def _require_depth(model: Model, database: Path, is_video: bool) -> None:
-    """Check that points are seen from directions that differ.
+    """Check that points are seen from directions that differ, by a lens that there can be.
 
     Raises:
-        DyngsError: the camera turned without moving, or moved too little.
+        DyngsError: the camera turned without moving, or moved too little; or no lens fits.
     """
+    if not model.has_real_lens:
+        raise DyngsError(
+            "no lens that there can be fits the matches: most of them are probably on something that moves, as a "
+            "person who fills much of the pictures; give masks of it (--masks), or film what stands"
+        )
     angles = angles_deg(model.reconstruction)
     angle = float(np.median(angles)) if len(angles) else 0.0
     if angle >= _SMALL_ANGLE_DEG:

@@ -24,6 +24,7 @@ _TRACKS_PER_PICTURE = 400
 poses found. All of them take two to three times as long, for the same points in the end."""
 _THREADS = 1  # with more, sums are added in another order on each run, and the model differs
 _SAME_ERROR, _SAME_AGREEMENT = 0.05, 0.02
+_FOCALS = (0.2, 10.0)
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,15 @@ class Model:
     def registered(self) -> int:
         """Pictures that have a pose."""
         return self.reconstruction.num_reg_images()
+
+    @property
+    def has_real_lens(self) -> bool:
+        """Whether focal lengths, as shares of the longest side, are those of cameras: 0.2 to 10, or said by EXIF."""
+        return all(
+            camera.has_prior_focal_length
+            or _FOCALS[0] <= camera.mean_focal_length() / max(camera.width, camera.height) <= _FOCALS[1]
+            for camera in self.reconstruction.cameras.values()
+        )
 
     @property
     def error_px(self) -> float:
@@ -94,8 +104,8 @@ def mapped(task: MappingTask, wanted: Literal["auto", "global", "incremental"]) 
 
 
 def needs_more(model: Model, task: MappingTask) -> bool:
-    """Whether pictures are left out, poses do not fit the matches, or the reprojection error is large."""
-    bad = model.registered < task.count or model.agreeing < GOOD_AGREEMENT
+    """Whether pictures are left out, poses do not fit the matches, a lens is none, or the error is large."""
+    bad = model.registered < task.count or model.agreeing < GOOD_AGREEMENT or not model.has_real_lens
     return bad or model.error_px > GOOD_ERROR_PX * max(task.longest_side, 1000) / 1000
 
 
@@ -106,6 +116,8 @@ def better(first: Model | None, second: Model | None) -> Model | None:
     """
     if first is None or second is None:
         return first or second
+    if first.has_real_lens != second.has_real_lens:
+        return first if first.has_real_lens else second
     good, other = first.registered * first.agreeing, second.registered * second.agreeing
     if abs(good - other) > _SAME_AGREEMENT * max(first.registered, second.registered):
         return first if good > other else second
