@@ -19,7 +19,7 @@ _FAR = 75
 
 
 _NONE, _NONE_PX = 0.0015, 1.0
-_SMALL, _SMALL_PX = 0.005, 2.0
+_SMALL, _SMALL_PX = 0.008, 2.0
 _COVERED, _CELLS = 0.5, 8
 
 
