@@ -169,6 +169,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         background=evaluation_background(config.data.background, capture.has_alpha)[1],
     )
     x, y, z = (float(value) for value in capture.world_offset)
+    refinement = _refinement(config, pictures, extent)  # before what asks the pictures for corrected cameras
     return Trainer(
         config=config,
         scene=scene,
@@ -190,7 +191,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         priors=priors,
         robust=_robust(config, capture, pictures),
         exposures=exposures_of(config.train, pictures),
-        refinement=_refinement(config, pictures, extent),
+        refinement=refinement,
     )
 
 
@@ -210,7 +211,7 @@ def _robust(config: Config, capture: Capture, pictures: PictureLoader) -> Robust
     match config.model:
         case StaticModel() if config.train.robust == "always":
             cameras = training_cameras(capture.splits["train"], config.data)
-            return RobustMasks(pictures, cameras, config.train.steps)
+            return RobustMasks(pictures, cameras, config.train.steps, pictures.corrected)
         case _:
             return None
 

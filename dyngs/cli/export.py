@@ -1,4 +1,4 @@
-"""``dyngs export``: write a run as Gaussians in many formats, a page, tracks, an avatar, or a small .dyngs file."""
+"""``dyngs export``: write a run as Gaussians in many formats, a page, tracks, an avatar, cameras, or a .dyngs file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from dyngs.splats.formats import Written
 
 _OTHER_SUFFIXES = {f".{MOVING}": MOVING, ".npz": "tracks", ".safetensors": "avatar", ".dyngs": "dyngs"}
-_OTHER_SUFFIXES |= {".html": "html"}
+_OTHER_SUFFIXES |= {".html": "html", ".json": "cameras"}
 
 _EPILOG = """\
 examples:
@@ -32,6 +32,7 @@ examples:
   dyngs export runs/ann --format avatar --out ann.safetensors     a person as one file, for `render` and `export`
   dyngs export runs/dance --format tracks --dynamic               positions of all moving Gaussians over time, as .npz
   dyngs export runs/dance --format dyngs --out dance_export       a small file, for `eval`, `render` and `export`
+  dyngs export runs/refined --format cameras                      runs/refined/cameras/transforms.json
   dyngs export runs/dance --out dance.html                        a page that plays in any browser, offline
 """
 
@@ -40,9 +41,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``export`` to the commands."""
     parser = commands.add_parser(
         "export",
-        help="write a run as .ply, .spz, .glb and the like, tracks, avatar, small .dyngs file or page",
+        help="write a run as .ply, .spz, .glb and the like, tracks, avatar, small .dyngs file, page or cameras",
         description="Write the Gaussians of a run as files that viewers and editors read, as tracks of their centres, "
-        "as one small .dyngs file, as a page that plays by itself, or a person as an avatar file.",
+        "as one small .dyngs file, as a page that plays by itself, a person as an avatar file, or the cameras.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -50,7 +51,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--format",
         type=_format,
-        choices=(*SPLAT_FORMATS, MOVING, "tracks", "dyngs", "avatar", "html"),
+        choices=(*SPLAT_FORMATS, MOVING, "tracks", "dyngs", "avatar", "html", "cameras"),
         help="file format (default: what the suffix of --out names, else ply)",
     )
     parser.add_argument(
@@ -85,6 +86,7 @@ def _format(text: str) -> str:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the files and print where they are and how large."""
+    from dyngs.cli.export_cameras import export_cameras
     from dyngs.cli.export_html import export_page
     from dyngs.export.avatar import read_avatar
     from dyngs.runs.checkpoint import load_run
@@ -93,6 +95,8 @@ def run(arguments: argparse.Namespace) -> int:
     kind = _kind(arguments)
     if kind == "html":
         return export_page(arguments)
+    if kind == "cameras":
+        return export_cameras(arguments)
     is_file = is_avatar_file(arguments.run_dir)
     if is_file and (arguments.out is None or kind in ("dyngs", "avatar")):
         raise DyngsError(f"{arguments.run_dir}: an avatar file is exported as Gaussians or tracks, with --out PATH")

@@ -210,16 +210,10 @@ class PictureLoader:
         view = self._views[index]
         decoded = self._decoded(index % len(self._views))
         height, width = decoded.pixels.shape[:2]
-        intrinsics = scaled_intrinsics(view.intrinsics, width / view.width, height / view.height)
         pixels = premultiplied(decoded.pixels)
         return Picture(
             name=view.name,
-            cameras=Cameras(
-                torch.as_tensor(view.cam_from_world, dtype=torch.float32, device="cpu")[None],
-                torch.as_tensor(intrinsics, dtype=torch.float32, device="cpu")[None],
-                width,
-                height,
-            ),
+            cameras=_camera_of(view, width, height),
             rgb_premultiplied=pixels[..., :3].contiguous(),
             alpha=pixels[..., 3].contiguous() if pixels.shape[-1] == 4 else None,
             mask=None if decoded.mask is None else decoded.mask.float(),
@@ -229,6 +223,11 @@ class PictureLoader:
             depth=decoded.depth,
             flow=decoded.flow,
         )
+
+    def cameras(self) -> list[Cameras]:
+        """Return the cameras of all pictures as they are by now, one each; no picture is read."""
+        stored = [_camera_of(view, *size) for view, size in zip(self._views, self.sizes, strict=True)]
+        return stored if self.corrected is None else [self.corrected(i, x) for i, x in enumerate(stored)]
 
     def shrunk(self, index: int, factor: int) -> Picture:
         """Return ``self[index].shrunk(factor)``; cached for the last factor, where memory is left."""
@@ -378,6 +377,15 @@ class PictureLoader:
             last = (key, undistort_map(view.lens, view.intrinsics, view.width, view.height))
             self._last_map = last
         return last[1]
+
+
+def _camera_of(view: View, width: int, height: int) -> Cameras:
+    """Return the camera of a view as a picture of this size, by the capture."""
+    intrinsics = scaled_intrinsics(view.intrinsics, width / view.width, height / view.height)
+    pose, intrinsics = (
+        torch.as_tensor(x, dtype=torch.float32, device="cpu")[None] for x in (view.cam_from_world, intrinsics)
+    )
+    return Cameras(pose, intrinsics, width, height)
 
 
 def check_files(views: Sequence[View]) -> None:

@@ -13,15 +13,13 @@ from statistics import fmean
 
 import torch
 
-from dyngs.data.capture import View
+from dyngs.data.capture import Capture, View
 from dyngs.data.loader import PictureLoader
-from dyngs.errors import reading
 from dyngs.evaluate.temporal import Drawing
 from dyngs.metrics import psnr
-from dyngs.runs.checkpoint import LoadedRun, checkpoint_paths, latest_checkpoint
+from dyngs.runs.cameras import found_corrections
+from dyngs.runs.checkpoint import LoadedRun
 from dyngs.training.camera_fit import fitted_to_picture
-from dyngs.training.camera_refinement import CameraRefinement
-from dyngs.training.state import OTHER_CONFIG
 
 
 def psnr_from_own_poses(drawing: Drawing, pictures: PictureLoader, size: float) -> float:
@@ -42,18 +40,17 @@ def psnr_from_own_poses(drawing: Drawing, pictures: PictureLoader, size: float) 
     return fmean(scores)
 
 
-def pictures_of_split(views: Sequence[View], split: str, run_dir: Path, run: LoadedRun) -> PictureLoader:
-    """Return the pictures of a split; those of training have the cameras that training found, if it refined any.
+def pictures_of_split(capture: Capture, views: Sequence[View], run_dir: Path, run: LoadedRun) -> PictureLoader:
+    """Return the pictures of ``views``, a split of ``capture``, with the cameras that training found, if any.
+
+    Pictures that were not trained on have the lens that they share with others, and the pose of a camera that stands
+    still; all other poses are those of the capture.
 
     Raises:
         DyngsError: unreadable pictures, or a checkpoint of other views.
     """
     pictures = PictureLoader(views, run.config.data)
-    if split != "train" or run.config.camera.refine != "always" or not checkpoint_paths(run_dir):
-        return pictures
-    checkpoint = latest_checkpoint(run_dir)
-    refinement = CameraRefinement(pictures.views, run.info.extent, run.config.train.steps)
-    with reading(checkpoint.name, OTHER_CONFIG):
-        refinement.load_state(checkpoint.part("cameras"))
-    pictures.corrected = refinement.corrections.applied
+    found = found_corrections(run_dir, run, capture.splits["train"])
+    if found is not None:
+        pictures.corrected = lambda index, cameras: found.applied_to(pictures.views[index], cameras)
     return pictures

@@ -177,7 +177,7 @@ def evaluate_run(
     scene = scene_of_split(run, capture, split)
     drawing = Drawing(scene, render_options(run.config.model), colour)
     with _num_threads(threads):
-        loader = pictures_of_split(views, split, run_dir, run)
+        loader = pictures_of_split(capture, views, run_dir, run)
         regions = Regions(views, loader, colour)
         pictures = (loader[i] for i in range(len(loader)))
         scores, reasons = score_views(scene, pictures, drawing.options, colour, load_lpips(lpips_net), regions)

@@ -20,7 +20,6 @@ from dyngs.training.background import background_colour
 from dyngs.training.events import Event, Message, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer
-from dyngs.training.views import training_cameras
 
 MAIN_SHARE = 0.5
 """Share of the weight of a Gaussian that must lie in one view."""
@@ -79,7 +78,7 @@ def floaters(trainer: Trainer) -> Tensor:
     gaussians, options = scene.gaussians.detach(), replace(trainer.options, depth="expected", absgrad=False)
     total, most = torch.zeros_like(gaussians.logit_opacities), torch.zeros_like(gaussians.logit_opacities)
     nearness = torch.full_like(total, torch.inf)
-    for camera in training_cameras(trainer.pictures.views, trainer.config.data):
+    for camera in trainer.pictures.cameras():
         small = _small(camera)
         drawn = scene.render(small, None, options=options, background=background)
         assert drawn.depth is not None

@@ -29,7 +29,6 @@ from dyngs.training.background import background_colour
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer
-from dyngs.training.views import training_cameras
 from dyngs.visibility import VisibilityMasks
 
 MOVING_VIEWS, MOVING_TIMES = 8, 24
@@ -151,7 +150,7 @@ def scoring_views(trainer: Trainer, scene: Scene, times: Sequence[float | None] 
     if times is None:
         times = [None] if scene.is_still else [scene.times[i] for i in evenly_spaced(len(scene.times), MOVING_TIMES)]
     views = STILL_VIEWS if scene.is_still else MOVING_VIEWS
-    cameras = distinct_cameras(training_cameras(trainer.pictures.views, trainer.config.data), views)
+    cameras = distinct_cameras(trainer.pictures.cameras(), views)
     return ScoringViews(scene, cameras, times, trainer.options, background)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -51,8 +52,8 @@ class CameraCorrections:
 
     def __init__(self, views: Sequence[View], size: float) -> None:
         self.size = size
-        self._pose_of = _numbered([view.cam_from_world.tobytes() for view in views])
-        self._lens_of = _numbered([(view.intrinsics.tobytes(), view.width, view.height) for view in views])
+        self._pose_of, self._pose_rows = _numbered([_pose_key(view) for view in views])
+        self._lens_of, self._lens_rows = _numbered([_lens_key(view) for view in views])
         poses_of_lens = Counter(lens for lens, _ in set(zip(self._lens_of, self._pose_of, strict=True)))
         self._refines_lens = [poses_of_lens[i] >= MIN_POSES for i in range(len(poses_of_lens))]
         self.poses = torch.zeros(max(self._pose_of) + 1, 6, device="cpu")
@@ -68,6 +69,23 @@ class CameraCorrections:
         """Return ``cameras``, that of a picture of view ``index`` at any scale, corrected."""
         pose, lens = self.rows(index)
         return corrected(cameras, self.poses[pose], None if lens is None else self.lenses[lens], self.size)
+
+    def applied_to(self, view: View, cameras: Cameras) -> Cameras:
+        """Return ``cameras``, that of a picture of any view of the capture, with what is known of it.
+
+        A view that was not trained on has the pose of a camera that stands still, or a lens, as training found it.
+        """
+        pose, lens = self._pose_rows.get(_pose_key(view)), self._lens_rows.get(_lens_key(view))
+        own = torch.zeros(6, device="cpu") if pose is None else self.poses[pose]
+        return corrected(
+            cameras, own, None if lens is None or not self._refines_lens[lens] else self.lenses[lens], self.size
+        )
+
+    def corrected_view(self, view: View) -> View:
+        """Return ``view`` with its camera as ``applied_to`` has it, in float64."""
+        pose, lens = (torch.from_numpy(x).double()[None] for x in (view.cam_from_world, view.intrinsics))
+        camera = self.applied_to(view, Cameras(pose, lens, view.width, view.height))
+        return replace(view, cam_from_world=camera.cam_from_world[0].numpy(), intrinsics=camera.intrinsics[0].numpy())
 
     def remove_common_motion(self) -> None:
         """Remove from the corrections how all cameras together move, turn and grow."""
@@ -146,10 +164,18 @@ def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
 
 
-def _numbered(keys: Sequence[Hashable]) -> list[int]:
-    """Return for each key the number of those equal to it, counted in order of their first appearance."""
+def _pose_key(view: View) -> Hashable:
+    return view.cam_from_world.tobytes()
+
+
+def _lens_key(view: View) -> Hashable:
+    return view.intrinsics.tobytes(), view.width, view.height
+
+
+def _numbered(keys: Sequence[Hashable]) -> tuple[list[int], dict[Hashable, int]]:
+    """Return for each key the number of those equal to it, in order of their first appearance; and by key."""
     numbers: dict[Hashable, int] = {}
-    return [numbers.setdefault(key, len(numbers)) for key in keys]
+    return [numbers.setdefault(key, len(numbers)) for key in keys], numbers
 
 
 class CameraRefinement:

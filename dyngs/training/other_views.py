@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -34,10 +34,16 @@ class OtherViews:
     Args:
         pictures: of training.
         cameras: V cameras of their full size.
+        corrected: returns the camera of a view as it is by now, see ``PictureLoader``; None: it stays.
     """
 
-    def __init__(self, pictures: PictureLoader, cameras: Sequence[Cameras]) -> None:
-        self._pictures = pictures
+    def __init__(
+        self,
+        pictures: PictureLoader,
+        cameras: Sequence[Cameras],
+        corrected: Callable[[int, Cameras], Cameras] | None = None,
+    ) -> None:
+        self._pictures, self._cameras, self._corrected = pictures, list(cameras), corrected
         self._poses = torch.cat([camera.cam_from_world for camera in cameras]).cpu()
         self._intrinsics = torch.cat([camera.intrinsics for camera in cameras]).cpu()
         self._sizes = torch.tensor([[camera.width, camera.height] for camera in cameras], device="cpu")
@@ -84,24 +90,30 @@ class OtherViews:
     def _found(self, index: int, which: Tensor, depth: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
         """Return the (J, P) indices of the cells where other views see P cells of a picture, and whether they do."""
         grid, size = self._grids[index], self._sizes[index].float()
+        poses, intrinsics = self._now(torch.cat([others.new_tensor([index]), others]))
         places = which.nonzero().flip(1)  # column, row
         pixels = (places + 0.5) * (size / grid.flip(0))
-        intrinsics, pose = self._intrinsics[index], self._poses[index]
-        focal, middle = intrinsics.diagonal()[:2], intrinsics[:2, 2]
+        pose, focal, middle = poses[0], intrinsics[0].diagonal()[:2], intrinsics[0, :2, 2]
         local = torch.cat([(pixels - middle) / focal, torch.ones_like(pixels[:, :1])], 1) * depth[:, None]
         world = (local - pose[:3, 3]) @ pose[:3, :3]
-        there = torch.einsum("jab,pb->jpa", self._poses[others, :3, :3], world) + self._poses[others, None, :3, 3]
+        there = torch.einsum("jab,pb->jpa", poses[1:, :3, :3], world) + poses[1:, None, :3, 3]
         z = there[..., 2:]
-        focal, middle = (
-            self._intrinsics[others].diagonal(dim1=1, dim2=2)[:, None, :2],
-            self._intrinsics[others, None, :2, 2],
-        )
+        focal, middle = intrinsics[1:].diagonal(dim1=1, dim2=2)[:, None, :2], intrinsics[1:, None, :2, 2]
         pixels = there[..., :2] / z.clamp_min(_TINY) * focal + middle
         grids = self._grids[others].flip(1)[:, None]
         cells = (pixels / self._sizes[others, None].float() * grids).floor()
         is_seen = (z[..., 0] > _TINY) & (cells >= 0).all(-1) & (cells < grids).all(-1)
         cells = cells.clamp(torch.zeros_like(grids), grids - 1).long()
         return cells[..., 1] * CELLS + cells[..., 0], is_seen
+
+    def _now(self, which: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the (J, 4, 4) poses and (J, 3, 3) intrinsics of views, corrected."""
+        if self._corrected is None:
+            return self._poses[which], self._intrinsics[which]
+        cameras = [self._corrected(i, self._cameras[i]) for i in which.tolist()]
+        parts = ([camera.cam_from_world for camera in cameras], [camera.intrinsics for camera in cameras])
+        poses, intrinsics = (torch.cat(part).cpu() for part in parts)
+        return poses, intrinsics
 
     def _table(self, index: int) -> Tensor:
         """Return the (5, CELLS, CELLS) cells of a picture: premultiplied colour, alpha, mask; zeros beyond its grid."""

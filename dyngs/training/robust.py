@@ -51,10 +51,17 @@ class RobustMasks:
         pictures: of training.
         cameras: theirs, V cameras of their full size.
         steps: of the run.
+        corrected: see ``OtherViews``.
     """
 
-    def __init__(self, pictures: PictureLoader, cameras: list[Cameras], steps: int) -> None:
-        self._others, self._begins = OtherViews(pictures, cameras), WARM_UP * steps
+    def __init__(
+        self,
+        pictures: PictureLoader,
+        cameras: list[Cameras],
+        steps: int,
+        corrected: Callable[[int, Cameras], Cameras] | None = None,
+    ) -> None:
+        self._others, self._begins = OtherViews(pictures, cameras, corrected), WARM_UP * steps
         self._visits = torch.zeros(len(pictures), dtype=torch.int64, device="cpu")
         self._left_out = torch.zeros(len(pictures), CELLS, CELLS, dtype=torch.uint8, device="cpu")
         self._histogram = torch.zeros(_OCTAVES * _PER_OCTAVE, dtype=torch.float64, device="cpu")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 
 from dyngs.api.train import train
 from dyngs.build import assemble
+from dyngs.camera import Cameras
 from dyngs.config import Config
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.gaussians import Gaussians
@@ -78,3 +80,17 @@ def test_few_views_or_no_wish_leave_all(
     monkeypatch.setattr(module, "FEWEST_VIEWS", 3 if "false" in keys[0] else 20)
     monkeypatch.setattr(module, "floaters", lambda trainer: torch.arange(len(trainer.scene)) < 2)
     assert len(load_run(train(config_of(still, *keys, f"run.dir={tmp_path / 'run'}"))).scene) == 300
+
+
+def test_cameras_are_those_that_training_found(trainer: Trainer) -> None:
+    """A camera that turned out to be elsewhere has nothing close before it."""
+    before = floaters(trainer)
+
+    def moved(index: int, cameras: Cameras) -> Cameras:
+        pose = cameras.cam_from_world.clone()
+        pose[:, 2, 3] += 5.0 * (index == 0)
+        return replace(cameras, cam_from_world=pose)
+
+    trainer.pictures.corrected = moved
+    assert bool(before[-1])
+    assert not bool(floaters(trainer)[-1])

@@ -244,3 +244,29 @@ def test_without_refinement_nothing_is_kept_for_it(refine: str, still: Path) -> 
     trainer = trainer_of(still, refine)
     assert trainer.refinement is None
     assert not any(name.startswith("cameras") for name in trainer.state())
+
+
+def test_a_view_that_was_not_trained_on_has_what_is_known_of_its_camera() -> None:
+    """The pose of a camera that stands still, a lens of many poses, and nothing else; training views have both."""
+    views = random_views(MIN_POSES)
+    found = CameraCorrections(views, SIZE)
+    found.poses += 0.01
+    found.lenses += 0.02
+    generator = torch.Generator().manual_seed(1)
+    other = random_view(99, generator)
+    zoomed = random_view(98, generator, intrinsics=np.diag([200.0, 200.0, 1.0]))
+    same_place = replace(other, cam_from_world=views[2].cam_from_world)
+    for index, view in enumerate(views):
+        torch.testing.assert_close(
+            found.applied_to(view, camera_of(view)).cam_from_world, found.applied(index, camera_of(view)).cam_from_world
+        )
+    np.testing.assert_array_equal(found.corrected_view(zoomed).cam_from_world, zoomed.cam_from_world)
+    np.testing.assert_array_equal(found.corrected_view(zoomed).intrinsics, zoomed.intrinsics)
+    np.testing.assert_array_equal(found.corrected_view(other).cam_from_world, other.cam_from_world)
+    lens = found.corrected_view(views[0]).intrinsics
+    np.testing.assert_array_equal(found.corrected_view(other).intrinsics, lens)
+    assert abs(lens[0, 0] / other.intrinsics[0, 0] - np.exp(0.02)) < 1e-6
+    np.testing.assert_array_equal(
+        found.corrected_view(same_place).cam_from_world, found.corrected_view(views[2]).cam_from_world
+    )
+    assert np.abs(found.corrected_view(views[2]).cam_from_world - views[2].cam_from_world).max() > 1e-3

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from flat_wall import BLACK, DISTANCE, cameras_before_wall, learned, seen_from, wall
@@ -50,3 +52,22 @@ def test_colours_lie_on_the_background_and_masked_cells_do_not_count() -> None:
 @pytest.mark.parametrize(("size", "grid"), [((80, 60), (30, 40)), ((60, 80), (40, 30)), ((1000, 3), (1, 40))])
 def test_the_longest_side_has_so_many_cells(size: tuple[int, int], grid: tuple[int, int]) -> None:
     assert grid_of(*size) == grid
+
+
+def test_places_are_found_by_cameras_as_they_are_by_now() -> None:
+    """Wrong cameras that are corrected find what the right ones do."""
+    right = cameras_before_wall(6)
+    shift = torch.tensor([0.4, 0.3, 0.0])
+    wrong = []
+    for camera in right:
+        pose = camera.cam_from_world.clone()
+        pose[0, :3, 3] += shift
+        wrong.append(replace(camera, cam_from_world=pose))
+    rgb = wall(right[1])
+    more = torch.stack([torch.full_like(rgb[..., 0], DISTANCE), torch.ones_like(rgb[..., 0])], -1)
+    grid = grid_of(rgb.shape[1], rgb.shape[0])
+    drawn = adaptive_avg_pool2d(torch.cat([rgb, more], -1).permute(2, 0, 1), grid)
+    which, pictures = torch.ones(grid, dtype=torch.bool), seen_from(right)
+    given = OtherViews(pictures, right).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
+    found = OtherViews(pictures, wrong, lambda i, _: right[i]).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
+    assert torch.equal(found, given)

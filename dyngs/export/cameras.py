@@ -1,0 +1,107 @@
+"""Cameras of a run as a transforms.json: those of training as training found them, the others by the capture."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dyngs.data.capture import Capture, PointCloud, Split, View
+from dyngs.data.geometry.poses import opengl_from_cam
+from dyngs.files.write import atomic_file, write_text
+
+NAME, POINTS_NAME = "transforms.json", "points.ply"
+_OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
+
+
+def write_cameras(path: Path, capture: Capture, splits: Mapping[Split, Sequence[View]]) -> Path:
+    """Write cameras in nerfstudio's layout, and the capture's points beside them; return ``path``.
+
+    Pictures stay where they are: ``file_path`` is the way to them from the folder of ``path``. Poses are in the world
+    of the capture's files. Coefficients of distortion are those of the capture.
+
+    Args:
+        path: the file.
+        capture: whose views they are.
+        splits: views of train, val and test, with the cameras to write.
+
+    Raises:
+        DyngsError: the folder cannot be written.
+    """
+    folder = Path(os.path.abspath(path.parent))
+    frames: list[dict[str, object]] = []
+    content: dict[str, object] = {}
+    for split, views in splits.items():
+        own = [_frame(view, folder, capture) for view in views]
+        content[f"{split}_filenames"] = [frame["file_path"] for frame in own]
+        frames += own
+    if capture.fps is not None:
+        content["fps"] = capture.fps
+    if capture.points is not None:
+        _write_points(path.with_name(POINTS_NAME), capture.points, capture.world_offset)
+        content["ply_file_path"] = POINTS_NAME
+    write_text(path, json.dumps(content | {"frames": frames}, indent=1) + "\n")
+    return path
+
+
+def _frame(view: View, folder: Path, capture: Capture) -> dict[str, object]:
+    """Return the entry of a view; its files are named as seen from ``folder``."""
+    pose = opengl_from_cam(view.cam_from_world)
+    pose[:3, 3] += capture.world_offset
+    first, last = capture.span or (0.0, 1.0)
+    (fx, _, cx), (_, fy, cy) = view.intrinsics[:2].tolist()
+    frame: dict[str, object] = {
+        "file_path": _way(view.image_path, folder),
+        "transform_matrix": pose.tolist(),
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx,
+        "cy": cy,
+        "w": view.width,
+        "h": view.height,
+        "camera": view.camera_id,
+    }
+    match view.lens.model:
+        case "none":
+            frame["camera_model"] = "PINHOLE"
+        case "opencv":
+            frame["camera_model"] = "FULL_OPENCV" if len(view.lens.params) > 5 else "OPENCV"
+            frame |= dict(zip(_OPENCV_NAMES, view.lens.params, strict=False))
+        case "fisheye":
+            frame["camera_model"] = "OPENCV_FISHEYE"
+            frame |= dict(zip(_FISHEYE_NAMES, view.lens.params, strict=False))
+    if view.time is not None:
+        frame["time"] = first + view.time * (last - first)
+    if view.frame is not None:
+        frame["frame"] = view.frame
+    files = {"mask_path": view.mask_path, "depth_file_path": view.depth_path, "flow_file_path": view.flow_path}
+    files["instance_mask_path" if view.motion_mask_labels else "motion_mask_path"] = view.motion_mask_path
+    return frame | {key: _way(file, folder) for key, file in files.items() if file is not None}
+
+
+def _way(file: Path, folder: Path) -> str:
+    """Return the way from ``folder`` to ``file``; the whole path where there is none, as between two drives."""
+    file = Path(os.path.abspath(file))
+    try:
+        return os.path.relpath(file, folder).replace(os.sep, "/")
+    except ValueError:
+        return file.as_posix()
+
+
+def _write_points(path: Path, points: PointCloud, offset: np.ndarray) -> None:
+    """Write points with their colours as a binary .ply."""
+    fields = [(name, "<f8") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    rows = np.empty(len(points.xyz), dtype=fields)
+    for i, name in enumerate("xyz"):
+        rows[name] = points.xyz[:, i] + offset[i]
+    for i, name in enumerate(("red", "green", "blue")):
+        rows[name] = points.rgb[:, i]
+    kinds = {"<f8": "double", "u1": "uchar"}
+    lines = [f"property {kinds[kind]} {name}" for name, kind in fields]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *lines, "end_header"]
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(("\n".join(header) + "\n").encode() + rows.tobytes())

@@ -1,0 +1,32 @@
+"""Cameras as a run found them, where it refined those of its capture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from dyngs.data.capture import View
+from dyngs.errors import reading
+from dyngs.runs.checkpoint import LoadedRun, checkpoint_paths, latest_checkpoint
+from dyngs.training.camera_refinement import CameraCorrections, CameraRefinement
+from dyngs.training.state import OTHER_CONFIG
+
+
+def found_corrections(run_dir: Path, run: LoadedRun, trained_on: Sequence[View]) -> CameraCorrections | None:
+    """Return the corrections of a run's cameras; None where it refined none, or has no checkpoint.
+
+    Args:
+        run_dir: its folder.
+        run: what was loaded from there.
+        trained_on: the training views of its capture.
+
+    Raises:
+        DyngsError: a checkpoint of other views.
+    """
+    if run.config.camera.refine != "always" or not checkpoint_paths(run_dir):
+        return None
+    checkpoint = latest_checkpoint(run_dir)
+    refinement = CameraRefinement(trained_on, run.info.extent, run.config.train.steps)
+    with reading(checkpoint.name, OTHER_CONFIG):
+        refinement.load_state(checkpoint.part("cameras"))
+    return refinement.corrections
