@@ -10,25 +10,18 @@ poses, and from poses refined on the pictures themselves. FOLDER keeps copies an
 
 from __future__ import annotations
 
-import argparse
 import json
-import re
-import resource
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
+from disturbed import Study, print_table
 
-from dyngs.api.train import train
 from dyngs.config import DataConfig
-from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.files.write import write_text
-from dyngs.ops.native import kernel_threads
-from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.runs.checkpoint import load_run
 
 DEGREES, SHARE = 0.5, 0.01
 
@@ -60,42 +53,22 @@ def _motion(random: np.random.Generator, shift: float) -> np.ndarray:
     return motion
 
 
-def row(root: Path, run: Path, preset: str, keys: Sequence[str]) -> str:
-    """Return the cells of a run, trained where it is not there."""
-    seconds = ""
-    if not checkpoint_paths(run):
-        begun = resource.getrusage(resource.RUSAGE_SELF).ru_utime
-        train(load_config(packaged_preset(preset), [f"data.root={root}", f"run.dir={run}", *keys]))
-        seconds = f"{resource.getrusage(resource.RUSAGE_SELF).ru_utime - begun:.0f}"
+def scores(run: Path) -> list[str]:
+    """Return the cells of a run: what was used, PSNR from given and from own poses, and its size."""
     report = evaluate_run(run, refine_poses=True)
     used = load_run(run).config.camera.refine
-    return f"{used} | {report.psnr:.2f} | {report.psnr_own_poses:.2f} | {report.num_gaussians:,} | {seconds}"
+    return [used, f"{report.psnr:.2f}", f"{report.psnr_own_poses:.2f}", f"{report.num_gaussians:,}"]
 
 
-def main(words: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("words", nargs="+", help="captures, and key=value")
-    parser.add_argument("--preset", default="static")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--refine", default="never,always,auto")
-    parser.add_argument("--cameras", default="given,disturbed")
-    options = parser.parse_intermixed_args(words)
-    captures = [Path(word) for word in options.words if not re.match(r"[\w.]+=", word)]
-    keys = [word for word in options.words if re.match(r"[\w.]+=", word)]
-    print("| capture | cameras | camera.refine | used | PSNR | own poses | Gaussians | CPU s |\n|" + "---|" * 8)
-    with kernel_threads(torch.get_num_threads()):
-        for capture in captures:
-            copy = options.folder / f"{capture.name}_disturbed"
-            if not copy.exists():
-                disturb(capture, copy, options.seed)
-            for cameras in options.cameras.split(","):
-                root = copy if cameras == "disturbed" else capture
-                for refine in options.refine.split(","):
-                    run = options.folder / f"{capture.name}_{cameras}_{refine}"
-                    cells = row(root, run, options.preset, [f"camera.refine={refine}", *keys])
-                    print(f"| {capture.name} | {cameras} | {refine} | {cells} |", flush=True)
-
+STUDY = Study(
+    text=__doc__ or "",
+    worse="cameras",
+    given="given",
+    key="camera.refine",
+    disturb=disturb,
+    columns=("used", "PSNR", "own poses", "Gaussians"),
+    scores=scores,
+)
 
 if __name__ == "__main__":
-    main()
+    print_table(STUDY)

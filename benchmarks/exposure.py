@@ -4,29 +4,23 @@
 
 In a copy of each capture every training picture has its own random gain (0.6 to 1.6) and white balance (each channel
 0.85 to 1.18), applied to the stored values and cut off at white as a camera does; test pictures are as they were. The
-preset (configs/static.yaml with the overrides) is trained on the capture as it is and on the copy. All are measured on
-the same untouched test pictures: as they are, after one affine colour for all of them (the scene has the colours of the
-mean picture), and right halves after an affine colour fitted on left halves. FOLDER keeps copies and runs, which are
-reused.
+preset (static, with the overrides) is trained on the capture as it is and on the copy. All are measured on the same
+untouched test pictures: as they are, after one affine colour for all of them (the scene has the colours of the mean
+picture), and right halves after an affine colour fitted on left halves. FOLDER keeps copies and runs, which are reused.
 """
 
 from __future__ import annotations
 
-import argparse
-import re
-import resource
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 import torch
+from disturbed import Study, print_table
 
-from dyngs.api.train import train
 from dyngs.colour.affine import fitted_affine, recoloured
 from dyngs.config import Config, DataConfig
-from dyngs.config.io import load_config
 from dyngs.data.loader import PictureLoader
 from dyngs.data.pictures.images import read_picture
 from dyngs.data.read import read_capture
@@ -34,12 +28,10 @@ from dyngs.evaluate.half_fit import right_half_scores
 from dyngs.evaluate.report import split_views
 from dyngs.files.write import write_image
 from dyngs.metrics import psnr
-from dyngs.ops.native import kernel_threads
-from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.runs.checkpoint import load_run
 from dyngs.scene import render_options
 from dyngs.training.background import evaluation_background
 
-PRESET = Path(__file__).parents[1] / "configs" / "static.yaml"
 GAINS, WHITE_BALANCE = (0.6, 1.6), (0.85, 1.18)
 
 
@@ -60,8 +52,11 @@ def _between(random: np.random.Generator, limits: tuple[float, float], count: in
 
 
 @torch.no_grad()
-def scores(run: Path) -> tuple[float, float, float, float]:
-    """Return PSNR of test pictures as they are, after one affine colour for all, of halves as they are and fitted."""
+def scores(run: Path) -> list[str]:
+    """Return the cells of a run: what was used, and PSNR of test pictures.
+
+    As they are, after one affine colour for all, of halves as they are, and of halves fitted.
+    """
     loaded = load_run(run)
     config: Config = loaded.config
     capture = read_capture(config.data)
@@ -76,47 +71,19 @@ def scores(run: Path) -> tuple[float, float, float, float]:
     plain = [psnr(r.rgb[0], p.composite(background), p.mask) for p, r in shown]
     fitted = [psnr(recoloured(one, p, r, background), p.composite(background), p.mask) for p, r in shown]
     halves = [right_half_scores(p, r, background) for p, r in shown]
-    return fmean(plain), fmean(fitted), fmean(x.plain or 0.0 for x in halves), fmean(x.fitted or 0.0 for x in halves)
+    means = [fmean(plain), fmean(fitted), fmean(x.plain or 0.0 for x in halves), fmean(x.fitted or 0.0 for x in halves)]
+    return [config.train.exposure, *(f"{mean:.2f}" for mean in means)]
 
 
-def row(root: Path, run: Path, exposure: str, overrides: Sequence[str]) -> str:
-    """Return the cells of a run, trained where it is not there."""
-    seconds = ""
-    if not checkpoint_paths(run):
-        begun = resource.getrusage(resource.RUSAGE_SELF).ru_utime
-        train(load_config(PRESET, [f"data.root={root}", f"run.dir={run}", f"train.exposure={exposure}", *overrides]))
-        seconds = f"{resource.getrusage(resource.RUSAGE_SELF).ru_utime - begun:.0f}"
-    cells = " | ".join(f"{score:.2f}" for score in scores(run))
-    taken = load_run(run).config.train.exposure
-    return f"{taken} | {cells} | {seconds}"
-
-
-def main(words: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("words", nargs="+", help="captures, and key=value")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--exposure", default="never,always,auto")
-    parser.add_argument("--pictures", default="untouched,disturbed")
-    options = parser.parse_intermixed_args(words)
-    captures = [Path(word) for word in options.words if not re.match(r"[\w.]+=", word)]
-    overrides = [word for word in options.words if re.match(r"[\w.]+=", word)]
-    print(
-        "| capture | pictures | train.exposure | used | PSNR | one affine | right halves | fitted | CPU s |\n|"
-        + "---|" * 9
-    )
-    with kernel_threads(torch.get_num_threads()):
-        for capture in captures:
-            copy = options.folder / f"{capture.name}_disturbed"
-            if not copy.exists():
-                disturb(capture, copy, options.seed)
-            for pictures in options.pictures.split(","):
-                root = copy if pictures == "disturbed" else capture
-                for exposure in options.exposure.split(","):
-                    run = options.folder / f"{capture.name}_{pictures}_{exposure}"
-                    cells = row(root, run, exposure, overrides)
-                    print(f"| {capture.name} | {pictures} | {exposure} | {cells} |", flush=True)
-
+STUDY = Study(
+    text=__doc__ or "",
+    worse="pictures",
+    given="untouched",
+    key="train.exposure",
+    disturb=disturb,
+    columns=("used", "PSNR", "one affine", "right halves", "fitted"),
+    scores=scores,
+)
 
 if __name__ == "__main__":
-    main()
+    print_table(STUDY)

@@ -25,10 +25,12 @@ class Lens:
     Attributes:
         model: "none", "opencv" (k1 k2 p1 p2 [k3 k4 k5 k6]) or "fisheye" (OpenCV equidistant k1..k4).
         params: the coefficients, in OpenCV's order.
+        focal_ratio: focal length of the lens over that of the pinhole, which the view's intrinsics have.
     """
 
     model: Literal["none", "opencv", "fisheye"] = "none"
     params: tuple[float, ...] = ()
+    focal_ratio: float = 1.0
 
 
 @dataclass(frozen=True)

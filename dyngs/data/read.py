@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from dyngs.config import DataConfig
-from dyngs.data.capture import Capture, PointCloud, Splits, View, all_views
+from dyngs.data.capture import Capture, Lens, PointCloud, Splits, View, all_views
 from dyngs.data.frame_selection import select_frames
 from dyngs.data.geometry.recenter import recenter
 from dyngs.data.name_order import times_by_name
 from dyngs.data.pictures.frame_cache import decode_frames
 from dyngs.data.pictures.images import read_header
+from dyngs.data.pictures.lens import wide_pinhole
 from dyngs.data.prior_files import present_priors
 from dyngs.data.readers import (
     blender,
@@ -144,6 +146,8 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         if not splits["train"]:
             raise DyngsError(f"{capture.root}: data.test_every={options.test_every} leaves no training views; raise it")
     splits.setdefault("val", ())
+    if options.undistort == "wide":
+        splits = {name: _wide(views) for name, views in splits.items()}
     if new_poses is not None:
         splits["pose"] = new_poses
     for view in all_views(splits):
@@ -166,6 +170,18 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         warnings=(*warnings, *by_name, *notes, *more, *absent),
     )
     return recenter(capture)
+
+
+def _wide(views: tuple[View, ...]) -> tuple[View, ...]:
+    """Return views whose pinholes show all that their lenses saw."""
+    known: dict[Hashable, tuple[Lens, np.ndarray]] = {}
+    wide: list[View] = []
+    for view in views:
+        key = (view.lens, view.intrinsics.tobytes(), view.width, view.height)
+        if key not in known:
+            known[key] = wide_pinhole(view.lens, view.intrinsics, view.width, view.height)
+        wide.append(replace(view, lens=known[key][0], intrinsics=known[key][1]))
+    return tuple(wide)
 
 
 def _check_places(view: View) -> None:

@@ -53,7 +53,7 @@ def _frame(view: View, folder: Path, capture: Capture) -> dict[str, object]:
     pose = opengl_from_cam(view.cam_from_world)
     pose[:3, 3] += capture.world_offset
     first, last = capture.span or (0.0, 1.0)
-    (fx, _, cx), (_, fy, cy) = view.intrinsics[:2].tolist()
+    (fx, _, cx), (_, fy, cy) = (view.intrinsics @ np.diag([view.lens.focal_ratio] * 2 + [1])).tolist()[:2]
     frame: dict[str, object] = {
         "file_path": _way(view.image_path, folder),
         "transform_matrix": pose.tolist(),

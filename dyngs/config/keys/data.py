@@ -45,6 +45,11 @@ class DataConfig(Section):
     longest_side: int | None = Field(
         default=None, ge=1, description="shrink pictures so that the longer side has at most this many px; null: do not"
     )
+    undistort: Literal["same_focal", "wide"] = Field(
+        default="same_focal",
+        description="pinhole that pictures of other lenses are undistorted to; same_focal: of the same focal length, "
+        "what lies beyond its edges is lost; wide: of a shorter one that shows all the lens saw, within 120 degrees",
+    )
     test_every: int = Field(
         default=8, ge=0, description="hold out every n-th picture by name where the capture has no split; 0: none"
     )

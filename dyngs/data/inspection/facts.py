@@ -13,6 +13,8 @@ from dyngs.data.geometry.poses import camera_center
 from dyngs.data.pictures.lens import is_pinhole, kept_share
 from dyngs.data.times import distinct_times
 
+MUCH_LOST = 90
+"""Per cent of a picture below which a wider pinhole is worth a word."""
 MOST_LENSES = 20
 """Different lenses that are looked at; more are not needed to tell how much is lost."""
 
@@ -60,7 +62,13 @@ def _kept(views: Sequence[View]) -> str:
     if not distorted:
         return ""
     shares = [100 * kept_share(view.lens, view.intrinsics, view.width, view.height) for view in distorted]
-    return f"; undistorted with the same focal length, which keeps {_range(shares)} % of each picture"
+    ratios = [view.lens.focal_ratio for view in distorted]
+    if max(ratios) > 1:
+        how = f"to a pinhole with {_range([1 / ratio for ratio in ratios])} of the focal length"
+    else:
+        how = "with the same focal length"
+    more = " (data.undistort=wide keeps more)" if max(ratios) == 1 and min(shares) < MUCH_LOST else ""
+    return f"; undistorted {how}, which keeps {_range(shares)} % of each picture{more}"
 
 
 def _masks(views: Sequence[View]) -> str:

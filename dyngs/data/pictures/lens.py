@@ -1,8 +1,12 @@
-"""Lens undistortion by resampling: from the stored picture to a pinhole picture with the same camera matrix."""
+"""Lens undistortion by resampling: from the stored picture to a pinhole picture of the same size and centre.
+
+The pinhole has the focal length of the lens, or a shorter one that shows more of what the lens saw (``wide_pinhole``).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,6 +18,10 @@ _ROWS_PER_CHUNK = 256
 _ITERATIONS = 30
 _CLOSE_PX = 0.05
 _GRID = 64
+WIDEST_DEG = 120.0
+"""Field of view that ``wide_pinhole`` keeps at most: beyond, a pinhole's picture is mostly stretched rim."""
+WORTH = 1.02
+"""A focal length that is shorter by less than this factor is not worth it."""
 
 
 @dataclass(frozen=True)
@@ -35,26 +43,27 @@ def is_pinhole(lens: Lens) -> bool:
 
 
 def distort(lens: Lens, points: Tensor) -> Tensor:
-    """Return the (..., 2) distorted positions of ``points`` (..., 2), both on the plane z = 1.
+    """Return the (..., 2) distorted positions, in focal lengths of the pinhole, of ``points`` (..., 2) on plane z = 1.
 
     "opencv": Brown-Conrady, ``x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)`` plus the tangential
     terms. "fisheye": ``theta (1 + k1 theta^2 + .. + k4 theta^8)`` along the direction of the point, theta = atan(r).
+    Both times ``focal_ratio``.
     """
     if is_pinhole(lens):
         return points
     if lens.model == "fisheye":
-        return _distort_fisheye(lens, points)
+        return lens.focal_ratio * _distort_fisheye(lens, points)
     from kornia.geometry.calibration import distort_points
 
     identity = torch.eye(3, dtype=points.dtype, device=points.device)[None]
     coefficients = torch.tensor([_padded(lens.params)], dtype=points.dtype, device=points.device)
-    return distort_points(points.reshape(1, -1, 2), identity, coefficients).reshape(points.shape)
+    return lens.focal_ratio * distort_points(points.reshape(1, -1, 2), identity, coefficients).reshape(points.shape)
 
 
 def undistorted_points(lens: Lens, intrinsics: np.ndarray, points: Tensor) -> Tensor:
     """Return the (..., 2) pixel positions in the pinhole picture of ``points`` (..., 2) in the stored, distorted one.
 
-    By fixed-point iteration, in float64; NaN where it does not converge to ``_CLOSE_PX``, as far outside the field of
+    By iteration, in float64; NaN where it does not converge to ``_CLOSE_PX``, as far outside the field of
     view, and where a point is NaN.
 
     Args:
@@ -65,9 +74,12 @@ def undistorted_points(lens: Lens, intrinsics: np.ndarray, points: Tensor) -> Te
     k = torch.as_tensor(intrinsics, dtype=torch.float64, device=points.device)
     focal, center = k.diagonal()[:2], k[:2, 2]
     wanted = (points.double() - center) / focal
-    found = wanted
-    for _ in range(_ITERATIONS):
-        found = found + (wanted - distort(lens, found))
+    found = wanted / lens.focal_ratio
+    if lens.model == "fisheye":
+        found = _straightened_fisheye(lens, found)
+    else:
+        for _ in range(_ITERATIONS):
+            found = found + (wanted - distort(lens, found)) / lens.focal_ratio
     close = ((distort(lens, found) - wanted) * focal).norm(dim=-1, keepdim=True) < _CLOSE_PX
     return torch.where(close, found * focal + center, torch.nan).to(points.dtype)
 
@@ -83,10 +95,41 @@ def kept_share(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> f
     if is_pinhole(lens):
         return 1.0
     shares = (torch.arange(_GRID, dtype=torch.float64, device="cpu") + 0.5) / _GRID
+    found = _undistorted_grid(lens, intrinsics, (width, height), shares)
     size = shares.new_tensor([width, height])
-    points = torch.stack(torch.meshgrid(shares, shares, indexing="xy"), dim=-1) * size
-    found = undistorted_points(lens, intrinsics, points)
     return float(((found >= 0) & (found <= size)).all(-1).double().mean())  # false for NaN
+
+
+def wide_pinhole(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> tuple[Lens, np.ndarray]:
+    """Return the lens and the (3, 3) pinhole of the same size and centre that shows all that the lens saw.
+
+    Of what lies up to ``WIDEST_DEG`` / 2 from the axis. Its focal length is shorter, never longer; the middle of the
+    picture has that much fewer pixels per degree, and what the lens did not see is not valid in ``undistort_map``.
+
+    Args:
+        intrinsics: (3, 3) camera matrix in pixels, with the focal length of the lens.
+    """
+    if is_pinhole(lens):
+        return lens, intrinsics
+    shares = torch.linspace(0, 1, _GRID + 1, dtype=torch.float64, device="cpu")
+    center = shares.new_tensor(intrinsics[:2, 2])
+    focal = shares.new_tensor(np.diag(intrinsics)[:2])
+    found = (_undistorted_grid(lens, intrinsics, (width, height), shares) - center) / focal
+    farthest = _radius_limit(lens, intrinsics, width, height)
+    limit = min(math.tan(math.radians(WIDEST_DEG / 2)), farthest)
+    seen = found[found.norm(dim=-1) <= limit]  # false for NaN
+    room = torch.stack([center, shares.new_tensor([width, height]) - center]).clamp_min(1) / focal
+    needed = torch.stack([-seen.min(0).values, seen.max(0).values]) / room if len(seen) else room.new_ones(1)
+    ratio = float(needed.max())
+    if ratio < WORTH:
+        return lens, intrinsics
+    return replace(lens, focal_ratio=lens.focal_ratio * ratio), intrinsics @ np.diag([1 / ratio, 1 / ratio, 1.0])
+
+
+def _undistorted_grid(lens: Lens, intrinsics: np.ndarray, size: tuple[int, int], shares: Tensor) -> Tensor:
+    """Return (N, N, 2) the places in the pinhole picture, px, of a grid of places in the stored one."""
+    points = torch.stack(torch.meshgrid(shares, shares, indexing="xy"), dim=-1) * shares.new_tensor(size)
+    return undistorted_points(lens, intrinsics, points)
 
 
 def undistort_map(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> LensMap:
@@ -137,6 +180,19 @@ def _distort_fisheye(lens: Lens, points: Tensor) -> Tensor:
     radius = points.norm(dim=-1, keepdim=True)
     angle = torch.atan(radius)
     return points * torch.where(radius > 1e-9, _fisheye_radius(lens, angle) / radius.clamp(min=1e-9), 1.0)
+
+
+def _straightened_fisheye(lens: Lens, points: Tensor) -> Tensor:
+    """Return the inverse of ``_distort_fisheye``: Newton's method for the angle; NaN from 90 degrees on."""
+    radius = points.norm(dim=-1, keepdim=True)
+    angle = radius.clone()
+    for _ in range(_ITERATIONS):
+        slope = torch.ones_like(angle)
+        for power, k in enumerate(lens.params, start=1):
+            slope = slope + (2 * power + 1) * k * angle ** (2 * power)
+        angle = angle - (_fisheye_radius(lens, angle) - radius) / slope
+    straight = torch.where((angle >= 0) & (angle < 0.5 * math.pi), torch.tan(angle), torch.nan)
+    return points * torch.where(radius > 1e-9, straight / radius.clamp(min=1e-9), 1.0)
 
 
 def _fisheye_radius(lens: Lens, angle: Tensor) -> Tensor:

@@ -295,6 +295,20 @@ def render_scene(scene: Scene, world_from_cam: np.ndarray, size: int, samples: i
     return (rgba * 255.0 + 0.5).astype(np.uint8).reshape(size, size, 4)
 
 
+def colours_along(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return (R, 3) float32 sRGB colours of rays, black where they hit nothing; the lamp is a point.
+
+    Args:
+        scene: what to draw.
+        origin: (3,) of all rays, world units.
+        directions: (R, 3) unit vectors in the world.
+    """
+    rgb = np.zeros((len(directions), 3), np.float32)
+    hit, colours = _trace(scene, _f32(origin), directions.astype(np.float32), _f32(scene.lamp))
+    rgb[hit] = colours
+    return rgb
+
+
 def render_movers(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3) -> np.ndarray:
     """(size, size) bool: pixels of ``render_scene`` in which something that moves is seen; light does not count."""
     seen = np.zeros(size * size, bool)

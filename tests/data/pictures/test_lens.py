@@ -1,12 +1,23 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from dyngs.data.capture import Lens
 from dyngs.data.geometry.intrinsics import pinhole_matrix
-from dyngs.data.pictures.lens import distort, is_pinhole, kept_share, undistort, undistort_map
+from dyngs.data.pictures.lens import (
+    WIDEST_DEG,
+    distort,
+    is_pinhole,
+    kept_share,
+    undistort,
+    undistort_map,
+    undistorted_points,
+    wide_pinhole,
+)
 
 BARREL = Lens("opencv", (-0.2, 0.05, 0.002, -0.003))
 FISHEYE = Lens("fisheye", (0.05, -0.02, 0.003, 0.0))
@@ -108,3 +119,63 @@ def test_lenses_that_keep_everything() -> None:
     assert kept_share(Lens(), intrinsics, 400, 400) == 1
     assert kept_share(Lens("opencv", (0.1, 0, 0, 0)), intrinsics, 400, 400) == 1  # a cushion: the pinhole sees more
     assert kept_share(Lens("opencv", (-0.1, 0, 0, 0)), intrinsics, 400, 400) < 1
+
+
+def fisheye_matrix(degrees: float) -> np.ndarray:
+    """Return the camera matrix of an equidistant fisheye of so many degrees across 160 x 120 px."""
+    focal = 80 / np.radians(degrees / 2)
+    return pinhole_matrix(focal, focal, 80.0, 60.0)
+
+
+@pytest.mark.parametrize("degrees", [60.0, 90.0, 110.0])
+def test_a_wide_pinhole_shows_all_that_the_lens_saw(degrees: float) -> None:
+    lens, intrinsics = Lens("fisheye", (0.0,) * 4), fisheye_matrix(degrees)
+    wide, pinhole = wide_pinhole(lens, intrinsics, 160, 120)
+    corner = np.radians(degrees / 2) * 1.25  # of a 4:3 picture
+    assert wide.focal_ratio > 1
+    np.testing.assert_allclose(pinhole[0, 0] * wide.focal_ratio, intrinsics[0, 0])
+    np.testing.assert_allclose(pinhole[:2, 2], intrinsics[:2, 2])
+    if np.degrees(corner) < WIDEST_DEG / 2:
+        assert kept_share(wide, pinhole, 160, 120) == 1
+        # no wider than it must be: a corner of the picture lies on its edge
+        np.testing.assert_allclose(0.8 * np.tan(corner) * pinhole[0, 0], 80, rtol=1e-3)
+    else:
+        assert kept_share(lens, intrinsics, 160, 120) + 0.3 < kept_share(wide, pinhole, 160, 120) < 1
+    valid = undistort_map(wide, pinhole, 160, 120).valid
+    assert not bool(valid.all())
+    assert bool(valid[20:100, 20:140].all())
+
+
+def test_a_picture_through_a_wide_pinhole_shows_what_the_lens_saw() -> None:
+    """The stored picture holds the angle from the axis and the direction; so must the pinhole's, at its own places."""
+    intrinsics = fisheye_matrix(90.0)
+    v, u = np.mgrid[:120, :160] + 0.5
+    x, y = ((u - 80) / intrinsics[0, 0], (v - 60) / intrinsics[1, 1])
+    stored = torch.from_numpy(np.stack([np.hypot(x, y), 0.5 + x / 4, 0.5 + y / 4], -1)).float()
+    wide, pinhole = wide_pinhole(Lens("fisheye", (0.0,) * 4), intrinsics, 160, 120)
+    lens_map = undistort_map(wide, pinhole, 160, 120)
+    found = undistort(stored, lens_map)
+    x, y = ((u - 80) / pinhole[0, 0], (v - 60) / pinhole[1, 1])
+    angle = np.arctan(np.hypot(x, y))
+    wanted = np.stack([angle, 0.5 + angle * x / np.hypot(x, y) / 4, 0.5 + angle * y / np.hypot(x, y) / 4], -1)
+    inner = lens_map.valid.numpy() & (angle < 0.98) & (angle > 0.05)
+    inner[1:-1, 1:-1] &= inner[:-2, 1:-1] & inner[2:, 1:-1]
+    assert inner.mean() > 0.6
+    assert np.abs(found.numpy() - wanted)[inner].max() < 5e-3
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.5])
+@pytest.mark.parametrize("lens", [BARREL, FISHEYE], ids=["barrel", "fisheye"])
+def test_undistorted_points_go_back(lens: Lens, ratio: float) -> None:
+    lens = replace(lens, focal_ratio=ratio)
+    points = torch.rand(40, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 40
+    focal, center = torch.tensor([50.0, 52.0]).double(), torch.tensor([31.0, 23.5]).double()
+    straight = (undistorted_points(lens, INTRINSICS, points) - center) / focal
+    torch.testing.assert_close(distort(lens, straight) * focal + center, points, rtol=0, atol=0.05)
+
+
+def test_lenses_that_need_no_wider_pinhole_keep_theirs() -> None:
+    for lens in (Lens(), Lens("opencv", (0.1, 0.02, 0.0, 0.0)), Lens("opencv", (-1e-3, 0.0, 0.0, 0.0))):
+        same, intrinsics = wide_pinhole(lens, INTRINSICS, 64, 48)
+        assert same == lens
+        assert intrinsics is INTRINSICS
