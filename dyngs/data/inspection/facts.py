@@ -13,6 +13,8 @@ from dyngs.data.geometry.poses import camera_center
 from dyngs.data.pictures.lens import is_pinhole, kept_share
 from dyngs.data.times import distinct_times
 
+SAME_LIGHT = 1.05
+"""Factor between the most and the least light up to which pictures count as equally exposed."""
 MUCH_LOST = 90
 """Per cent of a picture below which a wider pinhole is worth a word."""
 MOST_LENSES = 20
@@ -35,6 +37,7 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         ("focal length", f"{_range(focal_px)} px"),
         ("field of view", f"{_range(fov_deg)} degrees across"),
         ("lens", counted(lenses) + _kept(views)),
+        *_exposures(views),
         ("alpha", "transparent background" if capture.has_alpha else "none"),
         ("masks", _masks(views)),
         *_prior_facts(capture),
@@ -69,6 +72,18 @@ def _kept(views: Sequence[View]) -> str:
         how = "with the same focal length"
     more = " (data.undistort=wide keeps more)" if max(ratios) == 1 and min(shares) < MUCH_LOST else ""
     return f"; undistorted {how}, which keeps {_range(shares)} % of each picture{more}"
+
+
+def _exposures(views: Sequence[View]) -> list[tuple[str, str]]:
+    """Return how much the light let in differs by the tags of pictures; nothing where they do not say."""
+    known = [view.exposure for view in views if view.exposure is not None]
+    if not known:
+        return []
+    factor = max(known) / min(known)
+    said = f"by EXIF tags of {len(known)} of {len(views)} pictures, "
+    if factor < SAME_LIGHT:
+        return [("exposure", f"{said}the same")]
+    return [("exposure", f"{said}up to {factor:.3g} times as much light; train.exposure=auto finds out if it matters")]
 
 
 def _masks(views: Sequence[View]) -> str:

@@ -268,3 +268,20 @@ def test_large_pictures_are_reported_by_a_deep_look(tmp_path: Path) -> None:
     write_still_capture(root, StillOptions(size=100, num_train=4))
     report = inspect_capture(DataConfig(root=root, max_megapixels=0.005), deep=True)
     assert any("100x100 pixels are 0.01 megapixels" in line for line in report.problems)
+
+
+@pytest.mark.parametrize(
+    ("light", "said"),
+    [
+        ((None, None), None),
+        ((0.02, 0.02), "the same"),
+        ((0.01, 0.03), "up to 3 times as much light"),
+        ((None, 1), "of 6"),
+    ],
+)
+def test_exposures_of_the_tags_are_a_fact(tmp_path: Path, light: tuple[float | None, ...], said: str | None) -> None:
+    capture = _capture(tmp_path)
+    views = [replace(view, exposure=light[i % 2]) for i, view in enumerate(capture.splits["train"])]
+    facts = dict(report_on(capture.replace(splits={**capture.splits, "train": tuple(views)})).facts)
+    assert ("exposure" in facts) is (said is not None)
+    assert said is None or said in facts["exposure"]
