@@ -14,7 +14,12 @@ from dyngs.data.capture import Capture, Lens, PointCloud
 from dyngs.data.read import read_capture
 from dyngs.export.cameras import NAME, write_cameras
 
-LENSES = [Lens(), Lens("opencv", (0.1, -0.02, 0.001, 0.002)), Lens("opencv", (0.1,) * 8), Lens("fisheye", (0.01,) * 4)]
+LENSES = [
+    Lens(),
+    Lens("opencv", (0.1, -0.02, 0.001, 0.002)),
+    Lens("opencv", (0.1,) * 8),
+    Lens("fisheye", (0.01,) * 4, 1.5),
+]
 
 
 @pytest.fixture
@@ -47,8 +52,8 @@ def test_a_written_capture_is_read_as_it_was(capture: Capture, tmp_path: Path) -
         centre = -view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3] + capture.world_offset
         np.testing.assert_allclose(-same.cam_from_world[:3, :3].T @ same.cam_from_world[:3, 3], centre, atol=1e-9)
         np.testing.assert_allclose(same.cam_from_world[:3, :3], view.cam_from_world[:3, :3], atol=1e-9)
-        np.testing.assert_allclose(same.intrinsics, view.intrinsics)
-        assert (same.lens, same.camera_id) == (view.lens, view.camera_id)
+        np.testing.assert_allclose(same.intrinsics, view.intrinsics @ np.diag([view.lens.focal_ratio] * 2 + [1.0]))
+        assert (same.lens, same.camera_id) == (replace(view.lens, focal_ratio=1.0), view.camera_id)
         assert (same.mask_path is None) == (view.mask_path is None)
 
 
