@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
     from dyngs.evaluate.report import EvalReport
 
+_REFINED = ", poses refined"
+"""On the tested pictures."""
+
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``eval`` to the commands."""
@@ -26,10 +29,12 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
     parser.add_argument(
-        "--refine-poses",
+        "--refine",
         action="store_true",
-        help="also score from poses refined on the pictures themselves; always done after camera.refine",
+        help="also score from poses refined on the pictures themselves: of a person's body, otherwise of the cameras; "
+        "always done after camera.refine",
     )
+    parser.add_argument("--refine-poses", dest="refine", action="store_true", help=argparse.SUPPRESS)
     parser.set_defaults(run=run)
 
 
@@ -44,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.split,
         lpips_net=arguments.lpips_net,
         threads=arguments.threads,
-        refine_poses=arguments.refine_poses,
+        refine_poses=arguments.refine,
     )
     Console().print(report_table(report))
     for note in report.notes:
@@ -64,10 +69,10 @@ def report_table(report: EvalReport) -> Table:
         right = f"{report.psnr_right:.2f} dB; {report.psnr_right_fitted:.2f} dB with colours fitted on left halves"
         table.add_row("PSNR of right halves", right)
     if report.psnr_own_poses is not None:
-        table.add_row("PSNR, poses refined on the pictures", f"{report.psnr_own_poses:.2f} dB")
+        table.add_row(f"PSNR{_REFINED}", f"{report.psnr_own_poses:.2f} dB")
     table.add_row("SSIM", f"{report.ssim:.4f}")
-    if report.psnr_person is not None and report.ssim_person is not None:
-        table.add_row("in the person's box", f"{report.psnr_person:.2f} dB, SSIM {report.ssim_person:.4f}")
+    for label, value in _rows_of_person(report):
+        table.add_row(label, value)
     for label, value in _rows_of_regions(report):
         table.add_row(label, escape(value))
     for label, name, value in (
@@ -90,6 +95,22 @@ def report_table(report: EvalReport) -> Table:
     table.add_row("rendering", f"{report.fps:.1f} frames/s{deforming}")
     table.add_row("training", f"{report.step:,} steps in {report.seconds_train:.0f} s")
     return table
+
+
+def _rows_of_person(report: EvalReport) -> list[tuple[str, str]]:
+    """Return labels and values of the scores of a person: as given, then with poses refined on the pictures."""
+    rows: list[tuple[str, str]] = []
+    for scores, suffix in ((report, ""), (report.own_poses, _REFINED)):
+        if scores is None:
+            continue
+        for label, psnr, ssim, lpips in (
+            ("in the person's box", scores.psnr_person, scores.ssim_person, None),
+            ("on black", scores.psnr_black, scores.ssim_black, scores.lpips_black),
+        ):
+            if psnr is not None and ssim is not None:
+                distance = "" if lpips is None else f", LPIPS {lpips:.4f}"
+                rows.append((f"{label}{suffix}", f"{psnr:.2f} dB, SSIM {ssim:.4f}{distance}"))
+    return rows
 
 
 def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, Lens, PointCloud, Splits, View, all_views
-from dyngs.data.frame_selection import select_frames
+from dyngs.data.frame_selection import hold_out_frames, select_frames
 from dyngs.data.geometry.recenter import recenter
 from dyngs.data.name_order import times_by_name
 from dyngs.data.pictures.frame_cache import decode_frames
@@ -56,9 +56,10 @@ FORMATS: tuple[CaptureFormat, ...] = (
 def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) -> Capture:
     """Read the capture in a folder; pictures are not decoded, only their headers are read.
 
-    Views are sorted by name. ``frames`` of the options chooses among the times of all splits. Where the format names no
-    test views, every ``test_every``-th picture is one. Times are scaled to [0, 1] over all splits; a scene far from
-    the origin is moved there. The splits train, val and test are always present, val and test possibly empty.
+    Views are sorted by name. ``frames`` of the options chooses among the times of all splits, and ``pose_frames`` those
+    of a person that become the split pose. Where the format names no test views, every ``test_every``-th picture is
+    one. Times are scaled to [0, 1] over all splits; a scene far from the origin is moved there. The splits train, val
+    and test are always present, val and test possibly empty.
 
     Example::
 
@@ -139,6 +140,8 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         )
     written = splits
     splits, notes = _timed(capture, splits, options.frames)
+    if options.pose_frames is not None:
+        capture, splits, new_poses = _with_poses_held_out(capture, splits, new_poses, options.pose_frames)
     span = span_in_files(written, splits)
     seconds = span[1] - span[0] if capture.in_seconds and span else clip_seconds(splits, capture.fps)
     if "test" not in splits:
@@ -182,6 +185,20 @@ def _wide(views: tuple[View, ...]) -> tuple[View, ...]:
             known[key] = wide_pinhole(view.lens, view.intrinsics, view.width, view.height)
         wide.append(replace(view, lens=known[key][0], intrinsics=known[key][1]))
     return tuple(wide)
+
+
+def _with_poses_held_out(
+    capture: Capture, splits: Splits, new_poses: tuple[View, ...] | None, frames: str
+) -> tuple[Capture, Splits, tuple[View, ...]]:
+    """Return the capture and its splits without the times that ``frames`` selects, and the views of split pose."""
+    if capture.body is None:
+        raise DyngsError(f"{capture.root}: data.pose_frames={frames} is for people; here are no body parameters")
+    if new_poses is not None:
+        raise DyngsError(
+            f"{capture.root}: has a clip of new poses of its own; remove data.pose_frames={frames}, or the files of it"
+        )
+    splits, held = hold_out_frames(capture.root, splits, frames)
+    return capture.replace(body={**capture.body, "pose": capture.body["train"]}), splits, held
 
 
 def _check_places(view: View) -> None:

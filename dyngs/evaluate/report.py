@@ -23,10 +23,12 @@ from dyngs.data.true_tracks import read_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.evaluate.half_fit import right_half_scores
 from dyngs.evaluate.own_poses import pictures_of_split, psnr_from_own_poses
+from dyngs.evaluate.people import person_scores
 from dyngs.evaluate.regions import RegionName, Regions, RegionScores
 from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.files.write import write_text
+from dyngs.human.avatar.pose_fit import fitted_to_pictures
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.captured import captured_motion, same_bodies
 from dyngs.metrics import Lpips, LpipsNet, MetricValue, flip, load_lpips, psnr, ssim
@@ -48,8 +50,9 @@ REGION_METRICS: dict[str, RegionName] = {
 class ViewScore:
     """Metrics of one view; None where a metric cannot be had (``EvalReport.reasons`` says why).
 
-    ``render_seconds`` holds ``deform_seconds``; ``time`` is None for a still capture. ``psnr_person`` and
-    ``ssim_person`` are those inside the person's box.
+    ``render_seconds`` holds ``deform_seconds``; ``time`` is None for a still capture. Of people, ``psnr_person``
+    and ``ssim_person`` are those inside the person's box, and ``psnr_black``, ``ssim_black`` and ``lpips_black`` those
+    of the whole picture on black.
     """
 
     name: str
@@ -69,6 +72,30 @@ class ViewScore:
     psnr_still: float | None = None
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
+    psnr_black: float | None = None
+    ssim_black: float | None = None
+    lpips_black: float | None = None
+
+
+@dataclass(frozen=True)
+class OwnPoseScores:
+    """Means over views of a person in poses that were refined on these views themselves; names as in ``ViewScore``.
+
+    Attributes:
+        updates: mean number of updates that the pose of a moment took.
+        per_view: the single views.
+    """
+
+    psnr: float
+    ssim: float
+    lpips: float | None
+    psnr_person: float | None
+    ssim_person: float | None
+    psnr_black: float | None
+    ssim_black: float | None
+    lpips_black: float | None
+    updates: float
+    per_view: tuple[ViewScore, ...]
 
 
 @dataclass(frozen=True)
@@ -99,14 +126,17 @@ class EvalReport:
         stored_mb: size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others.
         psnr_person, ssim_person: means inside the box around the person, where the true picture is not transparent;
             only of a human model, and None where pictures have no alpha.
+        psnr_black, ssim_black, lpips_black: means of the whole picture on black, as published figures of people have
+            it; None in the same cases.
         psnr_foreground, psnr_moving, psnr_still: means over the views that have such a region, see
             ``dyngs.evaluate.regions``.
         moving_from: how it was found what moves, None where it was not.
         psnr_right, psnr_right_fitted: means of the PSNR of right halves, as the scene shows them, and after an affine
             colour fitted on left halves, see ``dyngs.evaluate.half_fit``; None where a half has no pixel that counts.
         track_error_px, track_within_5px, track_motion_px: see ``dyngs.evaluate.tracks``.
-        psnr_own_poses: PSNR from poses refined on the pictures themselves, see ``dyngs.evaluate.own_poses``; None where
-            that was not asked for.
+        psnr_own_poses: PSNR from poses refined on the pictures themselves, of cameras (``dyngs.evaluate.own_poses``)
+            or of the body (``dyngs.human.avatar.pose_fit``); None where that was not asked for.
+        own_poses: of a person, all scores from these poses.
     """
 
     split: str
@@ -148,6 +178,10 @@ class EvalReport:
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
     psnr_own_poses: float | None = None
+    psnr_black: float | None = None
+    ssim_black: float | None = None
+    lpips_black: float | None = None
+    own_poses: OwnPoseScores | None = None
 
     def to_json(self) -> str:
         """Return the report as strict JSON (no NaN or Infinity), ending in a newline."""
@@ -161,15 +195,20 @@ def evaluate_run(
 
     Args:
         run_dir: folder of a run with at least one checkpoint.
-        split: "test", "val" or "train".
+        split: "test", "val", "train" or "pose".
         lpips_net: "alex", "vgg" or "squeeze".
         threads: for rendering and metrics; 0 leaves the number as it is.
-        refine_poses: also score from poses that were refined on the pictures themselves; always done for a run that
-            refined its cameras.
+        refine_poses: also score from poses, of a person's body, otherwise of the cameras, that were refined on the
+            pictures themselves; always done for a run that refined its cameras.
 
     Raises:
-        DyngsError: no such run or split, unreadable pictures, a render or metric that is not finite, unwritable folder.
+        DyngsError: no such run or split, unreadable pictures, a render or metric that is not finite, unwritable folder,
+            poses of training views that are to be refined.
     """
+    if refine_poses and split == "train":
+        raise DyngsError(
+            f"{run_dir}: --refine is for pictures that were not trained on; name them with --split test, val or pose"
+        )
     run = load_run(run_dir)
     capture = read_capture(run.config.data)
     views = split_views(capture, split)
@@ -180,39 +219,54 @@ def evaluate_run(
         loader = pictures_of_split(capture, views, run_dir, run)
         regions = Regions(views, loader, colour)
         pictures = (loader[i] for i in range(len(loader)))
-        scores, reasons = score_views(scene, pictures, drawing.options, colour, load_lpips(lpips_net), regions)
+        lpips = load_lpips(lpips_net)
+        scores, reasons = score_views(scene, pictures, drawing.options, colour, lpips, regions)
         temporal = _temporal(drawing, loader, views)
         tracks = _track_scores(run, capture, scene, views)
         asked = split != "train" and (refine_poses or run.config.camera.refine == "always")
-        own_poses = psnr_from_own_poses(drawing, loader, run.info.extent) if asked else None
+        own_poses, person = _from_own_poses(drawing, loader, run.info.extent, lpips) if asked else (None, None)
     reasons |= {name: measured.reason for name, measured in temporal.items() if measured.reason is not None}
     report = EvalReport(
         split=split,
         num_views=len(scores),
-        width=scores[0].width,
-        height=scores[0].height,
         background=background,
-        psnr=fmean(s.psnr for s in scores),
-        ssim=fmean(s.ssim for s in scores),
         flip=_mean([s.flip for s in scores]),
-        lpips=_mean([s.lpips for s in scores]),
         lpips_net=lpips_net,
-        fps=1 / median(s.render_seconds for s in scores),
-        deform_share=median(s.deform_seconds / s.render_seconds for s in scores),
         flicker=temporal["flicker"].value,
         flicker_error=temporal["flicker_error"].value,
         psnr_per_time=psnr_per_time((s.time, s.psnr) for s in scores),
         reasons=reasons,
         notes=_notes(run, scores),
         per_view=tuple(scores),
-        psnr_person=_mean([s.psnr_person for s in scores]),
-        ssim_person=_mean([s.ssim_person for s in scores]),
         psnr_own_poses=own_poses,
+        own_poses=person,
+        **_means(scores),
         **_facts(run_dir, run, scene),
+        **_sizes_and_speed(scores),
     )
     report = _with_parts(report, regions, tracks)
     write_text(report_path(run_dir, split), report.to_json())
     return report
+
+
+def _from_own_poses(
+    drawing: Drawing, pictures: PictureLoader, size: float, lpips: Lpips
+) -> tuple[float, OwnPoseScores | None]:
+    """Return the PSNR from poses that were fitted to the pictures, and all scores if these are poses of a person."""
+    avatar = avatar_of(drawing.scene)
+    if avatar is None:
+        return psnr_from_own_poses(drawing, pictures, size), None
+    fitted = fitted_to_pictures(avatar, pictures, drawing.background, drawing.options)
+    each = (pictures[i] for i in range(len(pictures)))
+    views, _ = score_views(fitted.scene, each, drawing.options, drawing.background, lpips)
+    scores = OwnPoseScores(**_means(views), updates=fmean(fitted.updates), per_view=tuple(views))
+    return scores.psnr, scores
+
+
+def _means(scores: Sequence[ViewScore]) -> dict[str, Any]:
+    """Return the means of the metrics that exist for poses as given and for refined ones."""
+    names = "psnr ssim lpips psnr_person ssim_person psnr_black ssim_black lpips_black"
+    return {name: _mean([getattr(score, name) for score in scores]) for name in names.split()}
 
 
 def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:
@@ -227,6 +281,16 @@ def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:
         "seconds_train": run.seconds_train,
         "step": run.step,
         "stored_mb": 1e-6 * (run_dir / SCENE_FILE).stat().st_size if has_only_scene_file(run_dir) else None,
+    }
+
+
+def _sizes_and_speed(scores: Sequence[ViewScore]) -> dict[str, Any]:
+    """Return the size of the first picture, and how fast all were drawn."""
+    return {
+        "width": scores[0].width,
+        "height": scores[0].height,
+        "fps": 1 / median(s.render_seconds for s in scores),
+        "deform_share": median(s.deform_seconds / s.render_seconds for s in scores),
     }
 
 
@@ -295,7 +359,7 @@ def score_views(
         if not rendered.isfinite().all():
             raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
         truth, mask = picture.composite(background), picture.mask
-        box = person_box(picture) if avatar_of(scene) is not None else None
+        people = {} if avatar_of(scene) is None else person_scores(picture, rendering, background, lpips)
         parts = RegionScores() if regions is None else regions.scores(picture, rendered, truth)
         halves = right_half_scores(picture, rendering, background)
         optional = {"flip": flip(rendered, truth, mask), "lpips": lpips(rendered, truth, mask)}
@@ -313,26 +377,16 @@ def score_views(
             render_seconds=seconds,
             deform_seconds=deform_seconds,
             time=picture.time,
-            psnr_person=None if box is None else psnr(rendered[box], truth[box], None if mask is None else mask[box]),
-            ssim_person=None if box is None else ssim(rendered[box], truth[box], None if mask is None else mask[box]),
             psnr_foreground=parts.foreground,
             psnr_moving=parts.moving,
             psnr_still=parts.still,
             psnr_right=halves.plain,
             psnr_right_fitted=halves.fitted,
+            **people,
         )
         _require_finite(score, mask)
         scores.append(score)
     return scores, reasons
-
-
-def person_box(picture: Picture) -> tuple[slice, slice] | None:
-    """Return rows and columns of the smallest box around opaque pixels; None without alpha or where there are none."""
-    if picture.alpha is None or not bool((picture.alpha > 0).any()):
-        return None
-    shown = picture.alpha > 0
-    rows, columns = (torch.nonzero(shown.any(axis))[:, 0] for axis in (1, 0))
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
 def split_views(capture: Capture, split: str) -> Sequence[View]:
@@ -348,13 +402,14 @@ def split_views(capture: Capture, split: str) -> Sequence[View]:
 def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
     """Return the scene of a run as the views of ``split`` show it: a person plays the clip of that split.
 
-    Frames that were trained on keep their refined poses; others have those of their files.
+    The split pose, and splits with body parameters of their own, have the poses of their files. Others show the clip of
+    training with its refined poses, interpolated at times between.
     """
     avatar = avatar_of(run.scene)
     if avatar is None or capture.body is None:
         return run.scene
     given, trained = capture.body[cast(Split, split)], capture.body["train"]
-    if same_bodies(given, trained):
+    if split != "pose" and same_bodies(given, trained):
         return run.scene
     shown = captured_motion(capture.root, given, split_views(capture, split), avatar.skeleton.joints)
     return avatar.playing(shown.clip)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dyngs.data.capture import Split, View
-from dyngs.data.frame_selection import parse_frames, select_frames
+from dyngs.data.frame_selection import hold_out_frames, parse_frames, select_frames
 from dyngs.data.times import distinct_times
 from dyngs.errors import DyngsError
 
@@ -98,3 +98,39 @@ def test_nothing_but_time_changes() -> None:
     before = splits([0.0, 0.25, 0.5], [])["train"]
     after = select_frames(ROOT, {"train": before}, ":2")["train"]
     assert after == (before[0], replace(before[1], time=1.0))
+
+
+def filmed(camera: int, split: Split) -> dict[Split, tuple[View, ...]]:
+    """A camera at five times."""
+    views = (view(f"c{camera}/{i}", i / 4) for i in range(5))
+    return {split: tuple(replace(own, camera_id=camera) for own in views)}
+
+
+@pytest.mark.parametrize("frames", ["-2::", "3:", "3:5"])
+def test_held_out_frames_are_a_clip_of_their_own(frames: str) -> None:
+    kept, held = hold_out_frames(ROOT, filmed(0, "train"), frames)
+    assert [(v.name, v.time) for v in kept["train"]] == [("c0/0", 0), ("c0/1", 0.5), ("c0/2", 1)]
+    assert [(v.name, v.time) for v in held] == [("c0/3", 0), ("c0/4", 1)]
+
+
+def test_held_out_frames_are_seen_from_the_test_cameras_if_there_are_any() -> None:
+    splits = filmed(0, "train") | filmed(1, "test")
+    kept, held = hold_out_frames(ROOT, splits, "1::2")
+    assert [v.name for v in held] == ["c1/1", "c1/3"]
+    assert [v.name for v in kept["train"]] == ["c0/0", "c0/2", "c0/4"]
+    assert [v.name for v in kept["test"]] == ["c1/0", "c1/2", "c1/4"]
+    mixed: dict[Split, tuple[View, ...]] = {"train": splits["train"][:4], "test": splits["train"][4:]}
+    assert [v.name for v in hold_out_frames(ROOT, mixed, "3:")[1]] == ["c0/3", "c0/4"], "one camera"
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (":", "leaves no training views"),
+        ("9:", "picks none of the capture's 5 times"),
+        ("3", "data.pose_frames='3': write"),
+    ],
+)
+def test_frames_that_cannot_be_held_out(frames: str, message: str) -> None:
+    with pytest.raises(DyngsError, match=message):
+        hold_out_frames(ROOT, filmed(0, "train"), frames)

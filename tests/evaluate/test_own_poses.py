@@ -9,6 +9,7 @@ import pytest
 import dyngs
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
+from dyngs.errors import DyngsError
 from dyngs.evaluate.own_poses import pictures_of_split
 from dyngs.evaluate.report import evaluate_run
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
@@ -28,7 +29,10 @@ def test_the_second_figure_is_there_where_cameras_were_refined_or_it_is_asked_fo
     assert asked.psnr_own_poses is not None
     assert asked.psnr_own_poses > asked.psnr - 0.2  # its loss is not PSNR
     assert asked.psnr == report.psnr
-    assert evaluate_run(folder, "train", refine_poses=True).psnr_own_poses is None
+    assert asked.own_poses is None, "nobody is in the pictures"
+    assert evaluate_run(folder, "train").psnr_own_poses is None
+    with pytest.raises(DyngsError, match="--refine is for pictures that were not trained on"):
+        evaluate_run(folder, "train", refine_poses=True)
 
 
 def test_training_pictures_have_the_refined_cameras(run: tuple[Path, str]) -> None:

@@ -134,7 +134,7 @@ def test_report_of_a_run(tmp_path) -> None:
         "num_moving moving_share field_mb deform_share flicker flicker_error psnr_per_time psnr_person ssim_person"
     )
     parts = "psnr_foreground psnr_moving psnr_still moving_from track_error_px track_within_5px track_motion_px"
-    parts += " psnr_right psnr_right_fitted psnr_own_poses"
+    parts += " psnr_right psnr_right_fitted psnr_own_poses own_poses psnr_black ssim_black lpips_black"
     rest = {*parts.split(), "seconds_train", "step", "reasons", "notes", "per_view", "colour_floats", "stored_mb"}
     assert set(keys.split()) | set(over_time.split()) | rest == set(stored)
     facts = {"split": "test", "num_views": 3, "width": 16, "height": 16, "background": "white", "lpips_net": "alex"}

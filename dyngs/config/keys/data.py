@@ -31,6 +31,11 @@ class DataConfig(Section):
     frames: str | None = Field(
         default=None, description="start:stop:step over the capture's times, as a Python slice; null: all"
     )
+    pose_frames: str | None = Field(
+        default=None,
+        description="start:stop:step over the times that data.frames leaves: pictures of a person that are held out as "
+        "the split pose; -20:: is the last 20; null: none",
+    )
     times: Literal["files", "order"] = Field(
         default="files",
         description="when the pictures were taken; files: as the capture says; order: in the order of their names, by "

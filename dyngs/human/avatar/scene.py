@@ -152,10 +152,13 @@ class HumanScene(Scene):
 
     def _posed(self, time: float | None) -> Moment:
         now = clamped_time(time)
-        posing = frame_pose(self.moves_as.at(now), 0)
+        return self.in_pose(frame_pose(self.moves_as.at(now), 0), now)
+
+    def in_pose(self, posing: BodyPose, time: float) -> Moment:
+        """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable in the pose."""
         offsets = rest_offsets(self.anchors, self.weights, posing, self.shapes, self.pose_dirs)
         gaussians = pose_gaussians(self.gaussians, self.weights, self.learned_skeleton, posing, offsets)
-        return Moment(gaussians, now, Frame(self.gaussians.means, posing.rotations[0]))
+        return Moment(gaussians, time, Frame(self.gaussians.means, posing.rotations[0]))
 
     def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that is learned.

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from tiny_captures import edit_json, pixel_of, random_pixels, write_frames, write_picture
 
+from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, Capture, View
 from dyngs.data.pictures.images import read_picture
+from dyngs.data.read import read_capture
 from dyngs.data.readers.body_json import is_body_json, read_body_json
 from dyngs.errors import DyngsError
 
@@ -140,3 +142,15 @@ def test_the_pelvis_lies_inside_the_person(shared: Path, name: str) -> None:
         for view, row in zip(views, rows_of(capture.root, body, views), strict=True):
             x, y = pixel_of(view, places.scale[row] * pelvis + places.trans[row])
             assert read_picture(view.image_path)[int(y), int(x), 3] == 255, view.name
+
+
+def test_frames_are_held_out_where_no_other_clip_was_filmed(root: Path) -> None:
+    with pytest.raises(DyngsError, match=r"has a clip of new poses of its own; remove data\.pose_frames=2::"):
+        read_capture(DataConfig(root=root, pose_frames="2::"))
+    for name in ("transforms_pose.json", "body_pose.npz"):
+        (root / name).unlink()
+    capture = read_capture(DataConfig(root=root, pose_frames="2::"))
+    assert [view.name for view in capture.splits["pose"]] == ["images/test/f2_c2"]
+    (root / "body_train.npz").unlink()
+    with pytest.raises(DyngsError, match="is for people; here are no body parameters"):
+        read_capture(DataConfig(root=root, pose_frames="2::"))

@@ -11,8 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny_captures import write_colmap, write_picture
 
+from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
+from dyngs.data.read import read_capture
 from dyngs.data.readers.neuman import is_neuman, read_neuman
 from dyngs.errors import DyngsError
 
@@ -203,3 +205,10 @@ def test_bad_refined_parameters(root: Path, change: dict[str, Any], line: str) -
     with pytest.raises(DyngsError, match=line) as caught:
         read_neuman(root)
     assert "smpl_optimized_aligned_scale.npz" in str(caught.value)
+
+
+def test_the_last_frames_are_held_out_as_new_poses(root: Path) -> None:
+    (root / "test_split.txt").write_text("01.jpg\n07.jpg\n")
+    capture = read_capture(DataConfig(root=root, pose_frames="6:9"))
+    frames = {name: {view.frame for view in views} for name, views in capture.splits.items()}
+    assert frames == {"train": {0, 2, 3, 4, 5}, "val": set(), "test": {1}, "pose": {6, 7, 8}}

@@ -12,7 +12,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from tiny_captures import HEIGHT, WIDTH, pixel_of, write_video
 
+from dyngs.config import DataConfig
 from dyngs.data.pictures.silhouettes import cut_out
+from dyngs.data.read import read_capture
 from dyngs.data.readers.people_snapshot import is_people_snapshot, read_people_snapshot
 from dyngs.errors import DyngsError
 
@@ -169,3 +171,15 @@ def test_no_frame_has_everything(root: Path) -> None:
     write_poses(root, pose=poses, trans=poses[:, :3])
     with pytest.raises(DyngsError, match=r"no frame of female-3-casual\.mp4 has both a mask and body parameters"):
         read_people_snapshot(root)
+
+
+def test_the_last_frames_are_held_out_as_new_poses(root: Path) -> None:
+    capture = read_capture(DataConfig(root=root, pose_frames="4::", test_every=2))
+    assert [[view.frame for view in capture.splits[name]] for name in ("train", "test", "pose")] == [
+        [1, 3],
+        [0, 2],
+        [4, 5],
+    ]
+    assert [view.time for view in capture.splits["pose"]] == [0, 1]
+    assert capture.body is not None
+    assert capture.body["pose"].frames == capture.body["train"].frames

@@ -12,8 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny_captures import pixel_of, random_pixels, side_poses, write_picture
 
+from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
+from dyngs.data.read import read_capture
 from dyngs.data.readers.zju_mocap import is_zju_mocap, read_zju_mocap
 from dyngs.errors import DyngsError
 
@@ -290,3 +292,13 @@ def test_bad_pickles_of_one_camera(tmp_path: Path) -> None:
         dump(tmp_path, bad_cameras, bad_meshes)
         with pytest.raises(DyngsError, match=line):
             read_zju_mocap(tmp_path)
+
+
+@pytest.mark.parametrize(("cameras", "held"), [(4, "Camera_B1/000002"), (0, "images/frame_000002")])
+def test_the_last_frame_is_held_out_as_a_new_pose(tmp_path: Path, cameras: int, held: str) -> None:
+    write_annots(tmp_path, cameras) if cameras else write_single(tmp_path)
+    capture = read_capture(DataConfig(root=tmp_path, pose_frames="-1::", test_every=0))
+    assert [view.name for view in capture.splits["pose"]] == [held]
+    assert {view.frame for view in (*capture.splits["train"], *capture.splits["test"])} == {0, 1}
+    assert capture.body is not None
+    assert 2 in capture.body["pose"].frames

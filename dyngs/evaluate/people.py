@@ -1,0 +1,47 @@
+"""Scores of a picture of a person: inside the person's box, and of the whole picture on black.
+
+Most of a picture of a person is background, which costs nothing to get right: on black, as published figures have it,
+the same render scores many dB more than inside the box.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dyngs.data.loader import Picture
+from dyngs.metrics import Lpips, psnr, ssim
+from dyngs.rendering import Rendering
+
+
+def person_scores(picture: Picture, rendering: Rendering, background: Tensor, lpips: Lpips) -> dict[str, float | None]:
+    """Return the scores by their names in ``dyngs.evaluate.report.ViewScore``; none where nobody is to be seen.
+
+    Args:
+        picture: the truth.
+        rendering: of its one view.
+        background: (3,) behind both.
+        lpips: from ``load_lpips``.
+    """
+    box = person_box(picture)
+    if box is None:
+        return {}
+    truth, mask, rendered = picture.composite(background), picture.mask, rendering.rgb[0]
+    inside = None if mask is None else mask[box]
+    black = rendered - rendering.transmittance[0][..., None] * background
+    return {
+        "psnr_person": psnr(rendered[box], truth[box], inside),
+        "ssim_person": ssim(rendered[box], truth[box], inside),
+        "psnr_black": psnr(black, picture.rgb_premultiplied, mask),
+        "ssim_black": ssim(black, picture.rgb_premultiplied, mask),
+        "lpips_black": lpips(black, picture.rgb_premultiplied, mask).value,
+    }
+
+
+def person_box(picture: Picture) -> tuple[slice, slice] | None:
+    """Return rows and columns of the smallest box around opaque pixels; None without alpha or where there are none."""
+    if picture.alpha is None or not bool((picture.alpha > 0).any()):
+        return None
+    shown = picture.alpha > 0
+    rows, columns = (torch.nonzero(shown.any(axis))[:, 0] for axis in (1, 0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

@@ -1,0 +1,220 @@
+"""Body poses fitted to pictures: the poses in which an avatar, which stays as it is, looks most like them.
+
+GART (Lei et al. 2024), Anim-NeRF (Chen et al. 2021) and others fit the poses of test pictures like this before they
+score new poses. Local letters: F moments, J joints, V pictures of a moment.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.pictures.images import area_downscale
+from dyngs.human.avatar.corrections import POSE_CM, POSE_WEIGHT, SharedCorrection, corrected_clip
+from dyngs.human.avatar.posing import BodyPose
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.ops.adam import adam_step_
+from dyngs.ops.loss import l1_ssim_loss
+from dyngs.rendering import RenderOptions
+from dyngs.scene import Moment
+
+SSIM_WEIGHT, ALPHA_WEIGHT = 0.2, 0.1
+"""Of SSIM and of the mean error of alpha in the loss, as in training."""
+COARSE_PX = 40
+"""Height of the person, px, in the coarsest of the three rounds."""
+FIRST_RATES, LAST_RATES = (5e-3, 5e-3, 3e-3), (2.5e-3, 1.2e-3, 5e-4)
+"""Learning rates of rotations, rad, in the three rounds."""
+SHIFT_RATE = 0.5
+"""Learning rate of the translation, m, over that of rotations, rad."""
+BETAS = (0.9, 0.99)
+WINDOW, LEAST_GAIN, MOST_WINDOWS = 8, 0.02, 12
+"""After so many updates (at least one for each picture) the rate is halved unless the mean loss fell by that share; a
+round ends below the last rate, or after so many windows."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Of one pose: rotations ``turns`` (J, 3) axis-angle applied before the given ones, rad; ``shift`` (3,) m."""
+
+    turns: Tensor
+    shift: Tensor
+
+    def leaves(self) -> Correction:
+        """Return the same values as leaf tensors that receive gradients."""
+        return Correction(self.turns.clone().requires_grad_(), self.shift.clone().requires_grad_())
+
+
+@dataclass(frozen=True)
+class FittedPoses:
+    """Poses fitted to pictures.
+
+    Attributes:
+        scene: the same person, playing them.
+        updates: number of updates at each of the F moments.
+    """
+
+    scene: HumanScene
+    updates: tuple[int, ...]
+
+
+def fitted_to_pictures(
+    scene: HumanScene, pictures: PictureLoader, background: Tensor, options: RenderOptions
+) -> FittedPoses:
+    """Return the person in the poses in which it looks most like ``pictures``: rotations of joints and translation.
+
+    All pictures of a moment decide its pose, and no others do. The fit begins with the pose that is played, or with
+    that corrected as the moment before was, whichever looks more alike. Skeleton, size and appearance stay as they are.
+    No random numbers are drawn.
+
+    Args:
+        scene: playing the clip that is to be corrected.
+        pictures: of a split.
+        background: (3,) behind both.
+        options: as in training.
+    """
+    groups: dict[float, list[int]] = {}
+    for index, time in enumerate(pictures.times):
+        groups.setdefault(0.0 if time is None else time, []).append(index)
+    times = sorted(groups)
+    starts = _moments(scene.moves_as, times)
+    found: list[Correction] = []
+    counts: list[int] = []
+    for row, time in enumerate(times):
+        start = starts.select(torch.tensor([row], device="cpu"))
+        fit = _Fit(scene, start, time, background, options, tuple(pictures[i] for i in groups[time]))
+        correction, count = fit.fitted(found[-1] if found else None)
+        found.append(correction)
+        counts.append(count)
+    none = SharedCorrection(torch.zeros_like(scene.fit.turns), 0.0)
+    turns, shifts = torch.stack([x.turns for x in found]), torch.stack([x.shift for x in found])
+    clip = corrected_clip(none, starts, turns, shifts * starts.scale[:, None])
+    return FittedPoses(_playing_exactly(scene, clip), tuple(counts))
+
+
+def _moments(clip: MotionClip, times: Sequence[float]) -> MotionClip:
+    """Return the clip at ``times``, ascending."""
+    parts = [clip.at(time) for time in times]
+    poses, trans, scale = (torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale"))
+    return MotionClip(torch.tensor(times, dtype=torch.float64, device="cpu"), poses, trans, scale)
+
+
+def _playing_exactly(scene: HumanScene, clip: MotionClip) -> HumanScene:
+    """Return the person in ``clip`` as it is: what ``playing`` applies to all poses is taken off first."""
+    fit = scene.fit
+    return scene.playing(corrected_clip(SharedCorrection(-fit.turns, -fit.log_scale), clip))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """The fit of one pose.
+
+    Attributes:
+        scene: the person.
+        start: the pose to begin with, a clip of one frame.
+        time: of the pictures.
+        background, options: to draw with.
+        pictures: V.
+    """
+
+    scene: HumanScene
+    start: MotionClip
+    time: float
+    background: Tensor
+    options: RenderOptions
+    pictures: tuple[Picture, ...]
+
+    def fitted(self, guess: Correction | None) -> tuple[Correction, int]:
+        """Return the correction of the pose, and the number of updates it took.
+
+        Args:
+            guess: another correction to begin with than none.
+        """
+        joints = self.scene.skeleton.joints
+        none = Correction(torch.zeros_like(joints), torch.zeros_like(joints[0]))
+        shrinks = _shrinks(self.pictures)
+        found = none if guess is None else self._better(none, guess, shrinks[0])
+        count = 0
+        for shrink, first, last in zip(shrinks, FIRST_RATES, LAST_RATES, strict=True):
+            found, updates = self._round(found, shrink, first, last)
+            count += updates
+        return self._better(none, found, 1), count
+
+    def _better(self, a: Correction, b: Correction, shrink: int) -> Correction:
+        """Return the one that looks more like the pictures, ``a`` if neither does."""
+        with torch.no_grad():
+            losses = [float(self._loss(x, self.pictures, shrink)) for x in (a, b)]
+        return b if losses[1] < losses[0] else a
+
+    def _round(self, start: Correction, shrink: int, rate: float, last: float) -> tuple[Correction, int]:
+        """Return the correction after one round, and its number of updates; each is for one picture, in turn."""
+        now = Correction(start.turns.clone(), start.shift.clone())
+        moments = [torch.zeros_like(x) for x in (now.turns, now.turns, now.shift, now.shift)]
+        window = len(self.pictures) * math.ceil(WINDOW / len(self.pictures))
+        before, update = math.inf, 0
+        for _ in range(MOST_WINDOWS):
+            total = 0.0
+            for _ in range(window):
+                update += 1
+                leaves = now.leaves()
+                with torch.enable_grad():
+                    loss = self._loss(leaves, (self.pictures[update % len(self.pictures)],), shrink)
+                    by_turns, by_shift = torch.autograd.grad(loss, [leaves.turns, leaves.shift])
+                total += float(loss.detach())
+                adam_step_(now.turns, by_turns, *moments[:2], lr=rate, step=update, betas=BETAS)
+                adam_step_(now.shift, by_shift, *moments[2:], lr=SHIFT_RATE * rate, step=update, betas=BETAS)
+            if total > (1 - LEAST_GAIN) * before:
+                rate /= 2
+                if rate < last:
+                    break
+            before = total
+        return now, update
+
+    def _loss(self, correction: Correction, pictures: Sequence[Picture], shrink: int) -> Tensor:
+        """Return the loss () of a correction: the mean over ``pictures``, compared after shrinking, and its size.
+
+        Render and picture are both shrunk: drawn at a smaller size the same Gaussians look larger, because of the
+        low-pass that every Gaussian gets in pixels, and the fit ends elsewhere.
+        """
+        start = self.start
+        posing = BodyPose(
+            axis_angle_to_matrix(start.poses[0]) @ axis_angle_to_matrix(correction.turns),
+            start.trans[0] + correction.shift * start.scale[0],
+            start.scale[0],
+        )
+        moment = self.scene.in_pose(posing, self.time)
+        losses = [self._difference(picture, moment, shrink) for picture in pictures]
+        return torch.stack(losses).mean() + POSE_WEIGHT * correction.turns.square().mean() / POSE_CM**2
+
+    def _difference(self, picture: Picture, moment: Moment, shrink: int) -> Tensor:
+        """Return the loss () between the person at ``moment`` and a picture."""
+        drawn = self.scene.render(picture.cameras, moment, options=self.options, background=self.background)
+        rendered, truth, mask = drawn.rgb[0], picture.composite(self.background), picture.mask
+        error = None if picture.alpha is None else (drawn.alpha[0] - picture.alpha)[..., None]
+        if mask is not None:
+            rendered, truth = rendered * mask[..., None], truth * mask[..., None]
+            error = None if error is None else error * mask[..., None]
+            mask = _shrunk(mask[..., None], shrink)[..., 0]
+        loss = l1_ssim_loss(_shrunk(rendered, shrink), _shrunk(truth, shrink), SSIM_WEIGHT, mask)
+        return loss if error is None else loss + ALPHA_WEIGHT * _shrunk(error, shrink).abs().mean()
+
+
+def _shrinks(pictures: Sequence[Picture]) -> tuple[int, int, int]:
+    """Return the factors by which pictures are shrunk in the three rounds."""
+    heights = [int((x.alpha > 0).any(1).sum()) if x.alpha is not None else x.cameras.height for x in pictures]
+    coarse = max(1, round(max(heights) / COARSE_PX))
+    return coarse, round(math.sqrt(coarse)), 1
+
+
+def _shrunk(picture: Tensor, factor: int) -> Tensor:
+    """Return the (H, W, C) picture with its sides divided by ``factor``, averaged over pixel areas."""
+    if factor == 1:
+        return picture
+    height, width = (max(1, round(side / factor)) for side in picture.shape[:2])
+    return area_downscale(picture, width, height)

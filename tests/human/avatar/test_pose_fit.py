@@ -1,0 +1,136 @@
+"""Poses fitted to pictures: those that are off are found again, and nothing but poses changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import pytest
+import torch
+from torch import Tensor
+
+from dyngs.build import assemble
+from dyngs.camera import Cameras
+from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
+from dyngs.data.loader import Picture, PictureLoader
+from dyngs.human.avatar import pose_fit
+from dyngs.human.avatar.pose_fit import FittedPoses, fitted_to_pictures
+from dyngs.human.avatar.posing import frame_pose
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.pose.skinning import apply_transforms, joint_transforms
+from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.metrics import psnr
+
+WHITE = torch.ones(3)
+SIZE = 64
+MOVED = ("pelvis", "left_hip", "right_knee", "spine2", "left_shoulder", "right_shoulder", "left_elbow", "head")
+
+
+class Shown:
+    """Pictures in memory, as a loader has them."""
+
+    def __init__(self, pictures: list[Picture]) -> None:
+        self._pictures = pictures
+        self.times = tuple(picture.time for picture in pictures)
+
+    def __getitem__(self, index: int) -> Picture:
+        return self._pictures[index]
+
+
+@pytest.fixture(scope="module")
+def truth(person: Path) -> tuple[HumanScene, list[Cameras]]:
+    """A person of a few hundred Gaussians, which was not trained, and three cameras."""
+    config = Config(
+        data=DataConfig(root=person),
+        model=HumanModel(resolution=24, scaffold_heights=(0.0,), min_silhouette_share=0.0, sh_degree=0),
+        optim=OptimConfig(),
+        train=TrainConfig(steps=10),
+        run=RunConfig(threads=1),
+    )
+    trainer = assemble(config)
+    assert isinstance(trainer.scene, HumanScene)
+    cameras = {tuple(x.cam_from_world.flatten().tolist()): x for x in (p.cameras for p in trainer.pictures)}
+    grow = torch.tensor([SIZE / 32, SIZE / 32, 1.0])[:, None]
+    larger = [Cameras(x.cam_from_world, grow * x.intrinsics, SIZE, SIZE) for x in cameras.values()]
+    return trainer.scene, larger
+
+
+def pictures_of(
+    scene: HumanScene, cameras: list[Cameras], times: list[float], mask: Tensor | None = None
+) -> list[Picture]:
+    found = []
+    for time in times:
+        for i, camera in enumerate(cameras):
+            with torch.no_grad():
+                drawn = scene.render(camera, time, background=torch.zeros(3))
+            rgb = drawn.rgb[0].clamp(0, 1)
+            found.append(Picture(f"{time}_{i}", camera, rgb, drawn.alpha[0], mask, time))
+    return found
+
+
+def fitted(scene: HumanScene, pictures: list[Picture]) -> FittedPoses:
+    return fitted_to_pictures(scene, cast(PictureLoader, Shown(pictures)), WHITE, scene.options)
+
+
+def disturbed(scene: HumanScene) -> HumanScene:
+    """The same person with some joints turned by 9 degrees about some axis, 3 cm from where it was."""
+    random = torch.Generator().manual_seed(2)
+    clip = scene.clip
+    rows = [JOINT_NAMES.index(name) for name in MOVED]
+    poses, away = clip.poses.clone(), torch.randn(len(clip), len(rows), 3, generator=random)
+    poses[:, rows] += 0.15 * away / away.norm(dim=2, keepdim=True)
+    return scene.playing(replace(clip, poses=poses, trans=clip.trans + torch.tensor([0.03, 0.0, 0.0])))
+
+
+def joints_of(scene: HumanScene, clip: MotionClip, row: int) -> Tensor:
+    posing, skeleton = frame_pose(clip, row), scene.learned_skeleton
+    moved = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
+    return posing.scale * apply_transforms(moved, skeleton.joints)[:22] + posing.trans
+
+
+def mean_psnr(scene: HumanScene, pictures: list[Picture]) -> float:
+    with torch.no_grad():
+        drawn = [scene.render(x.cameras, x.time, background=WHITE).rgb[0] for x in pictures]
+    return sum(psnr(a, x.composite(WHITE)) for a, x in zip(drawn, pictures, strict=True)) / len(pictures)
+
+
+def test_disturbed_poses_are_found_again(
+    truth: tuple[HumanScene, list[Cameras]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 4)
+    scene, cameras = truth
+    pictures = pictures_of(scene, cameras, list(scene.times[:2]))
+    start = disturbed(scene)
+    fit = fitted(start, pictures)
+    assert mean_psnr(fit.scene, pictures) > mean_psnr(start, pictures) + 5
+    assert len(fit.updates) == 2
+    for row in range(2):
+        true = joints_of(scene, scene.moves_as, row)
+        before, after = (joints_of(scene, x.moves_as, row) for x in (start, fit.scene))
+        errors = [float((x - true).norm(dim=1).mean()) for x in (before, after)]
+        assert errors[1] < 0.5 * errors[0]
+        assert errors[0] > 0.03
+    assert fit.scene.gaussians is start.gaussians
+    assert fit.scene.learned is start.learned
+
+
+def test_what_fits_already_stays(truth: tuple[HumanScene, list[Cameras]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
+    scene, cameras = truth
+    pictures = pictures_of(scene, cameras[:1], [0.0])
+    fit = fitted(scene, pictures)
+    torch.testing.assert_close(fit.scene.moves_as.poses, scene.moves_as.poses[:1], rtol=0, atol=1e-5)
+    torch.testing.assert_close(fit.scene.moves_as.trans, scene.moves_as.trans[:1], rtol=0, atol=1e-6)
+
+
+def test_masked_pixels_say_nothing_about_the_pose(
+    truth: tuple[HumanScene, list[Cameras]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
+    scene, cameras = truth
+    start = disturbed(scene)
+    pictures = pictures_of(scene, cameras[:1], [0.0], mask=torch.zeros(SIZE, SIZE))
+    fit = fitted(start, pictures)
+    torch.testing.assert_close(fit.scene.moves_as.poses, start.moves_as.poses[:1], rtol=0, atol=1e-5)
