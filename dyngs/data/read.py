@@ -30,7 +30,14 @@ from dyngs.data.readers import (
     zju_mocap,
 )
 from dyngs.data.readers.shared.capture_format import CaptureFormat
-from dyngs.data.times import clip_seconds, sequence_warnings, span_in_files, still_if_constant, unit_times
+from dyngs.data.times import (
+    clip_seconds,
+    sequence_warnings,
+    span_in_files,
+    still_if_constant,
+    times_of_frames,
+    unit_times,
+)
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside, pictures_up_to, staying_within
 from dyngs.files.wrong_place import command_for
@@ -128,6 +135,8 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
     splits: Splits = {name: tuple(sorted(views, key=lambda view: view.name)) for name, views in capture.splits.items()}
     if not splits.get("train"):
         raise DyngsError(f"{capture.root}: the {capture.format} capture has no training views; add posed pictures")
+    if capture.body is not None:  # people are drawn in the poses of their frames, which are found by their times
+        splits = times_of_frames(splits)
     new_poses = splits.pop("pose", None)
     by_name: list[str] = []
     rate = options.frames_per_second

@@ -64,6 +64,28 @@ def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Spl
     return scaled, [f"times run from {first:g} to {last:g} and were scaled to [0, 1]"]
 
 
+def times_of_frames(splits: Splits) -> Splits:
+    """Return the splits with times by frame number where no view has a time and all have a frame, of several.
+
+    The first frame of all splits is at 0 and the last one at 1; the split pose is a clip of its own.
+    """
+    clips = {name: "pose" if name == "pose" else "train" for name in splits}
+    whole: defaultdict[str, list[View]] = defaultdict(list)
+    for name, views in splits.items():
+        whole[clips[name]] += views
+    spans: dict[str, tuple[int, int]] = {}
+    for clip, views in whole.items():
+        frames = {view.frame for view in views if view.frame is not None and view.time is None}
+        if len(frames) > 1 and all(view.frame is not None and view.time is None for view in views):
+            spans[clip] = (min(frames), max(frames) - min(frames))
+    timed: Splits = dict(splits)
+    for name, views in splits.items():
+        if clips[name] in spans:
+            first, span = spans[clips[name]]
+            timed[name] = tuple(replace(view, time=((view.frame or 0) - first) / span) for view in views)
+    return timed
+
+
 def span_in_files(written: Splits, kept: Splits) -> tuple[float, float] | None:
     """Return the first and the last time of the ``kept`` views as ``written`` in the files; None without times."""
     names = {view.name for view in all_views(kept) if view.time is not None}

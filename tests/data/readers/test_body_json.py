@@ -154,3 +154,14 @@ def test_frames_are_held_out_where_no_other_clip_was_filmed(root: Path) -> None:
     (root / "body_train.npz").unlink()
     with pytest.raises(DyngsError, match="is for people; here are no body parameters"):
         read_capture(DataConfig(root=root, pose_frames="2::"))
+
+
+def test_times_that_are_not_given_follow_from_frame_numbers(root: Path) -> None:
+    """Or else every picture would be compared with the first pose."""
+    timed = read_capture(DataConfig(root=root))
+    for split in ("train", "test", "pose"):
+        edit_json(root / f"transforms_{split}.json", lambda content: [own.pop("time") for own in content["frames"]])
+    found = read_capture(DataConfig(root=root))
+    for split, views in timed.splits.items():
+        assert [view.time for view in found.splits[split]] == [view.time for view in views]
+    assert {view.time for view in found.splits["train"]} == {0, 0.5, 1}
