@@ -1,4 +1,4 @@
-"""Selection of frames: ``data.frames`` and ``data.pose_frames`` as Python slices over the times of a capture."""
+"""Selection of views: ``data.frames`` and ``data.pose_frames`` as Python slices over times, ``data.train_cameras``."""
 
 from __future__ import annotations
 
@@ -76,6 +76,29 @@ def hold_out_frames(root: Path, splits: Splits, frames: str) -> tuple[Splits, tu
     others = {view.camera_id for view in splits.get("test", ())} - trained
     held = all_views(_at_times(splits, distinct, picked))
     return kept, tuple(view for view in held if not others or view.camera_id in others)
+
+
+def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Splits:
+    """Return the views of the splits anew: those of ``cameras`` for training, those of all others for testing.
+
+    Raises:
+        DyngsError: a camera that has no pictures, or no other camera.
+    """
+    views = all_views(splits)
+    known = sorted({view.camera_id for view in views})
+    unknown = sorted(set(cameras) - set(known))
+    shown = ", ".join(map(str, cameras))
+    if unknown:
+        raise DyngsError(
+            f"{root}: data.train_cameras=[{shown}]: no camera {unknown[0]}; there are {len(known)}, from {known[0]} to "
+            f"{known[-1]}"
+        )
+    if set(known) == set(cameras):
+        raise DyngsError(f"{root}: data.train_cameras=[{shown}] are all cameras of the capture; leave one for testing")
+    return {
+        "train": tuple(view for view in views if view.camera_id in cameras),
+        "test": tuple(view for view in views if view.camera_id not in cameras),
+    }
 
 
 def _picked_times(root: Path, splits: Splits, frames: str, key: str) -> tuple[dict[float, float], list[float]]:

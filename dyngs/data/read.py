@@ -10,7 +10,7 @@ import numpy as np
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, Lens, PointCloud, Splits, View, all_views
-from dyngs.data.frame_selection import hold_out_frames, select_frames
+from dyngs.data.frame_selection import hold_out_frames, select_frames, split_by_camera
 from dyngs.data.geometry.recenter import recenter
 from dyngs.data.name_order import times_by_name
 from dyngs.data.pictures.frame_cache import decode_frames
@@ -138,6 +138,10 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
     if capture.body is not None:  # people are drawn in the poses of their frames, which are found by their times
         splits = times_of_frames(splits)
     new_poses = splits.pop("pose", None)
+    if options.train_cameras is not None:
+        splits = split_by_camera(capture.root, splits, options.train_cameras)
+        said = tuple(line for line in capture.warnings if line != zju_mocap.FIRST_HELD_OUT)
+        capture = replace(capture, warnings=said)
     by_name: list[str] = []
     rate = options.frames_per_second
     if options.times == "order":

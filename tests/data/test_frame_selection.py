@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dyngs.data.capture import Split, View
-from dyngs.data.frame_selection import hold_out_frames, parse_frames, select_frames
+from dyngs.data.frame_selection import hold_out_frames, parse_frames, select_frames, split_by_camera
 from dyngs.data.times import distinct_times
 from dyngs.errors import DyngsError
 
@@ -134,3 +134,14 @@ def test_held_out_frames_are_seen_from_the_test_cameras_if_there_are_any() -> No
 def test_frames_that_cannot_be_held_out(frames: str, message: str) -> None:
     with pytest.raises(DyngsError, match=message):
         hold_out_frames(ROOT, filmed(0, "train"), frames)
+
+
+def test_cameras_that_are_trained_on() -> None:
+    splits: dict[Split, tuple[View, ...]] = {"train": (), "test": filmed(0, "test")["test"]}
+    splits["train"] = tuple(view for camera in (1, 2) for view in filmed(camera, "train")["train"])
+    found = split_by_camera(ROOT, splits, (0, 2))
+    assert {name: {view.camera_id for view in views} for name, views in found.items()} == {"train": {0, 2}, "test": {1}}
+    with pytest.raises(DyngsError, match=r"train_cameras=\[3\]: no camera 3; there are 3, from 0 to 2"):
+        split_by_camera(ROOT, splits, (3,))
+    with pytest.raises(DyngsError, match="are all cameras of the capture; leave one for testing"):
+        split_by_camera(ROOT, splits, (0, 1, 2))

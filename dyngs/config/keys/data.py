@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -35,6 +35,12 @@ class DataConfig(Section):
         default=None,
         description="start:stop:step over the times that data.frames leaves: pictures of a person that are held out as "
         "the split pose; -20:: is the last 20; null: none",
+    )
+    train_cameras: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(
+        default=None,
+        min_length=1,
+        description="cameras whose pictures are trained on, by index from 0 as the capture has them; those of all "
+        "others are for testing; null: as the capture says",
     )
     times: Literal["files", "order"] = Field(
         default="files",

@@ -23,6 +23,7 @@ from dyngs.files.pickles import read_pickle, read_pickled_array
 ANNOTATIONS = "annots.npy"
 CAMERAS = "cameras.pkl"
 MESHES = "mesh_infos.pkl"
+FIRST_HELD_OUT = "no camera is named for testing: the first one is held out"
 
 _MASK_FOLDERS = ("mask_cihp", "mask", "masks")
 _NUM_JOINTS = 24
@@ -208,7 +209,7 @@ def _splits(views: Sequence[View]) -> tuple[Splits, list[str]]:
     return {
         "train": tuple(view for view in views if view.camera_id != 0),
         "test": tuple(view for view in views if view.camera_id == 0),
-    }, ["no camera is named for testing: the first one is held out"]
+    }, [FIRST_HELD_OUT]
 
 
 def _mask(root: Path, file: str, folders: Sequence[str]) -> Path | None:

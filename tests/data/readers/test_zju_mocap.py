@@ -302,3 +302,14 @@ def test_the_last_frame_is_held_out_as_a_new_pose(tmp_path: Path, cameras: int, 
     assert {view.frame for view in (*capture.splits["train"], *capture.splits["test"])} == {0, 1}
     assert capture.body is not None
     assert 2 in capture.body["pose"].frames
+
+
+def test_one_camera_is_trained_on_and_all_others_tested(tmp_path: Path) -> None:
+    """As published for one training camera, with new poses held out."""
+    write_annots(tmp_path)
+    capture = read_capture(DataConfig(root=tmp_path, train_cameras=(0,), pose_frames="2::"))
+    found = {name: {(v.camera_id, v.frame) for v in views} for name, views in capture.splits.items()}
+    others = {(camera, frame) for camera in (1, 2, 3) for frame in (0, 1)}
+    held = {(camera, 2) for camera in (1, 2, 3)}
+    assert found == {"train": {(0, 0), (0, 1)}, "val": set(), "test": others, "pose": held}
+    assert not [line for line in capture.warnings if "held out" in line]
