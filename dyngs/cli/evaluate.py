@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,6 +45,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     from dyngs.evaluate.report import evaluate_run, report_path
 
+    if arguments.refine:
+        print("refining poses on the tested pictures, beside the scores as given: this takes a while", file=sys.stderr)
     report = evaluate_run(
         arguments.run_dir,
         arguments.split,

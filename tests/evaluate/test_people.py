@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -13,10 +14,14 @@ import dyngs
 from dyngs.camera import Cameras
 from dyngs.cli import main
 from dyngs.data.loader import Picture
+from dyngs.data.read import read_capture
 from dyngs.evaluate.people import person_box, person_scores
+from dyngs.evaluate.report import scene_of_split
 from dyngs.human.avatar import pose_fit
+from dyngs.human.avatar.scene import avatar_of
 from dyngs.metrics import Lpips, ssim
 from dyngs.rendering import Rendering
+from dyngs.runs.checkpoint import load_run
 
 NO_LPIPS = Lpips("alex", "no weights here")
 CAMERA = Cameras(torch.eye(4)[None], torch.tensor([[[20.0, 0, 10], [0, 20, 6], [0, 0, 1]]]), 20, 12)
@@ -59,9 +64,24 @@ def test_nobody_is_to_be_seen() -> None:
 
 @pytest.fixture(scope="module")
 def run(person: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "person"
-    keys = [f"data.root={person}", f"run.dir={folder}", "train.steps=6", "run.threads=1", "model.resolution=24"]
-    return dyngs.train(dyngs.load_config("human", keys))
+    """Of a capture without another clip: the last of its three frames is held out."""
+    folder = tmp_path_factory.mktemp("runs")
+    root = shutil.copytree(person, folder / "capture", ignore=shutil.ignore_patterns("*_pose.*", "pose"))
+    keys = [f"data.root={root}", "data.pose_frames=2::", f"run.dir={folder / 'run'}", "train.steps=6", "run.threads=1"]
+    return dyngs.train(dyngs.load_config("human", [*keys, "model.resolution=24"]))
+
+
+def test_held_out_frames_are_scored_in_the_poses_of_the_file(run: Path) -> None:
+    loaded = load_run(run)
+    capture = read_capture(loaded.config.data)
+    trained, held = (avatar_of(scene_of_split(loaded, capture, split)) for split in ("test", "pose"))
+    assert trained is not None
+    assert held is not None
+    assert (len(trained.moves_as), len(held.moves_as)) == (2, 1)
+    assert capture.body is not None
+    given = torch.from_numpy(capture.body["pose"].poses[2]).float()
+    assert held.played is not None
+    torch.testing.assert_close(held.played.poses[0], given, rtol=0, atol=1e-6)
 
 
 def test_refined_poses_stand_beside_those_as_given(
