@@ -162,10 +162,10 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         if not splits["train"]:
             raise DyngsError(f"{capture.root}: data.test_every={options.test_every} leaves no training views; raise it")
     splits.setdefault("val", ())
-    if options.undistort == "wide":
-        splits = {name: _wide(views) for name, views in splits.items()}
     if new_poses is not None:
         splits["pose"] = new_poses
+    if options.undistort == "wide":
+        splits = {name: _wide(views) for name, views in splits.items()}
     for view in all_views(splits):
         _check_places(view)
     splits, tracks, absent = present_priors(splits, capture.tracks_path)
