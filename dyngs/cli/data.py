@@ -91,7 +91,7 @@ def _add_motion(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         description="Read a motion, retarget it to the template if it has another skeleton, and write it as .npz in "
         "the layout of AMASS SMPL-X, y up.",
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help="AMASS .npz, .bvh, .glb or .gltf")
+    parser.add_argument("file", type=Path, metavar="FILE", help="AMASS or SMPL-X .npz, .bvh, .glb, .gltf, .vrma")
     parser.add_argument("out", type=Path, metavar="OUT.npz", help="a new file")
     parser.add_argument("--fps", type=float, metavar="F", help="resample to F frames per second (default: as in FILE)")
     parser.add_argument("--up", choices=("auto", "y", "z"), default="auto", help="up axis of an .npz (default auto)")

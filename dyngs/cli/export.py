@@ -61,7 +61,10 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     when.add_argument("--time", type=scene_time, metavar="T", help="time to export, from 0 to 1 (default 0)")
     when.add_argument("--times", metavar="A:B:N", help="N times from A to B (tracks: default the training times)")
     parser.add_argument(
-        "--motion", type=Path, metavar="FILE", help="motion for a person: AMASS .npz, .bvh, .glb or .gltf"
+        "--motion",
+        type=Path,
+        metavar="FILE",
+        help="motion for a person: .npz (AMASS, SMPL-X), .bvh, .glb, .gltf, .vrma",
     )
     parser.add_argument(
         "--max-change",

@@ -100,7 +100,10 @@ def _add_person(parser: argparse.ArgumentParser) -> None:
     """Add the options of people."""
     person = parser.add_mutually_exclusive_group()
     person.add_argument(
-        "--motion", type=Path, metavar="FILE", help="motion for a person: AMASS .npz, .bvh, .glb or .gltf"
+        "--motion",
+        type=Path,
+        metavar="FILE",
+        help="motion for a person: .npz (AMASS, SMPL-X), .bvh, .glb, .gltf, .vrma",
     )
     person.add_argument("--pose", choices=("rest",), help="show a person in the rest pose of the template")
 

@@ -24,7 +24,7 @@ class AnimatedRun:
 
 
 def with_motion(run: LoadedRun, path: Path) -> AnimatedRun:
-    """Return the run with its person in the motion of a file (AMASS, BVH or glTF).
+    """Return the run with its person in the motion of a file (AMASS, SMPL-X, BVH, glTF or VRM animation).
 
     A file with ``scale`` is a fit to this person in the world of the capture; any other motion is adapted to the size,
     place and up direction of the person.

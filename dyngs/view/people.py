@@ -22,7 +22,7 @@ MAIN_JOINTS = (
     *("left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle"),
 )
 """Joints with sliders."""
-MOTION_SUFFIXES = (".npz", ".bvh", ".glb", ".gltf")
+MOTION_SUFFIXES = (".npz", ".bvh", ".glb", ".gltf", ".vrma")
 _MOST_MOTIONS = 500
 
 Angles = Mapping[str, tuple[float, float, float]]

@@ -1,4 +1,4 @@
-"""Reader and writer of AMASS motion files: ``.npz`` of SMPL, SMPL-H and SMPL-X.
+"""Reader and writer of AMASS motion files, and of other ``.npz`` with the parameters of SMPL, SMPL-H and SMPL-X.
 
 Local letters: J joints, F frames, B shape parameters.
 """
@@ -27,6 +27,12 @@ from dyngs.human.template.joints import SMPLX_ROWS
 _MODELS = {72: "smpl", 156: "smplh", 165: "smplx"}
 _PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
 """Keys and widths of the parts of 165 numbers, in order; all after the second may be missing."""
+_NAMED = ("global_orient", "body_pose", "jaw_pose", "leye_pose", "reye_pose", "left_hand_pose", "right_hand_pose")
+"""Keys of the same 165 numbers as the package smplx names its arguments."""
+_NAMED_WIDTHS = (3, 63, 3, 3, 3, 45, 45)
+_RATES = ("mocap_frame_rate", "mocap_framerate", "fps", "frame_rate")
+_ANY_AXES = "any axes"
+"""Marks arrays of a file with the names of smplx: nobody says which way is up."""
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
@@ -35,9 +41,12 @@ def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
 
     Keys: ``poses`` (F, 72, 156 or 165), or ``root_orient``, ``pose_body`` and the like; ``trans`` (F, 3);
     ``mocap_framerate`` or ``mocap_frame_rate``; ``betas`` (B,) if known; ``scale`` (one or F) and ``up_axis`` ("y" or
-    "z") in files that dyngs or a fit wrote. The last two of SMPL's 24 joints, the hands, are left out.
+    "z") in files that dyngs or a fit wrote. The last two of SMPL's 24 joints, the hands, are left out. Or the names of
+    the package smplx, which most fits to videos have: ``global_orient``, ``body_pose`` and the like, ``transl``,
+    ``fps``.
 
     AMASS files are z up: unless ``up`` or the key ``up_axis`` says otherwise, a file is z up if it has no ``scale``.
+    Fits with the names of smplx have any axes: there, the one nearest to the mean up direction of the pelvis is up.
     The rotation T from z up to y up moves every vertex v to T v: the root rotates about the pelvis J_0 of the shaped
     body, hence R_0' = T R_0 and trans' = T (trans + s J_0) - s J_0.
 
@@ -91,10 +100,11 @@ def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: U
     is_other_model = not is_own and body.name != _MODELS[width]
     if not is_own:
         betas = np.zeros_like(betas) if is_other_model else betas[: body.num_shapes]
-    if _is_z_up(path, arrays, up):
+    turn = _y_up_from_file(path, arrays, up, poses[:, 0])
+    if turn is not None:
         pelvis = scale[:, None] * _pelvis(body, betas)
-        poses[:, 0] = (Rotation.from_matrix(_Y_UP_FROM_Z_UP) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
-        trans = (trans + pelvis) @ _Y_UP_FROM_Z_UP.T - pelvis
+        poses[:, 0] = (Rotation.from_matrix(turn) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+        trans = (trans + pelvis) @ turn.T - pelvis
     values = (torch.from_numpy(x).float() for x in (poses, trans, betas, scale))
     poses, trans, betas, scale = values
     motion = Motion(poses, trans, betas, _fps(path, arrays), scale)
@@ -103,10 +113,35 @@ def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: U
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays that are needed; others, which may hold objects, are not read."""
-    keys = ("poses", *_PARTS, "trans", "betas", "scale", "up_axis", "mocap_framerate", "mocap_frame_rate")
+    keys = ("poses", *_PARTS, *_NAMED, "trans", "transl", "betas", "scale", "up_axis", *_RATES)
     if not path.is_file():
         raise DyngsError(f"{path}: no such file")
-    return read_arrays(path, lambda names: [key for key in keys if key in names])
+    found = read_arrays(path, lambda names: [key for key in keys if key in names])
+    if "poses" not in found and "root_orient" not in found and "global_orient" in found:
+        return _renamed(path, found)
+    return found
+
+
+def _renamed(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the arrays of a file with the names of the package smplx under those of AMASS, with poses of 165."""
+    frames = len(np.atleast_1d(arrays["global_orient"]))
+    parts = []
+    for key, width in zip(_NAMED, _NAMED_WIDTHS, strict=True):
+        part = _numbers(path, arrays, key) if key in arrays or key == "body_pose" else np.zeros((frames, width))
+        part = part.reshape(len(part), -1) if part.ndim else part
+        if key == "body_pose" and part.shape == (frames, 69):
+            part = part[:, :63]  # SMPL's, whose last two joints are the hands
+        if part.shape != (frames, width):
+            advice = "; save axis-angles, hands with use_pca=False" if part.ndim == 2 else ""
+            raise DyngsError(f"{path}: '{key}' must be {frames} x {width} numbers, {_got(part)}{advice}")
+        parts.append(part)
+    rest = {key: x for key, x in arrays.items() if key not in _NAMED}
+    betas = rest.get("betas")
+    if betas is not None and betas.ndim == 2 and len(betas) == frames:
+        rest["betas"] = _numbers(path, arrays, "betas").mean(axis=0)  # of one person, fitted to each frame anew
+    if "transl" in rest:
+        rest["trans"] = rest.pop("transl")
+    return {**rest, "poses": np.concatenate(parts, axis=1), _ANY_AXES: np.ones(1)}
 
 
 def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
@@ -130,7 +165,9 @@ def _joined_parts(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
     """Return poses (F, 165) joined from the parts of the body."""
     missing = [key for key in ("root_orient", "pose_body") if key not in arrays]
     if missing:
-        raise DyngsError(f"{path}: has neither 'poses' nor '{missing[0]}'; give an AMASS file of a motion")
+        raise DyngsError(
+            f"{path}: has neither 'poses' nor '{missing[0]}' nor 'global_orient'; give an AMASS file of a motion"
+        )
     frames = len(np.atleast_1d(arrays["root_orient"]))
     parts = []
     for key, width in _PARTS.items():
@@ -157,7 +194,7 @@ def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str) -> np.ndarray:
 
 def _fps(path: Path, arrays: dict[str, np.ndarray]) -> float:
     """Return the frames per second."""
-    key = "mocap_frame_rate" if "mocap_frame_rate" in arrays else "mocap_framerate"
+    key = next((key for key in _RATES if key in arrays), "fps" if _ANY_AXES in arrays else _RATES[1])
     rate = _numbers(path, arrays, key)
     if rate.size != 1 or not rate.item() > 0:
         raise DyngsError(f"{path}: '{key}' must be one positive number")
@@ -170,6 +207,27 @@ def _scale(path: Path, arrays: dict[str, np.ndarray], frames: int) -> np.ndarray
     if scale.shape not in ((), (1,), (frames,)) or not (scale > 0).all():
         raise DyngsError(f"{path}: 'scale' must be one positive number, or one for each of {frames} frames")
     return np.broadcast_to(scale, frames).copy()
+
+
+def _y_up_from_file(path: Path, arrays: dict[str, np.ndarray], up: UpAxis, roots: np.ndarray) -> np.ndarray | None:
+    """Return the rotation (3, 3) to y up, None if there is nothing to turn.
+
+    By ``up``, the key ``up_axis``, as AMASS files are, or by rotations (F, 3) of the root.
+    """
+    if up == "auto" and "up_axis" not in arrays and _ANY_AXES in arrays:
+        mean = Rotation.from_rotvec(roots).as_matrix()[:, :, 1].mean(axis=0)
+        axis = int(np.abs(mean).argmax())
+        found = np.eye(3)[axis] * (1.0 if mean[axis] >= 0 else -1.0)
+        return None if found[1] > 0 else _turn_to_y(found)
+    return _Y_UP_FROM_Z_UP if _is_z_up(path, arrays, up) else None
+
+
+def _turn_to_y(up: np.ndarray) -> np.ndarray:
+    """Return the rotation (3, 3) that takes a signed axis other than y to y; half a turn about x for -y."""
+    if up[1] < 0:
+        return np.diag([1.0, -1.0, -1.0])
+    across = np.cross(up, [0.0, 1.0, 0.0])
+    return Rotation.from_rotvec(np.pi / 2 * across).as_matrix()
 
 
 def _is_z_up(path: Path, arrays: dict[str, np.ndarray], up: UpAxis) -> bool:

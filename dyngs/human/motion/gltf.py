@@ -1,6 +1,6 @@
-"""Reader of skeletal animations in glTF 2.0 files (``.glb``, ``.gltf``).
+"""Reader of skeletal animations in glTF 2.0 files (``.glb``, ``.gltf``), and of VRM animations (``.vrma``).
 
-Local letters: S joints of the skin, F frames, K keys of a channel.
+Local letters: S joints, F frames, K keys of a channel.
 """
 
 from __future__ import annotations
@@ -12,11 +12,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.errors import reading
-from dyngs.human.motion.gltf_file import Animation, GltfFile
+from dyngs.files.limits import require_at_most
+from dyngs.human.motion.gltf_file import MOST_JOINTS, Animation, GltfFile
 from dyngs.human.motion.motion import frame_chunks, require_frame_count, sample_times
 from dyngs.human.motion.skeleton_motion import SkeletonMotion
 
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
+
+
+_VRM_THUMBS = {
+    f"{side}Thumb{new}": f"{side}Thumb{old}"
+    for side in ("left", "right")
+    for new, old in (("Metacarpal", "Proximal"), ("Proximal", "Intermediate"))
+}
+"""Names of the thumb's first two bones in VRM 1, and what VRM 0, and all other fingers, call these."""
 
 
 @dataclass(frozen=True)
@@ -37,32 +46,96 @@ class _Transforms:
     positions: np.ndarray
 
 
-def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> SkeletonMotion:
-    """Read the motion of the joints of the file's largest skin at ``fps`` frames per second, from first to last key.
+@dataclass(frozen=True)
+class _Rig:
+    """The joints of a file: nodes, names, and inverse bind matrices (an accessor); None: the nodes stand at rest."""
 
-    The rest pose is the bind pose, inverse(inverseBindMatrices), or without these the nodes without animation. The
-    world is that of the scene, y up. The rotation of a joint is the product of those of its nodes: scale is left out.
+    joints: tuple[int, ...]
+    names: tuple[str, ...]
+    bind: int | None = None
+
+
+def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> SkeletonMotion:
+    """Read the motion of a file's joints at ``fps`` frames per second, from first to last key.
+
+    The joints are those of the largest skin, and the rest pose is the bind pose, inverse(inverseBindMatrices), or
+    without these the nodes without animation. A file without a skin, as Mixamo exports "without skin", has the nodes
+    that are animated for joints, and must show a T-pose or an A-pose without animation. The world is that of the scene,
+    y up. The rotation of a joint is the product of those of its nodes: scale is left out.
 
     Args:
         path: of the file.
         fps: frames per second.
-        clip: name of the animation; needed if several move the skin.
+        clip: name of the animation; needed if several move the joints.
 
     Raises:
-        DyngsError: no skin, no such animation, anything broken or not supported (sparse accessors, meshopt compression,
-            mirrored nodes); names the file.
+        DyngsError: no such animation, anything broken or not supported (sparse accessors, meshopt compression, mirrored
+            nodes); names the file.
     """
     with reading(path):
-        return _motion(GltfFile(path), fps, clip)
+        file = GltfFile(path)
+        rig = _skin(file) or _animated_nodes(file, clip)
+        return _motion(file, rig, fps, _chosen(file, _with_ancestors(file, rig.joints), clip))
 
 
-def _motion(file: GltfFile, fps: float, clip: str | None) -> SkeletonMotion:
-    """Return the motion of the largest skin's joints, in world rotations relative to the rest pose."""
-    joints = max((skin.joints for skin in file.document.skins), key=len, default=())
+def read_vrm_animation(path: Path, fps: float = 30.0, clip: str | None = None) -> SkeletonMotion:
+    """Read a VRM animation (``.vrma``, extension VRMC_vrm_animation 1.0): the bones have the names of VRM's humanoid.
+
+    Without animation the nodes stand in a T-pose. The first animation counts unless ``clip`` names another. Expressions
+    and the gaze are left out.
+
+    Raises:
+        DyngsError: as ``read_gltf``, or the extension is missing.
+    """
+    with reading(path):
+        file = GltfFile(path)
+        extension = file.document.extensions.VRMC_vrm_animation
+        if extension is None:
+            raise file.error("has no VRMC_vrm_animation; a plain glTF animation ends in .glb")
+        bones = extension.humanoid.humanBones
+        rig = _Rig(tuple(bone.node for bone in bones.values()), tuple(_VRM_THUMBS.get(name, name) for name in bones))
+        if not bones:
+            raise file.error("its humanoid has no bones; export it again")
+        chain = _with_ancestors(file, rig.joints)
+        moving = _moving(file, chain)
+        chosen = moving[0] if moving and clip is None else _chosen(file, chain, clip)
+        return _motion(file, rig, fps, chosen)
+
+
+def _skin(file: GltfFile) -> _Rig | None:
+    """Return the joints of the largest skin; None without skins."""
+    if not file.document.skins:
+        return None
+    largest = max(file.document.skins, key=lambda skin: len(skin.joints))
+    nodes = file.document.nodes
+    names = tuple(nodes[node].name if node < len(nodes) else "" for node in largest.joints)
+    return _Rig(largest.joints, names, largest.inverseBindMatrices)
+
+
+def _animated_nodes(file: GltfFile, clip: str | None) -> _Rig:
+    """Return the nodes that an animation turns or moves, and all below them."""
+    nodes = file.document.nodes
+    channels = _chosen(file, dict.fromkeys(range(len(nodes))), clip).channels
+    moved = {c.target.node for c in channels if c.target.path in _KINDS and c.target.node is not None}
+    waiting = [node for node in moved if node < len(nodes)]
+    found: set[int] = set()
+    while waiting:
+        node = waiting.pop()
+        if node not in found and node < len(nodes):
+            found.add(node)
+            waiting += nodes[node].children
+    require_at_most(file.path, len(found), MOST_JOINTS, "joints")
+    joints = tuple(sorted(found))
     if not joints:
-        raise file.error("has no skin, hence no skeleton; export it with its skinned mesh")
+        raise file.error("its animation moves no node; export it again")
+    return _Rig(joints, tuple(nodes[node].name for node in joints))
+
+
+def _motion(file: GltfFile, rig: _Rig, fps: float, animation: Animation) -> SkeletonMotion:
+    """Return the motion of the joints, in world rotations relative to the rest pose."""
+    joints = rig.joints
     chain = _with_ancestors(file, joints)
-    curves = _curves(file, _chosen(file, chain, clip), chain)
+    curves = _curves(file, animation, chain)
     start, end = min(c.times[0] for c in curves.values()), max(c.times[-1] for c in curves.values())
     require_frame_count(file.path, float((end - start) * fps), len(chain))
     times = start + sample_times(end - start, 1.0, fps)
@@ -74,24 +147,15 @@ def _motion(file: GltfFile, fps: float, clip: str | None) -> SkeletonMotion:
             rotations[part, i], positions[part, i] = moving[node].rotations, moving[node].positions
     if not (np.abs(positions) < 1e9).all():
         raise file.error("its joints move beyond all bounds; export it again")
-    bind = next(skin.inverseBindMatrices for skin in file.document.skins if skin.joints == joints)
-    if bind is None:
+    if rig.bind is None:
         still = _world_transforms(file, chain, {}, np.zeros(1))
         rest = np.stack([still[node].positions[0] for node in joints])
         rest_from_joint = np.stack([still[node].rotations[0] for node in joints])
     else:
-        rest, rest_from_joint = _bind_pose(file, bind, len(joints))
+        rest, rest_from_joint = _bind_pose(file, rig.bind, len(joints))
     for part in frame_chunks(len(times)):
         rotations[part] = rotations[part] @ rest_from_joint.swapaxes(1, 2)
-    return SkeletonMotion(
-        file.path,
-        tuple(file.document.nodes[node].name for node in joints),
-        rest,
-        rotations,
-        positions,
-        fps,
-        world_is_y_up=True,
-    )
+    return SkeletonMotion(file.path, rig.names, rest, rotations, positions, fps, world_is_y_up=True)
 
 
 def _with_ancestors(file: GltfFile, joints: tuple[int, ...]) -> dict[int, int | None]:
@@ -120,16 +184,21 @@ def _with_ancestors(file: GltfFile, joints: tuple[int, ...]) -> dict[int, int | 
 
 def _chosen(file: GltfFile, chain: dict[int, int | None], clip: str | None) -> Animation:
     """Return the animation of that name, or the only one that moves a node of the chain."""
-    moving = [a for a in file.document.animations if any(c.target.node in chain for c in a.channels)]
+    moving = _moving(file, chain)
     named = [a for a in moving if clip in (None, a.name)]
     names = ", ".join(repr(a.name[:30]) for a in moving[:20])
     if not moving:
-        raise file.error("no animation moves its skin; export it with the animation")
+        raise file.error("no animation moves its joints; export it with the animation")
     if not named:
         raise file.error(f"has no animation {clip!r}; it has {names}")
     if clip is None and len(named) > 1:
         raise file.error(f"has several animations; choose a clip of {names}")
     return named[0]
+
+
+def _moving(file: GltfFile, chain: dict[int, int | None]) -> list[Animation]:
+    """Return the animations that move a node of the chain."""
+    return [a for a in file.document.animations if any(c.target.node in chain for c in a.channels)]
 
 
 def _curves(file: GltfFile, animation: Animation, chain: dict[int, int | None]) -> dict[tuple[int, str], _Curve]:

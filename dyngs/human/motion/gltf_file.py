@@ -1,4 +1,4 @@
-"""The document of a glTF 2.0 file (``.glb``, ``.gltf``): nodes, skins, animations, and the numbers of accessors.
+"""The document of a glTF 2.0 file (``.glb``, ``.gltf``, ``.vrma``): nodes, skins, animations, numbers of accessors.
 
 Local letters: K elements of an accessor, D numbers of each.
 """
@@ -27,7 +27,8 @@ _MOST_PARTS = 1 << 16
 """Limit on nodes, accessors, channels and the like."""
 
 
-_MOST_JOINTS = 4096
+MOST_JOINTS = 4096
+"""Limit on the joints of a skeleton."""
 
 
 _MOST_KEYS = 1 << 25
@@ -90,7 +91,7 @@ class Node(_Part):
 
 
 class _Skin(_Part):
-    joints: Annotated[tuple[NonNegativeInt, ...], Field(min_length=1, max_length=_MOST_JOINTS)]
+    joints: Annotated[tuple[NonNegativeInt, ...], Field(min_length=1, max_length=MOST_JOINTS)]
     inverseBindMatrices: NonNegativeInt | None = None
 
 
@@ -116,6 +117,22 @@ class Animation(_Part):
     name: str = ""
 
 
+class _Bone(_Part):
+    node: NonNegativeInt
+
+
+class _Humanoid(_Part):
+    humanBones: Annotated[dict[str, _Bone], Field(max_length=256)]
+
+
+class _VrmAnimation(_Part):
+    humanoid: _Humanoid
+
+
+class _Extensions(_Part):
+    VRMC_vrm_animation: _VrmAnimation | None = None
+
+
 class _Asset(_Part):
     version: Annotated[str, Field(pattern=r"^2\.")]
 
@@ -128,6 +145,7 @@ class _Document(_Part):
     accessors: _Parts[_Accessor] = ()
     bufferViews: _Parts[_View] = ()
     buffers: _Parts[_Buffer] = ()
+    extensions: _Extensions = _Extensions()
 
 
 class GltfFile:

@@ -9,7 +9,7 @@ from pathlib import Path
 from dyngs.errors import DyngsError, reading
 from dyngs.human.motion.amass import read_amass
 from dyngs.human.motion.bvh import read_bvh
-from dyngs.human.motion.gltf import read_gltf
+from dyngs.human.motion.gltf import read_gltf, read_vrm_animation
 from dyngs.human.motion.motion import Motion, UpAxis
 from dyngs.human.motion.retarget import retarget
 from dyngs.human.template.body import BodyTemplate
@@ -50,18 +50,25 @@ def _read_gltf(request: _Request) -> Motion:
     return retarget(read_gltf(request.path, fps, request.clip), request.body)
 
 
+def _read_vrma(request: _Request) -> Motion:
+    """Return a VRM animation, sampled likewise."""
+    fps = 30.0 if request.fps is None else request.fps
+    return retarget(read_vrm_animation(request.path, fps, request.clip), request.body)
+
+
 _FORMATS = {
-    ".npz": _Format("an AMASS .npz", lambda x: read_amass(x.path, x.body, x.up), has_up_axis=True),
+    ".npz": _Format("an AMASS or SMPL-X .npz", lambda x: read_amass(x.path, x.body, x.up), has_up_axis=True),
     ".bvh": _Format("a .bvh", lambda x: retarget(read_bvh(x.path), x.body)),
     ".glb": _Format("a .glb", _read_gltf, has_clips=True),
     ".gltf": _Format("a .gltf", _read_gltf, has_clips=True),
+    ".vrma": _Format("a .vrma", _read_vrma, has_clips=True),
 }
 
 
 def read_motion(
     path: Path, body: BodyTemplate | None = None, fps: float | None = None, up: UpAxis = "auto", clip: str | None = None
 ) -> Motion:
-    """Read a motion of 55 joints, float32, from an AMASS ``.npz``, a ``.bvh``, a ``.glb`` or a ``.gltf``.
+    """Read a motion of 55 joints, float32, from ``.npz`` (AMASS, SMPL-X), ``.bvh``, ``.glb``, ``.gltf`` or ``.vrma``.
 
     Args:
         path: of the file.

@@ -61,6 +61,19 @@ RIGS = (
         f"hips spine spine1 spine4|spine3|spine2 neck head {_MIXAMO_LIMBS} "
         "*handindex# *handmiddle# *handpinky# *handring# *handthumb#",
     ),
+    Rig(
+        "VRM",
+        ("left", "right"),
+        "hips spine chest upperchest neck head *shoulder *upperarm *lowerarm *hand *upperleg *lowerleg *foot *toes "
+        "*index# *middle# *little# *ring# *thumb# jaw *eye",
+        ("proximal", "intermediate", "distal"),
+    ),
+    Rig(
+        "VRoid",
+        ("l", "r"),
+        "chips cspine cchest cupperchest cneck chead *shoulder *upperarm *lowerarm *hand *upperleg *lowerleg *foot "
+        "*toebase *index# *middle# *little# *ring# *thumb#",
+    ),
     Rig("CMU", ("left", "right"), f"hips lowerback spine spine1 neck head {_MIXAMO_LIMBS}"),
     Rig(
         "Poser",

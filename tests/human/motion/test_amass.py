@@ -12,6 +12,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from motion_files import random_motion, slow_vertices, tiny_body
+from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
 from dyngs.human.motion.amass import read_amass, write_amass
@@ -187,6 +188,75 @@ def test_the_motions_at_hand() -> None:
             np.testing.assert_array_equal(motion.trans.numpy(), file["trans"])
             assert motion.fps == file["mocap_frame_rate"]
             assert float(motion.scale[0]) == pytest.approx(float(file["scale"]))
+
+
+# --- files with the names of the package smplx ------------------------------------------------------------------------
+
+
+def named(**changes: Any) -> dict[str, object]:
+    """The same numbers under the names that fits to videos have."""
+    poses = np.asarray(numbers()["poses"])
+    widths = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
+    widths |= {"left_hand_pose": 45, "right_hand_pose": 45}
+    ends = np.cumsum(list(widths.values()))
+    parts = {key: poses[:, end - width : end] for (key, width), end in zip(widths.items(), ends, strict=True)}
+    return {**parts, "transl": numbers()["trans"], "betas": np.ones((FRAMES, 10)), "fps": 25, **changes}
+
+
+UPS = {"y": np.eye(3), "z": Y_FROM_Z, "-y": np.diag([1.0, -1, -1]), "x": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])}
+
+
+@pytest.mark.parametrize("axis", UPS)
+def test_fits_are_turned_so_that_the_pelvis_is_upright(tmp_path: Path, axis: str) -> None:
+    """Vertex by vertex, whichever axis of the fit is up: its cameras decide that."""
+    y_from_file, body = UPS[axis], tiny_body(55, 10)
+    given = named()
+    roots = Rotation.from_rotvec(0.2 * np.asarray(given["global_orient"]))
+    given["global_orient"] = (Rotation.from_matrix(y_from_file.T) * roots).as_rotvec()
+    flat = np.concatenate([np.asarray(x) for key, x in given.items() if "pose" in key or "orient" in key], axis=1)
+    arrays = {"poses": flat, "trans": given["transl"], "betas": np.ones(10)}
+    expected = slow_vertices(body, as_written(arrays, 55)) @ y_from_file.T
+    motion = read(tmp_path, given, shapes=10)
+    np.testing.assert_allclose(slow_vertices(body, motion), expected, atol=3e-6)
+    assert motion.fps == 25
+    chosen = read(tmp_path, {**given, "up_axis": "y"}, shapes=10)
+    np.testing.assert_allclose(chosen.trans.numpy(), np.asarray(given["transl"]), atol=1e-6)
+
+
+def test_what_fits_may_lack_and_spell_otherwise(tmp_path: Path) -> None:
+    """Parts after the body, rows of joints, SMPL's 23 joints, one more axis."""
+    whole = named()
+    short = {key: x for key, x in whole.items() if key in ("global_orient", "body_pose", "transl", "fps")}
+    body = np.asarray(whole["body_pose"])
+    padded = {**short, "body_pose": np.concatenate([body, np.ones((FRAMES, 6))], axis=1)}
+    rows = {
+        **short,
+        "body_pose": body.reshape(FRAMES, 21, 3),
+        "global_orient": np.asarray(short["global_orient"])[:, None],
+    }
+    first = read(tmp_path, short)
+    np.testing.assert_allclose(first.poses[:, 1:22].reshape(FRAMES, -1).numpy(), body, atol=1e-6)
+    assert not bool(first.poses[:, 22:].any())
+    for other in (padded, rows):
+        np.testing.assert_array_equal(read(tmp_path, other).poses.numpy(), first.poses.numpy())
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"left_hand_pose": np.zeros((4, 6))}, "'left_hand_pose' must be 4 x 45 numbers, has 4 x 6; save axis-angles"),
+        ({"body_pose": None}, "the key 'body_pose' is missing"),
+        ({"body_pose": np.zeros((4, 21, 3, 3))}, "'body_pose' must be 4 x 63 numbers, has 4 x 189; save axis-angles"),
+        ({"transl": None}, "the key 'trans' is missing"),
+        ({"fps": None}, "the key 'fps' is missing"),
+        ({"global_orient": np.float64(1)}, "'global_orient' must be 1 x 3 numbers"),
+    ],
+)
+def test_broken_fits_say_what_is_wrong(tmp_path: Path, changes: dict[str, object], problem: str) -> None:
+    with pytest.raises(DyngsError, match=problem) as caught:
+        read(tmp_path, named(**changes))
+    assert str(caught.value).startswith(str(tmp_path / "x.npz"))
+    assert "\n" not in str(caught.value)
 
 
 # --- broken files -----------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from motion_files import Clip, Glb, as_local, glb_of, pelvis_path, random_motion
 from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
-from dyngs.human.motion.gltf import read_gltf
+from dyngs.human.motion.gltf import read_gltf, read_vrm_animation
 from dyngs.human.motion.motion import Motion
 from dyngs.human.motion.retarget import retarget
 from dyngs.human.template.joints import JOINT_NAMES
@@ -95,6 +95,97 @@ def test_the_text_form_with_its_buffer_inside_or_beside_it(tmp_path: Path) -> No
         found = read_gltf(tmp_path / "x.gltf")
         np.testing.assert_array_equal(found.rotations, expected.rotations)
         np.testing.assert_array_equal(found.positions, expected.positions)
+
+
+def test_a_file_without_a_skin_moves_its_animated_nodes(tmp_path: Path) -> None:
+    """As Mixamo's downloads without skin; nodes beside the skeleton are left out."""
+    glb = glb_of(OWN, clip(bind_matrices=False))
+    glb.json["skins"] = []
+    glb.json["nodes"].append({"name": "lamp"})
+    source = read_gltf(glb.write(tmp_path / "x.glb"))
+    assert source.names == JOINT_NAMES
+    same(retarget(source, BODY), MOTION)
+
+
+# --- VRM animations ---------------------------------------------------------------------------------------------------
+
+VRM = {"pelvis": "hips", "spine1": "spine", "spine2": "chest", "spine3": "upperChest", "neck": "neck", "head": "head"}
+LIMBS = {"collar": "Shoulder", "shoulder": "UpperArm", "elbow": "LowerArm", "wrist": "Hand", "hip": "UpperLeg"}
+LIMBS |= {"knee": "LowerLeg", "ankle": "Foot", "foot": "Toes"}
+PHALANGES = {"index": "Index", "middle": "Middle", "ring": "Ring", "pinky": "Little"}
+for _side in ("left", "right"):
+    VRM |= {f"{_side}_{ours}": _side + theirs for ours, theirs in LIMBS.items()}
+    for _i, _word in enumerate(("Proximal", "Intermediate", "Distal"), 1):
+        VRM |= {f"{_side}_{ours}{_i}": f"{_side}{theirs}{_word}" for ours, theirs in PHALANGES.items()}
+    VRM |= {f"{_side}_thumb{i}": f"{_side}Thumb{x}" for i, x in enumerate(("Metacarpal", "Proximal", "Distal"), 1)}
+BONES = skeleton(tuple(VRM))
+
+
+def vrma(**changes: object) -> Glb:
+    """The motion as a VRM animation: nodes have names of no meaning, the extension says which bone each is."""
+    moved = Clip(as_local(MOTION, BONES), pelvis_path(BODY, MOTION), bind_matrices=False, **changes)  # pyright: ignore[reportArgumentType]
+    glb = glb_of(BONES, moved)
+    glb.json.pop("skins")
+    for i, node in enumerate(glb.json["nodes"]):
+        node["name"] = f"node {i}"
+    bones = {VRM[name]: {"node": i} for i, name in enumerate(BONES.names)}
+    own = {"specVersion": "1.0", "humanoid": {"humanBones": bones}}
+    glb.json["extensions"] = {"VRMC_vrm_animation": own}
+    return glb
+
+
+def test_a_vrm_animation_moves_the_bones_that_it_names(tmp_path: Path) -> None:
+    """All but jaw and eyes, which VRM does not animate; also with axes of its own at rest, and facing -z."""
+    own = as_local(MOTION, BONES)
+    own_poses = np.zeros((5, 55, 3))
+    rows = [JOINT_NAMES.index(name) for name in BONES.names]
+    own_poses[:, rows] = Rotation.from_matrix(own.reshape(-1, 3, 3)).as_rotvec().reshape(5, -1, 3)
+    expected = world_rotations(own_poses, OWN.parents)
+    axes = Rotation.from_rotvec(np.random.default_rng(1).normal(size=(len(BONES.names), 3))).as_matrix()
+    for changes in ({}, {"axes": axes}):
+        source = read_vrm_animation(vrma(**changes).write(tmp_path / "x.vrma"))
+        found = retarget(source, BODY)
+        ours = world_rotations(found.poses.double().numpy(), OWN.parents)
+        np.testing.assert_allclose(ours[:, rows], expected[:, rows], atol=1e-5)
+        moved = found.trans.numpy() - found.trans.numpy()[0]
+        np.testing.assert_allclose(moved, MOTION.trans.numpy() - MOTION.trans.numpy()[0], atol=1e-5)
+
+
+def test_the_first_vrm_animation_counts(tmp_path: Path) -> None:
+    glb = vrma()
+    still = {"name": "second", "samplers": glb.json["animations"][0]["samplers"], "channels": []}
+    glb.json["animations"].append({**still, "channels": glb.json["animations"][0]["channels"][:1]})
+    path = glb.write(tmp_path / "x.vrma")
+    np.testing.assert_array_equal(
+        read_vrm_animation(path).rotations, read_vrm_animation(vrma().write(tmp_path / "y.vrma")).rotations
+    )
+    assert np.ptp(read_vrm_animation(path, clip="second").positions[:, 0], axis=0).max() == 0
+    with pytest.raises(DyngsError, match=r"has no animation 'x'; it has 'Walk', 'second'"):
+        read_vrm_animation(path, clip="x")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "problem"),
+    [
+        (lambda g: g.json.pop("extensions"), "has no VRMC_vrm_animation"),
+        (lambda g: g.json["extensions"]["VRMC_vrm_animation"].pop("humanoid"), "humanoid: Field required"),
+        (lambda g: _bones(g).update(hips={"node": 999}), "joint 999 is missing"),
+        (lambda g: _bones(g).update(hips={"node": -1}), r"humanBones\.hips\.node"),
+        (lambda g: _bones(g).clear(), "its humanoid has no bones"),
+        (lambda g: g.json.pop("animations"), "no animation moves its joints"),
+    ],
+)
+def test_vrm_animations_that_are_none(tmp_path: Path, spoil: Callable[[Glb], object], problem: str) -> None:
+    glb = vrma()
+    spoil(glb)
+    with pytest.raises(DyngsError, match=problem) as caught:
+        read_vrm_animation(glb.write(tmp_path / "x.vrma"))
+    assert str(caught.value).startswith(str(tmp_path / "x.vrma"))
+    assert "\n" not in str(caught.value)
+
+
+def _bones(glb: Glb) -> dict:
+    return glb.json["extensions"]["VRMC_vrm_animation"]["humanoid"]["humanBones"]
 
 
 # --- sampling ---------------------------------------------------------------------------------------------------------
@@ -208,8 +299,8 @@ def _node(glb: Glb, **changes: object) -> None:
 
 
 BREAKS: dict[str, tuple[Callable[[Glb], object], str]] = {
-    "no skin": (lambda g: g.json.pop("skins"), "has no skin"),
-    "no animation": (lambda g: g.json.pop("animations"), "no animation moves its skin"),
+    "no animation": (lambda g: g.json.pop("animations"), "no animation moves its joints"),
+    "no skin, no animation": (lambda g: (g.json.pop("skins"), g.json.pop("animations")), "no animation moves"),
     "old": (lambda g: g.json["asset"].update(version="1.0"), "asset.version"),
     "no asset": (lambda g: g.json.pop("asset"), "asset: Field required"),
     "text": (lambda g: _node(g, translation="here"), "nodes.0.translation: "),

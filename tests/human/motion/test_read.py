@@ -55,7 +55,7 @@ def test_the_body_that_comes_with_dyngs_is_the_default(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "options", "problem"),
     [
-        ("x.fbx", {}, r"x\.fbx: unknown kind of motion; give an AMASS \.npz"),
+        ("x.fbx", {}, r"x\.fbx: unknown kind of motion; give an AMASS or SMPL-X \.npz"),
         ("x.bvh", {"up": "z"}, "the up axis can only be chosen for an .npz"),
         ("x.npz", {"clip": "Walk"}, "holds one motion without a name"),
         ("x.bvh", {}, "cannot be read"),
