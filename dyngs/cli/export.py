@@ -30,6 +30,8 @@ examples:
   dyngs export runs/dance --static --out stage.ply                only the Gaussians that never move
   dyngs export runs/ann --motion walk.npz --out walk              a person (model.kind=human), one file per frame
   dyngs export runs/ann --format avatar --out ann.safetensors     a person as one file, for `render` and `export`
+  dyngs export runs/ann --format mesh --motion walk.npz --out ann.glb   skinned and textured, for Blender, three.js ...
+  dyngs export runs/ann --joints --out ann.ply                    Gaussians of a person with joints and weights
   dyngs export runs/dance --format tracks --dynamic               positions of all moving Gaussians over time, as .npz
   dyngs export runs/dance --format dyngs --out dance_export       a small file, for `eval`, `render` and `export`
   dyngs export runs/refined --format cameras                      runs/refined/cameras/transforms.json
@@ -41,9 +43,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``export`` to the commands."""
     parser = commands.add_parser(
         "export",
-        help="write a run as .ply, .spz, .glb and the like, tracks, avatar, small .dyngs file, page or cameras",
+        help="write a run as .ply, .spz, .glb and the like, tracks, avatar, mesh, small .dyngs file, page or cameras",
         description="Write the Gaussians of a run as files that viewers and editors read, as tracks of their centres, "
-        "as one small .dyngs file, as a page that plays by itself, a person as an avatar file, or the cameras.",
+        "as one small .dyngs file, as a page that plays by itself, a person as an avatar file or a mesh, or the cameras.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -51,7 +53,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--format",
         type=_format,
-        choices=(*SPLAT_FORMATS, MOVING, "tracks", "dyngs", "avatar", "html", "cameras"),
+        choices=(*SPLAT_FORMATS, MOVING, "tracks", "dyngs", "avatar", "mesh", "html", "cameras"),
         help="file format (default: what the suffix of --out names, else ply)",
     )
     parser.add_argument(
@@ -73,6 +75,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="--format dyngs: largest root-mean-square change of the pictures, in grey levels of 255 "
         "(default: what lowers the PSNR of training views by 0.025 dB)",
     )
+    parser.add_argument(
+        "--joints", action="store_true", help="a person at rest, with joints and skinning weights: .ply, .glb"
+    )
     add_axes(parser)
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--static", action="store_true", help="only the Gaussians that never move")
@@ -91,11 +96,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the files and print where they are and how large."""
     from dyngs.cli.export_cameras import export_cameras
     from dyngs.cli.export_html import export_page
+    from dyngs.cli.export_rigged import export_rigged
     from dyngs.export.avatar import read_avatar
     from dyngs.runs.checkpoint import load_run
 
     arguments.run_dir = run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
+    if kind == "mesh" or arguments.joints:
+        return export_rigged(arguments, kind)
     if kind == "html":
         return export_page(arguments)
     if kind == "cameras":
@@ -149,6 +157,8 @@ def _kind(arguments: argparse.Namespace) -> str:
         return given or "ply"
     found = known_format(out)
     named = _OTHER_SUFFIXES.get(out.suffix.lower()) if found is None else found.name
+    if given == "mesh" and named == "glb":
+        return given
     if given is None and named is None:
         is_sequence = arguments.times is not None or (arguments.motion is not None and arguments.time is None)
         if is_sequence and not out.suffix:

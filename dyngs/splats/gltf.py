@@ -46,19 +46,7 @@ def read_gltf(path: Path) -> SplatFile:
 
 def write_gltf(path: Path, splat: SplatFile) -> None:
     """Write a .glb with one primitive of Gaussians, harmonics up to degree 3."""
-    gaussians = splat.gaussians
-    sh = gaussians.sh.numpy()
-    arrays = {
-        "POSITION": gaussians.means.numpy(),
-        "COLOR_0": np.concatenate([_linear(sh[:, 0] * SH_C0 + 0.5), gaussians.opacities.numpy()[:, None]], axis=1),
-        f"{EXTENSION}:ROTATION": gaussians.quats.numpy()[:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": gaussians.scales.numpy(),
-        f"{EXTENSION}:OPACITY": gaussians.opacities.numpy()[:, None],
-    }
-    for degree in range(gaussians.sh_degree + 1):
-        first = num_sh_terms(degree - 1)
-        for k in range(first, num_sh_terms(degree)):
-            arrays[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - first}"] = sh[:, k]
+    arrays = gaussian_attributes(splat.gaussians)
     views, accessors, start = [], [], 0
     for name, values in arrays.items():
         size = 4 * values.size
@@ -69,20 +57,13 @@ def write_gltf(path: Path, splat: SplatFile) -> None:
             accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         accessors.append(accessor)
         start += size
-    own = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    own |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
-    primitive = {
-        "attributes": {name: i for i, name in enumerate(arrays)},
-        "mode": _POINTS,
-        "extensions": {EXTENSION: own},
-    }
     document = {
         "asset": {"version": "2.0", "generator": "dyngs"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
+        "meshes": [{"primitives": [gaussian_primitive({name: i for i, name in enumerate(arrays)})]}],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": start}],
@@ -95,6 +76,30 @@ def write_gltf(path: Path, splat: SplatFile) -> None:
         out.write(struct.pack("<I4s", start, b"BIN\0"))
         for values in arrays.values():
             out.write(np.ascontiguousarray(values, "<f4").tobytes())
+
+
+def gaussian_attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Return the numbers (N, D) of Gaussians by attribute of a primitive, harmonics up to degree 3."""
+    sh = gaussians.sh.numpy()
+    arrays = {
+        "POSITION": gaussians.means.numpy(),
+        "COLOR_0": np.concatenate([_linear(sh[:, 0] * SH_C0 + 0.5), gaussians.opacities.numpy()[:, None]], axis=1),
+        f"{EXTENSION}:ROTATION": gaussians.quats.numpy()[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": gaussians.scales.numpy(),
+        f"{EXTENSION}:OPACITY": gaussians.opacities.numpy()[:, None],
+    }
+    for degree in range(gaussians.sh_degree + 1):
+        first = num_sh_terms(degree - 1)
+        for k in range(first, num_sh_terms(degree)):
+            arrays[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - first}"] = sh[:, k]
+    return arrays
+
+
+def gaussian_primitive(attributes: dict[str, int]) -> dict[str, Any]:
+    """Return a primitive of Gaussians with accessors by attribute."""
+    own = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    own |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
+    return {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: own}}
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ render the file), ``SH degree``, ``eps2d`` (the 2D low-pass variance), ``up`` (t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +40,7 @@ def write_ply(
     *,
     eps2d: float | None = None,
     world_offset: Sequence[float] | np.ndarray | None = None,
+    columns: Mapping[str, np.ndarray] | None = None,
 ) -> Path:
     """Write Gaussians as .ply, atomically: an old file stays until the new one is complete. Return the path.
 
@@ -50,12 +51,14 @@ def write_ply(
         comments: further header comments, one line of ASCII each.
         eps2d: 2D low-pass variance (px^2) to note in the header.
         world_offset: (3,) offset to note in the header; zeros are not noted.
+        columns: further properties (N,) by name, written as float32 after all others; ``read_ply`` skips them.
 
     Raises:
         DyngsError: no Gaussians, non-finite values, or the file cannot be written.
     """
     path = Path(path)
-    table = _table(gaussians)
+    more = columns or {}
+    table = np.column_stack([_table(gaussians), *(x.astype("<f4") for x in more.values())])
     if len(table) == 0:
         raise DyngsError(f"{path}: not written, there are no Gaussians")
     bad = int((~np.isfinite(table).all(axis=1)).sum())
@@ -63,7 +66,7 @@ def write_ply(
         raise DyngsError(f"{path}: not written, {bad} of {len(table)} Gaussians have non-finite values")
     x, y, z = (0.0, 0.0, 0.0) if world_offset is None else map(float, world_offset)
     notes = header_comments(SplatFile(gaussians, mode, eps2d, (x, y, z)))
-    header = _header([*notes, *comments], len(table), gaussians.sh.shape[1])
+    header = _header([*notes, *comments], len(table), gaussians.sh.shape[1], tuple(more))
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         file.write(header)
         file.write(table.data)
@@ -139,14 +142,14 @@ _ROT = tuple(f"rot_{i}" for i in range(4))
 _REQUIRED = ("x", "y", "z", *_DC, "opacity", *_SCALE, *_ROT)
 
 
-def _header(comments: Iterable[str], count: int, num_terms: int) -> bytes:
+def _header(comments: Iterable[str], count: int, num_terms: int, more: tuple[str, ...] = ()) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0"]
     for comment in comments:
         if "\n" in comment or "\r" in comment or not comment.isascii():
             raise ValueError(f"a .ply comment must be one line of ASCII: {comment!r}")
         lines.append(f"comment {comment}")
     lines.append(f"element vertex {count}")
-    lines += [f"property float {name}" for name in _property_names(num_terms)]
+    lines += [f"property float {name}" for name in (*_property_names(num_terms), *more)]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 

@@ -300,3 +300,12 @@ def test_damaged_bytes_never_give_anything_but_an_error_line(tmp_path_factory, d
     except DyngsError:
         return
     assert all(x.isfinite().all() for x in gaussians.tensors().values())
+
+
+def test_further_columns_are_skipped_by_our_reader(tmp_path) -> None:
+    gaussians = make_gaussians(5, 1)
+    column = np.arange(5)
+    write_ply(tmp_path / "x.ply", gaussians, columns={"joint_0": column, "weight_0": column / 4})
+    assert_same(read_ply(tmp_path / "x.ply").gaussians, gaussians)
+    with pytest.raises(DyngsError, match="1 of 5 Gaussians have non-finite values"):
+        write_ply(tmp_path / "y.ply", gaussians, columns={"weight_0": np.where(column == 2, np.nan, 0)})

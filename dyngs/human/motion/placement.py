@@ -42,6 +42,24 @@ def place_like(clip: MotionClip, like: MotionClip, joints: Tensor, parents: tupl
     return replace(moved, trans=moved.trans + shift + (rise - shift @ up) * up)
 
 
+def upright(clip: MotionClip, like: MotionClip, joints: Tensor) -> MotionClip:
+    """Return a clip in the world of the person of ``like`` turned about the origin so that y is up there.
+
+    Args:
+        clip: the clip to turn.
+        like: the clip of training, whose ``up_direction`` becomes y.
+        joints: (J, 3) at rest, m, to which the clip applies.
+    """
+    rotation = _least_rotation(up_direction(like), joints.new_tensor([0.0, 1.0, 0.0]))
+    roots = rotation @ axis_angle_to_matrix(clip.poses[:, 0])
+    pelvis = clip.scale[:, None] * joints[0]
+    return replace(
+        clip,
+        poses=torch.cat([_axis_angle(roots)[:, None], clip.poses[:, 1:]], dim=1),
+        trans=(clip.trans + pelvis) @ rotation.T - pelvis,
+    )
+
+
 def rest_clip(like: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> MotionClip:
     """Return a clip of one frame: the rest pose at the place and size of the person of ``like``.
 

@@ -10,7 +10,7 @@ from motion_files import random_motion, tiny_body
 from torch import Tensor
 
 from dyngs.human.motion.clip import MotionClip, motion_clip
-from dyngs.human.motion.placement import place_like, rest_clip
+from dyngs.human.motion.placement import place_like, rest_clip, up_direction, upright
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 
 
@@ -57,3 +57,20 @@ def test_what_is_placed_like_the_upright_pose_is_placed_like_the_clip_it_comes_f
     one, other = (place_like(clip, x, body.joints, body.parents) for x in (like, rest))
     for name in ("poses", "trans", "scale"):
         torch.testing.assert_close(getattr(other, name), getattr(one, name), rtol=0, atol=1e-4)
+
+
+def test_upright_turns_a_world_whose_z_is_up() -> None:
+    """All joints as the rotation of the world moves them."""
+    joints, parents = torch.randn(3, 3, generator=torch.Generator().manual_seed(0)), (-1, 0, 1)
+    y_from_z = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    poses = 0.1 * torch.randn(4, 3, 3, generator=torch.Generator().manual_seed(1))
+    poses[:, 0] += torch.tensor([torch.pi / 2, 0, 0])
+    clip = MotionClip(torch.linspace(0, 1, 4).double(), poses, torch.rand(4, 3), torch.full((4,), 0.5))
+
+    def places(x: MotionClip) -> torch.Tensor:
+        moved = apply_transforms(joint_transforms(joints, parents, axis_angle_to_matrix(x.poses)), joints)
+        return x.scale[:, None, None] * moved + x.trans[:, None]
+
+    turned = upright(clip, clip, joints)
+    torch.testing.assert_close(places(turned), places(clip) @ y_from_z.T, atol=1e-5, rtol=0)
+    assert torch.equal(up_direction(turned), torch.tensor([0.0, 1.0, 0.0]))

@@ -1,0 +1,67 @@
+"""``dyngs export --format mesh`` and ``--joints``: a person with the skeleton, for other programs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dyngs.cli.arguments import is_avatar_file, print_notes
+from dyngs.errors import DyngsError
+
+if TYPE_CHECKING:
+    from dyngs.export.rigged.mesh_file import Played
+    from dyngs.runs.checkpoint import LoadedRun
+
+_UNFIT = ("time", "times", "static", "dynamic", "max_change", "up", "from_up", "sh_degree")
+
+
+def export_rigged(arguments: argparse.Namespace, kind: str) -> int:
+    """Write a person as a skinned mesh, or as Gaussians with joints, and print where the file is and how large.
+
+    Raises:
+        DyngsError: an option that does not go with it, no run of a person there, or a file that cannot be written.
+    """
+    from dyngs.export.rigged.mesh_file import write_mesh
+    from dyngs.export.rigged.splat_files import write_rigged_splats
+
+    wanted = "--joints" if arguments.joints else "--format mesh"
+    for name in _UNFIT:
+        given = getattr(arguments, name)
+        if given is not None and given is not False:
+            reason = "the file has the rest pose, y up" if name != "max_change" else "it goes with --format dyngs"
+            raise DyngsError(f"--{name.replace('_', '-')} does not go with {wanted}: {reason}")
+    if arguments.joints and kind not in ("ply", "glb"):
+        raise DyngsError(f"--joints goes with --format ply and glb, not with {kind}")
+    suffix = ".ply" if kind == "ply" else ".glb"
+    source: Path = arguments.run_dir
+    is_file = is_avatar_file(source)
+    if is_file and arguments.out is None:
+        raise DyngsError(f"{source}: where to? Give --out FILE{suffix}")
+    name = f"{'rigged' if arguments.joints else 'mesh'}{suffix}"
+    out: Path = arguments.out or source / name
+    if out.is_dir() or out.suffix.lower() != suffix:
+        raise DyngsError(
+            f"{out}: {wanted} writes one file; give --out {out / name if out.is_dir() else out.stem + suffix}"
+        )
+    if suffix == ".ply" and arguments.motion is not None:
+        raise DyngsError("--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb")
+    loaded, played = _loaded(arguments, is_file)
+    written = (write_rigged_splats if arguments.joints else write_mesh)(loaded, out, played)
+    print_notes(written.notes)
+    print(f"written: {written.path} ({written.path.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+def _loaded(arguments: argparse.Namespace, is_file: bool) -> tuple[LoadedRun, Played | None]:
+    """Return the person in the motion that is asked for, and what is known about it."""
+    from dyngs.export.avatar import read_avatar
+    from dyngs.export.rigged.mesh_file import Played
+    from dyngs.output.animation import with_motion
+    from dyngs.runs.checkpoint import load_run
+
+    loaded = (read_avatar if is_file else load_run)(arguments.run_dir)
+    if arguments.motion is None:
+        return loaded, None
+    animated = with_motion(loaded, arguments.motion)
+    return animated.run, Played(arguments.motion.stem, animated.fps)

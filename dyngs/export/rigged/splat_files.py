@@ -1,0 +1,117 @@
+"""A person's Gaussians at rest with joints and weights: ``.ply`` with further columns, ``.glb`` with a skin.
+
+Local letters: N Gaussians, J joints, K joints that one Gaussian follows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dyngs.conventions import SH_C0
+from dyngs.errors import DyngsError
+from dyngs.export.rigged.body import anchor_normals, rest_vertices
+from dyngs.export.rigged.mesh_file import Played, person_and_template
+from dyngs.export.rigged.skeleton import Rig, add_animation, add_skeleton, add_weights, animation_of, rig_of
+from dyngs.export.rigged.texture import frontal_colours
+from dyngs.files.glb import VERTICES, GlbDocument
+from dyngs.files.write import atomic_file
+from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.anchors import heaviest_joints
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.runs.checkpoint import LoadedRun
+from dyngs.splats.gltf import EXTENSION, gaussian_attributes, gaussian_primitive
+from dyngs.splats.ply import write_ply
+
+SUFFIXES = (".ply", ".glb")
+
+
+@dataclass(frozen=True)
+class RiggedSplats:
+    """Files of Gaussians with joints that were written: where, and a line about each thing that they cannot hold."""
+
+    path: Path
+    notes: tuple[str, ...]
+
+
+@torch.no_grad()
+def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None) -> RiggedSplats:
+    """Write the person of a run or avatar file at rest, with skinning weights: T-pose, y up, facing +z, soles at y = 0.
+
+    ``.ply``: the columns ``joint_0`` to ``joint_7`` (indices as float32, heaviest first) and ``weight_0`` to
+    ``weight_7`` after those of 3DGS, and a comment ``joint INDEX NAME PARENT X Y Z`` for each joint. ``.glb``:
+    Gaussians of KHR_gaussian_splatting with JOINTS_n, WEIGHTS_n and a skin.
+
+    Args:
+        run: of a person.
+        path: output file.
+        played: the motion that the run plays, as an animation in a ``.glb``; None: no animation.
+
+    Raises:
+        DyngsError: the run is not that of a person, its template is missing, or the file cannot be written.
+    """
+    scene, body = person_and_template(run, "--joints")
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise DyngsError(f"{path}: joints are written as {' or '.join(SUFFIXES)}; give --out with one of these")
+    if suffix == ".ply" and played is not None:
+        raise DyngsError("--motion does not go with --joints in a .ply, which shows the rest pose; write a .glb")
+    vertices = rest_vertices(scene, body)
+    rig = rig_of(scene, vertices)
+    gaussians, notes = scene.gaussians, ()
+    if scene.colour is not None:
+        colours = frontal_colours(scene, anchor_normals(scene.anchors, body, vertices))
+        gaussians = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None])
+        notes = ("the colours of the run are a network; the file has those seen from straight above the skin",)
+    if scene.shapes is not None or scene.pose_dirs is not None:
+        notes = (*notes, "offsets that depend on the pose are left out: skinning weights hold none")
+    gaussians = gaussians.replace(
+        means=rig.placed(gaussians.means), log_scales=gaussians.log_scales + float(np.log(rig.scale))
+    )
+    if suffix == ".ply":
+        _write_columns(path, run, scene, rig, gaussians)
+        return RiggedSplats(path, notes)
+    document = _document(scene, rig, gaussians)
+    if played is not None:
+        animation = animation_of(scene, rig, vertices, body.weights, played.fps, played.name)
+        add_animation(document, animation, 0)
+    with atomic_file(path) as temporary:
+        document.write(temporary)
+    unsure = "KHR_gaussian_splatting does not say whether skins turn Gaussians: viewers may show the rest pose"
+    return RiggedSplats(path, (*notes, unsure))
+
+
+def _write_columns(path: Path, run: LoadedRun, scene: HumanScene, rig: Rig, gaussians: Gaussians) -> None:
+    joints, weights = heaviest_joints(scene.weights)
+    columns = {f"joint_{k}": joints[:, k].numpy() for k in range(joints.shape[1])}
+    columns |= {f"weight_{k}": weights[:, k].numpy() for k in range(weights.shape[1])}
+    places = [" ".join(f"{x:.6f}" for x in place) for place in rig.joints.tolist()]
+    lines = [
+        f"joint {i} {name} {parent} {place}"
+        for i, (name, parent, place) in enumerate(zip(rig.names, rig.skeleton.parents, places, strict=True))
+    ]
+    model = run.config.model
+    write_ply(path, gaussians, model.rasterize_mode, ["up: y", *lines], eps2d=model.eps2d, columns=columns)
+
+
+def _document(scene: HumanScene, rig: Rig, gaussians: Gaussians) -> GlbDocument:
+    """Return Gaussians with a skin as a glTF document; the joints are the first nodes."""
+    document = GlbDocument()
+    nodes: list[dict[str, object]] = []
+    armature, _ = add_skeleton(document, rig, nodes)
+    nodes.append({"name": "person", "mesh": 0, "skin": 0})
+    attributes = {
+        name: document.add_numbers(values.astype(np.float32), VERTICES, limits=name == "POSITION")
+        for name, values in gaussian_attributes(gaussians).items()
+    } | add_weights(document, scene.weights)
+    document.json |= {
+        "scene": 0,
+        "scenes": [{"nodes": [armature, len(nodes) - 1]}],
+        "nodes": nodes,
+        "meshes": [{"name": "person", "primitives": [gaussian_primitive(attributes)]}],
+        "extensionsUsed": [EXTENSION],
+    }
+    return document

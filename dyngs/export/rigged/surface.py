@@ -1,0 +1,148 @@
+"""The template's surface moved to where the Gaussians are: clothes, hair, shoes.
+
+Local letters: M vertices, T triangles, P samples of the surface, N Gaussians.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.export.rigged.texture import SEEN, BakedTexels
+from dyngs.gaussians import Gaussians
+from dyngs.human.template.atlas import Texels
+from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.mesh import rasterize
+from dyngs.rendering import RenderOptions, render
+
+MARGINS = (0.0, 0.004, 0.008, 0.012, 0.016)
+"""Distances, m, from the uppermost Gaussians to the surface that are tried: Gaussians reach beyond their centres."""
+_BOUNDS = (-0.02, 0.06)
+"""Least and greatest displacement, m."""
+_SMOOTH = 0.01
+"""Standard deviation, m, of the weights by which displacements are averaged."""
+_NEAR = 64
+"""Samples that displace a vertex."""
+_FOLDS = (0.01, 0.02, 0.03)
+"""Distances, m, above a sample at which the body must not be for the sample to count: mouth, eye sockets."""
+_SIZE = 256
+_ANGLES = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)
+"""Silhouettes that are compared: pixels along a side, and directions around the body."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Vertices (M, 3) at rest, m, and how well silhouettes agree with those of the Gaussians.
+
+    Attributes:
+        vertices: (M, 3).
+        margin: the distance of ``MARGINS`` that was taken; None: the template as it is agrees better.
+        agreement: intersection over union of the silhouettes.
+        plain: the same for the template as it is.
+    """
+
+    vertices: Tensor
+    margin: float | None
+    agreement: float
+    plain: float
+
+
+def fitted_surface(
+    gaussians: Gaussians, body: BodyTemplate, vertices: Tensor, samples: Texels, baked: BakedTexels
+) -> Surface:
+    """Return the surface whose silhouettes agree best with the Gaussians', of the template's and some moved ones.
+
+    A vertex is displaced by the mean displacement of the samples around it in space, along their normals, up to what is
+    seen there. So fingers, whose sides cancel, swell less, and lids and lips move with the skin around them.
+
+    Args:
+        gaussians: N at rest.
+        body: the template.
+        vertices: (M, 3) at rest in the person's shape.
+        samples: P texels of that surface.
+        baked: what is seen there.
+    """
+    cameras = _cameras(vertices)
+    shown = render(gaussians, cameras, RenderOptions()).alpha.numpy() > 0.5
+    plain = best = _agreement(vertices, body, cameras, shown)
+    found = Surface(vertices, None, plain, plain)
+    pull = _Pull(body, vertices, samples, baked)
+    for margin in MARGINS if pull.is_known else ():
+        moved = pull.moved(margin)
+        agreement = _agreement(moved, body, cameras, shown)
+        if agreement > best:
+            best, found = agreement, Surface(moved, margin, agreement, plain)
+    return found
+
+
+class _Pull:
+    """Displacements of vertices by samples of the surface."""
+
+    def __init__(self, body: BodyTemplate, vertices: Tensor, samples: Texels, baked: BakedTexels) -> None:
+        self._vertices = vertices
+        rows = torch.nonzero(~_folded(body, vertices, samples) & (baked.alpha >= SEEN))[:, 0]
+        self.is_known = len(rows) > 0
+        if self.is_known:
+            count = min(_NEAR, len(rows))
+            distance, at = KDTree(samples.points[rows].numpy()).query(vertices.numpy(), k=count)
+            self._rows = rows[torch.from_numpy(at.reshape(len(vertices), count))]
+            near = torch.from_numpy(np.exp(-0.5 * (distance.reshape(len(vertices), count) / _SMOOTH) ** 2)).float()
+            self._weights = near * (samples.size.square() * baked.alpha)[self._rows]
+            self._heights, self._normals = baked.top, samples.normals
+
+    def moved(self, margin: float) -> Tensor:
+        """Return the vertices (M, 3) displaced by what is seen plus ``margin``."""
+        height = (self._heights + margin).clamp(*_BOUNDS)
+        along = (height[:, None] * self._normals)[self._rows]
+        total = self._weights.sum(1, keepdim=True)
+        mean = (self._weights[..., None] * along).sum(1) / total.clamp_min(1e-12)
+        return self._vertices + torch.where(total > 1e-12, mean, 0.0)
+
+
+def _folded(body: BodyTemplate, vertices: Tensor, samples: Texels) -> Tensor:
+    """Return whether each of P samples faces the body itself at a small distance."""
+    flat = torch.linalg.cross(*(vertices[body.faces][:, k] - vertices[body.faces][:, 0] for k in (1, 2)), dim=-1)
+    normals = torch.nn.functional.normalize(flat, dim=-1)
+    places = KDTree(vertices[body.faces].mean(1).numpy())
+    found = torch.zeros(len(samples), dtype=torch.bool, device="cpu")
+    for height in _FOLDS:
+        distance, at = places.query((samples.points + height * samples.normals).numpy(), k=min(4, places.n))
+        near = torch.from_numpy(at.reshape(len(samples), -1))
+        opposite = (normals[near] * samples.normals[:, None]).sum(-1) < -0.2
+        found |= (torch.from_numpy(distance.reshape(len(samples), -1) < 0.7 * height) & opposite).any(1)
+    return found
+
+
+def _cameras(vertices: Tensor) -> Cameras:
+    """Return cameras around the body, upright, at eye level of its middle."""
+    lowest, highest = vertices.amin(0), vertices.amax(0)
+    middle, reach = (lowest + highest) / 2, float((highest - lowest).norm()) / 2
+    distance = 6 * reach
+    poses = torch.eye(4, device="cpu").repeat(len(_ANGLES), 1, 1)
+    for pose, angle in zip(poses, _ANGLES, strict=True):
+        backward = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], device="cpu")
+        right = torch.tensor([math.cos(angle), 0.0, -math.sin(angle)], device="cpu")
+        pose[:3, :3] = torch.stack([right, torch.tensor([0.0, -1.0, 0.0], device="cpu"), -backward])
+        pose[:3, 3] = -pose[:3, :3] @ (middle + distance * backward)
+    focal = 0.47 * _SIZE * distance / reach
+    intrinsics = torch.tensor([[focal, 0, _SIZE / 2], [0, focal, _SIZE / 2], [0, 0, 1.0]], device="cpu")
+    return Cameras(poses, intrinsics.repeat(len(_ANGLES), 1, 1), _SIZE, _SIZE)
+
+
+def _agreement(vertices: Tensor, body: BodyTemplate, cameras: Cameras, shown: np.ndarray) -> float:
+    """Return intersection over union of silhouettes of the mesh with those ``shown`` (V, H, W) from all cameras."""
+    common = either = 0
+    for pose, intrinsics, mask in zip(cameras.cam_from_world, cameras.intrinsics, shown, strict=True):
+        pixels = (vertices @ pose[:3, :3].T + pose[:3, 3]) @ intrinsics.T
+        flat = torch.cat([pixels[:, :2] / pixels[:, 2:] - 0.5, torch.ones_like(pixels[:, :1])], dim=1)
+        own = np.zeros(mask.size, bool)
+        own[rasterize(flat[body.faces].double().numpy(), cameras.width, cameras.height).index] = True
+        common += int((own & mask.ravel()).sum())
+        either += int((own | mask.ravel()).sum())
+    return common / max(either, 1)
