@@ -45,7 +45,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "export",
         help="write a run as .ply, .spz, .glb and the like, tracks, avatar, mesh, small .dyngs file, page or cameras",
         description="Write the Gaussians of a run as files that viewers and editors read, as tracks of their centres, "
-        "as one small .dyngs file, as a page that plays by itself, a person as an avatar file or a mesh, or the cameras.",
+        "as one small .dyngs file, as a page that plays by itself, a person as an avatar or a mesh, or the cameras.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
