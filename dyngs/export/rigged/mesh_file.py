@@ -29,6 +29,8 @@ _FINER = 4
 """Texels of the texture per texel of the model's atlas, along a side."""
 _LARGEST = 2048
 """Texels along a side of the largest texture."""
+_MOST_SAMPLES = 512
+"""Texels along a side of the atlas from which the surface is moved."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
         texels = atlas_texels(body, size, vertices)
         filled = fill_unseen(bake_texels(scene, texels, normals), texels)
         image = texture_image(filled.rgb, texels)
-        samples = atlas_texels(body, size // 2, vertices)
+        samples = atlas_texels(body, min(size // 2, _MOST_SAMPLES), vertices)
         surface = fitted_surface(scene.gaussians, body, vertices, samples, bake_texels(scene, samples, normals))
         mesh, rig = body_mesh(scene, body, surface.vertices), rig_of(scene, surface.vertices)
         animation = None

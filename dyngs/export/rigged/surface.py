@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -86,7 +88,8 @@ class _Pull:
 
     def __init__(self, body: BodyTemplate, vertices: Tensor, samples: Texels, baked: BakedTexels) -> None:
         self._vertices = vertices
-        rows = torch.nonzero(~_folded(body, vertices, samples) & (baked.alpha >= SEEN))[:, 0]
+        counts = _on_largest_part(body)[samples.faces] & ~_folded(body, vertices, samples) & (baked.alpha >= SEEN)
+        rows = torch.nonzero(counts)[:, 0]
         self.is_known = len(rows) > 0
         if self.is_known:
             count = min(_NEAR, len(rows))
@@ -103,6 +106,15 @@ class _Pull:
         total = self._weights.sum(1, keepdim=True)
         mean = (self._weights[..., None] * along).sum(1) / total.clamp_min(1e-12)
         return self._vertices + torch.where(total > 1e-12, mean, 0.0)
+
+
+def _on_largest_part(body: BodyTemplate) -> Tensor:
+    """Return whether each of T triangles belongs to the largest connected part: eyes and tongue do not."""
+    count = len(body.vertices)
+    ends = body.faces.repeat(1, 2)[:, [0, 1, 1, 2]].reshape(-1, 2).numpy()
+    edges = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    part = torch.from_numpy(connected_components(edges, directed=False)[1]).long()[body.faces[:, 0]]
+    return part == part.bincount().argmax()
 
 
 def _folded(body: BodyTemplate, vertices: Tensor, samples: Texels) -> Tensor:

@@ -22,11 +22,11 @@ from dyngs.human.template.atlas import Texels
 from dyngs.ops.quaternions import rotation_matrices
 from dyngs.ops.reference import harmonics_basis
 
-_NEAR = 24
-"""Gaussians per texel that are looked for at the skin, and as many above it."""
-_ABOVE = 0.025
-"""Height above the skin, m, where the others are looked for: clothes, hair."""
-_REACH = (-0.04, 0.07)
+_NEAR = 20
+"""Gaussians that are looked for at each height above a texel."""
+_HEIGHTS = (-0.04, -0.015, 0.005, 0.03, 0.06)
+"""Heights, m, where they are looked for: below the skin, on it, in clothes and hair."""
+_REACH = (-0.06, 0.1)
 """Heights, m, between which Gaussians belong to a texel."""
 _FACING = 0.3
 """Least cosine between the normals of a texel and of a Gaussian that belongs to it: arms do not colour the trunk."""
@@ -107,9 +107,9 @@ def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
 
 
 def _neighbours(places: KDTree, points: Tensor, along: Tensor) -> Tensor:
-    """Return the Gaussians (P, K) near ``points`` (P, 3) and above them, ascending; some twice."""
+    """Return the Gaussians (P, K) near and above ``points`` (P, 3), ascending; some more than once."""
     count = min(_NEAR, places.n)
-    found = [places.query((points + h * along).numpy(), k=count)[1].reshape(len(points), count) for h in (0.0, _ABOVE)]
+    found = [places.query((points + h * along).numpy(), k=count)[1].reshape(len(points), count) for h in _HEIGHTS]
     return torch.from_numpy(np.sort(np.concatenate(found, axis=1), axis=1))
 
 
