@@ -363,7 +363,7 @@ def human_start(
     if sh_degree > 1:
         raise DyngsError(f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1")
     given, body = capture.body["train"], load_template(model)
-    vertices, joints = rest_shape(body, torch.from_numpy(given.betas).float())
+    vertices, joints = rest_shape(body, given)
     texels = atlas_texels(body, model.resolution, vertices)
     gaussians, anchors = texel_gaussians(texels, sorted(set(model.scaffold_heights)), sh_degree)
     filmed = captured_motion(capture.root, given, capture.splits["train"], joints)

@@ -26,6 +26,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     verbs = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_inspect(verbs)
     _add_sfm(verbs)
+    _add_fit(verbs)
     _add_motion(verbs)
     _add_synth(verbs)
 
@@ -82,6 +83,19 @@ def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
         "overrides", nargs="*", default=[], metavar="data.key=value", help="data.follow_links, data.max_megapixels"
     )
     parser.set_defaults(run=run_sfm)
+
+
+def _add_fit(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = verbs.add_parser(
+        "fit",
+        help="fit the free body template to pictures of a person",
+        description="Fit the free body template to the silhouettes of a person: one shape and skeleton, and the pose "
+        "of every frame. OUT is a capture for `dyngs train human`.",
+    )
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder of a capture with silhouettes")
+    parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
+    parser.add_argument("overrides", nargs="*", default=[], metavar="data.key=value", help="keys of data")
+    parser.set_defaults(run=run_fit)
 
 
 def _add_motion(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -192,6 +206,18 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     print(result.summary())
     print(f"next: dyngs data inspect {result.root} --picture cameras.png")
     print(f"      dyngs train static data.root={result.root}")
+    return 0
+
+
+def run_fit(arguments: argparse.Namespace) -> int:
+    """Fit a body and print how good the fit is, and the next command."""
+    from dyngs.human.fit.fitted_capture import write_fitted_capture
+
+    options = _data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
+    with ProgressBar() as report:
+        result = write_fitted_capture(options, arguments.out, report)
+    print(result.summary())
+    print(f"next: dyngs train human data.root={result.root}")
     return 0
 
 

@@ -13,6 +13,7 @@ Split = Literal["train", "val", "test", "pose"]
 """The split "pose" shows a person in another clip, with times and frame numbers of its own."""
 
 BodyKind = Literal["smpl", "smplh", "smplx"]
+ShapeSpace = Literal["smpl", "anny"]
 
 BODY_KINDS: dict[int, BodyKind] = {24: "smpl", 52: "smplh", 55: "smplx"}
 """Number of joints to body model."""
@@ -132,10 +133,11 @@ class BodyFrames:
         frames: (F,) ascending frame numbers, as in ``View.frame``.
         poses: (F, J, 3) axis-angle, radians, J = 24, 52 or 55.
         trans: (F, 3).
-        betas: (B,) shape coefficients.
+        betas: (B,) shape coefficients, in the shape space ``shape_space``.
         scale: (F,) world units per metre of the template, positive.
         turns: (F, 3) axis-angle, radians, rotation about the template's origin; None for none.
         pelvis: (3,) rest position of the pelvis of the fitted body, None where the files do not say.
+        shape_space: that of ``betas``: of SMPL's family, or of the free template.
     """
 
     frames: tuple[int, ...]
@@ -145,6 +147,7 @@ class BodyFrames:
     scale: np.ndarray
     turns: np.ndarray | None = None
     pelvis: np.ndarray | None = None
+    shape_space: ShapeSpace = "smpl"
 
     @property
     def kind(self) -> BodyKind:

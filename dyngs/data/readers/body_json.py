@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -27,7 +28,8 @@ def read_body_json(root: Path) -> Capture:
 
     Each split has the parameters of its ``body_SPLIT.npz``: poses (T, 72, 156 or 165), trans (T, 3), betas and, if
     there, scale; row n is for the frame whose ``frame`` is n. Without such a file, val and test show the frames of
-    train. ``pose`` is another clip, with frame numbers, times and parameters of its own. Parameters and cameras share
+    train. ``surface_model_type`` "anny" says that betas are of the free template's shape space.
+    ``pose`` is another clip, with frame numbers, times and parameters of its own. Parameters and cameras share
     one world; unlike with AMASS files nothing is rotated to make it y up.
 
     Raises:
@@ -69,9 +71,10 @@ def _body_of(root: Path, split: Split, views: tuple[View, ...], train: BodyFrame
 
 
 def _read_body(path: Path) -> BodyFrames:
-    found = read_npz(path, ("poses", "trans", "betas"), ("scale",))
+    found = read_npz(path, ("poses", "trans", "betas"), ("scale", "surface_model_type"))
     frames = range(len(found["poses"]) if found["poses"].ndim else 0)
-    return body_frames(path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0))
+    body = body_frames(path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0))
+    return replace(body, shape_space="anny") if str(found.get("surface_model_type")) == "anny" else body
 
 
 FORMAT = CaptureFormat(

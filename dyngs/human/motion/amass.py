@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from dyngs.data.capture import ShapeSpace
 from dyngs.errors import DyngsError, reading
 from dyngs.files.numpy_files import read_arrays
 from dyngs.files.write import atomic_file
@@ -61,8 +62,10 @@ def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
         return _motion(path, _arrays(path), body, up)
 
 
-def write_amass(motion: Motion, path: Path) -> None:
+def write_amass(motion: Motion, path: Path, shape_space: ShapeSpace = "smpl") -> None:
     """Write the motion of 55 joints as an AMASS file of SMPL-X with ``up_axis`` y; reading it gives the same motion.
+
+    ``shape_space`` is that of the shape parameters: with "anny" the file names the free template as its model.
 
     Raises:
         DyngsError: the suffix is not ``.npz``, or the file cannot be written.
@@ -79,7 +82,7 @@ def write_amass(motion: Motion, path: Path) -> None:
             betas=motion.betas.cpu().numpy(),
             scale=motion.scale.cpu().numpy(),
             mocap_frame_rate=np.float64(motion.fps),
-            surface_model_type="smplx",
+            surface_model_type="smplx" if shape_space == "smpl" else shape_space,
             gender="neutral",
             up_axis="y",
         )

@@ -66,7 +66,7 @@ def captured_person(capture: Capture, model: HumanModel, body: BodyTemplate) -> 
     if not capture.has_alpha:
         raise DyngsError(f"{capture.root}: the pictures have no silhouettes; give them alpha, see docs/human.md")
     given, views = capture.body["train"], capture.splits["train"]
-    vertices, joints = rest_shape(body, torch.from_numpy(given.betas).to(body.vertices))
+    vertices, joints = rest_shape(body, given)
     texels = atlas_texels(body, model.resolution, vertices)
     heights = tuple(sorted(set(model.scaffold_heights)))
     gaussians, anchors = texel_gaussians(texels, heights, 0)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
@@ -29,7 +30,7 @@ from dyngs.human.synthetic.clothes import (
     texel_coordinates,
     texture_coordinates,
 )
-from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.body import BodyTemplate, apply_shape, posed_vertices
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.human.template.load import default_template
 from dyngs.human.template.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
@@ -55,6 +56,7 @@ class HumanOptions:
         num_test: test cameras, each midway between two training cameras; 0: neither test nor ``pose``.
         seed: of the outfit, see ``dyngs.human.synthetic.clothes.random_outfit``; the same seed gives the same bytes.
         samples: per side of a pixel.
+        body_seed: of the person's body shape; None: the template's own.
     """
 
     size: int = 128
@@ -64,6 +66,7 @@ class HumanOptions:
     num_test: int = 2
     seed: int = 0
     samples: int = 2
+    body_seed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     if min(options.num_new, options.num_test, options.seed) < 0:
         raise DyngsError("a synthetic person needs num_new, num_test and seed of at least 0")
     require_new_folder(out)
-    body = default_template()
+    body, betas = _person(options.body_seed)
     outfit = random_outfit(options.seed)
     clothed, texture = dress_body(body, outfit), paint_texture(body, outfit)
     train = dict(enumerate(_ring(options.num_cameras)))
@@ -110,13 +113,23 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     if options.num_new and test:
         clips["pose"] = squat(body, options.num_new)
     for name, clip in clips.items():
-        motion = replace(clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale)
+        motion = replace(clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas)
         meshes = list(_posed_meshes(clothed, motion, texture))
         splits = {"train": train, "test": test} if name == "train" else {"pose": test}
         for split, cameras in splits.items():
             _write_split(out, split, meshes, cameras, options)
-        write_amass(motion, out / f"body_{name}.npz")
+        write_amass(motion, out / f"body_{name}.npz", shape_space="smpl" if options.body_seed is None else "anny")
     return out
+
+
+def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
+    """Return the template in a random shape, and its shape parameters (B,)."""
+    body = default_template()
+    if seed is None:
+        return body, torch.zeros(10, device="cpu")
+    betas = torch.randn(body.num_shapes, generator=torch.Generator().manual_seed(seed), device="cpu")
+    vertices, joints = apply_shape(body, betas)
+    return replace(body, vertices=vertices, joints=joints), betas
 
 
 def walk(body: BodyTemplate, num_frames: int) -> Motion:

@@ -18,11 +18,13 @@ from dyngs.files.limits import require_at_most
 from dyngs.files.numpy_files import read_arrays
 from dyngs.files.pickles import read_pickle
 from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.bone_shapes import bone_shapes
 from dyngs.human.template.obj_uv import TextureCoordinates, read_obj, require_unit_square
 
 _SMPL = ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs", "posedirs")
 _TEMPLATE = ("v_template", "f", "weights_idx", "weights_val", "kintree_table", "J")
 _UV = ("vt", "ft")
+_TEMPLATE_SHAPES = ("shapedirs", "J_shapedirs")
 _NAMES = {24: "smpl", 52: "smplh", 55: "smplx"}
 _NO_PARENT = 2**32 - 1
 """-1 as an unsigned 32-bit number: the parent of the root in SMPL files."""
@@ -77,7 +79,7 @@ def _body(arrays: _Arrays, uv: Path | None) -> BodyTemplate:
         parents=parents,
         joints=_float(joints),
     )
-    return body if is_template else _with_blend_shapes(body, arrays)
+    return _with_shapes(body, arrays) if is_template else _with_blend_shapes(body, arrays)
 
 
 @dataclass(frozen=True)
@@ -146,6 +148,19 @@ def _with_blend_shapes(body: BodyTemplate, arrays: _Arrays) -> BodyTemplate:
         joint_expression_dirs=_float(joint_directions[..., shapes:]) if shapes < count else None,
         pose_dirs=_float(pose_dirs.reshape(3 * m, -1).T),
     )
+
+
+def _with_shapes(body: BodyTemplate, arrays: _Arrays) -> BodyTemplate:
+    """Return the free template with its shape space: directions of the file, if there are any, then those of bones."""
+    vertices, joints, weights = (x.double().numpy() for x in (body.vertices, body.joints, body.weights))
+    directions, joint_directions = bone_shapes(vertices, joints, body.parents, weights)
+    if set(_TEMPLATE_SHAPES) <= set(arrays.values):
+        m, j = weights.shape
+        own = arrays.floats("shapedirs", (m, 3, None))
+        own_joints = arrays.floats("J_shapedirs", (j, 3, own.shape[2]))
+        directions = np.concatenate([own, directions], axis=2)
+        joint_directions = np.concatenate([own_joints, joint_directions], axis=2)
+    return replace(body, shape_dirs=_float(directions), joint_shape_dirs=_float(joint_directions))
 
 
 def _num_shapes(joints: int, directions: int) -> int:
@@ -220,7 +235,8 @@ def _wanted(path: Path, present: Collection[object]) -> list[str]:
     missing = [f"'{key}'" for key in needed if key not in present]
     if missing:
         raise DyngsError(f"{path}: lacks {', '.join(missing)}; give a body file of SMPL, SMPL-H or SMPL-X")
-    return [*needed, *(key for key in _UV if key in present)]
+    optional = (*_UV, *_TEMPLATE_SHAPES) if needed is _TEMPLATE else _UV
+    return [*needed, *(key for key in optional if key in present)]
 
 
 def _read_pickle(path: Path) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import HumanModel
+from dyngs.data.capture import BodyFrames
 from dyngs.errors import DyngsError
 from dyngs.human.template.body import BodyTemplate, apply_shape
 from dyngs.human.template.body_reader import read_body
@@ -39,10 +40,12 @@ def load_template(model: HumanModel) -> BodyTemplate:
     return read_body(model.body, model.uv)
 
 
-def rest_shape(body: BodyTemplate, betas: Tensor) -> tuple[Tensor, Tensor]:
-    """Return vertices (M, 3) and joints (J, 3) at rest for ``betas`` (B,); those that ``body`` lacks are ignored.
+def rest_shape(body: BodyTemplate, given: BodyFrames) -> tuple[Tensor, Tensor]:
+    """Return vertices (M, 3) and joints (J, 3) at rest in the shape of ``given``; what ``body`` lacks is ignored.
 
-    A template without a shape space stays as it is: bone lengths are learned in training.
+    A template with another shape space than that of ``given`` stays as it is.
     """
+    if (given.shape_space == "anny") != (body.name == "anny"):
+        return body.vertices, body.joints
     with torch.no_grad():
-        return apply_shape(body, betas[: body.num_shapes])
+        return apply_shape(body, torch.from_numpy(given.betas).to(body.vertices)[: body.num_shapes])

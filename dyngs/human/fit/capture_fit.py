@@ -1,0 +1,270 @@
+"""The fit of a whole capture: reads silhouettes and given poses, fits the body, judges the result on views left out.
+
+Local letters: F frames, V views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.config import DataConfig
+from dyngs.data.capture import BodyFrames, Capture, View
+from dyngs.data.loader import PictureLoader
+from dyngs.errors import DyngsError
+from dyngs.human.fit.observed import ObservedFrame, longest_box_side, observed_frame
+from dyngs.human.fit.pose_prior import near_given, usual
+from dyngs.human.fit.result import BodyFit, body_fit
+from dyngs.human.fit.solve import Stage, drawn_frame, new_fit, run_stage
+from dyngs.human.fit.start import first_poses
+from dyngs.human.fit.surface import Surface, surface_of
+from dyngs.human.motion.captured import CapturedMotion, captured_motion
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.template.body import BodyTemplate
+from dyngs.parameters import Parameters
+
+PICTURE_SIDE = 512
+"""Longest side of the pictures that are read, px."""
+RESOLUTION = 48
+"""Texels per side of the atlas whose discs are drawn."""
+MOST_VIEWS = 8
+"""Views of one frame that are looked at."""
+FRAMES = 3
+"""Frames drawn in each step."""
+SHAPE = ("log_scale", "betas", "trans", "padding")
+"""What is the same in all frames, and where the person stands."""
+
+Report = Callable[[str, int, int], None]
+"""Called with what is being done, and how many of how many steps are done."""
+
+
+@dataclass(frozen=True)
+class FitEffort:
+    """How much a fit may cost.
+
+    Attributes:
+        side: of the squares around the person that are looked at, px.
+        steps: least number of steps of Adam of a stage.
+        visits: how often a frame is drawn where its pose is learned.
+    """
+
+    side: int = 128
+    steps: int = 120
+    visits: int = 18
+
+    def steps_for(self, clip: MotionClip) -> int:
+        """Return the number of steps that draws every frame often enough."""
+        return max(self.steps, -(-self.visits * len(clip) // FRAMES))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way to fit.
+
+    Attributes:
+        name: for people.
+        learned: of the clip.
+        iou: mean IoU of drawn and seen silhouettes.
+        per_frame: (F,) the same, per frame.
+    """
+
+    name: str
+    learned: Parameters
+    iou: float
+    per_frame: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class CaptureFit:
+    """A fit of a capture's clip of training.
+
+    Attributes:
+        fit: of the clip.
+        motion: the given clip, F frames.
+        chosen: the candidate that was taken.
+        tried: all candidates; the first one has the poses as given.
+        held_out: views left out of the fit, on which the candidates were measured; 0: measured on those fitted to.
+        from_silhouettes: no poses were given.
+    """
+
+    fit: BodyFit
+    motion: CapturedMotion
+    chosen: Candidate
+    tried: tuple[Candidate, ...]
+    held_out: int
+    from_silhouettes: bool
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What is looked at, by row of the clip: frames to fit to, and frames to judge by."""
+
+    used: dict[int, ObservedFrame | None]
+    judged: dict[int, ObservedFrame | None]
+    held_out: int
+
+    def halved(self, row: int) -> ObservedFrame | None:
+        """Return the frame of a row at half the size."""
+        found = self.used[row]
+        return None if found is None else found.shrunk(2)
+
+
+def fit_capture(
+    capture: Capture, options: DataConfig, body: BodyTemplate, report: Report, effort: FitEffort = FitEffort()
+) -> CaptureFit:
+    """Return the fit of ``body`` to the silhouettes of a capture's training views.
+
+    With given poses: first the shape, and rotations that are the same in all frames; then the rotations of every frame,
+    where that explains views better that were left out. Without: poses are found first (``first_poses``).
+
+    Args:
+        capture: with alpha.
+        options: how its pictures are read.
+        body: with a shape space.
+        report: of progress.
+        effort: how much it may cost.
+
+    Raises:
+        DyngsError: no silhouettes, or nobody in them.
+    """
+    if not capture.has_alpha:
+        raise DyngsError(f"{capture.root}: the pictures have no silhouettes; add masks of the person (docs/human.md)")
+    views = numbered(capture.splits["train"])
+    given = capture.body is not None
+    bodies = capture.body["train"] if capture.body is not None else _placeholder(views)
+    motion = captured_motion(capture.root, bodies, views, body.joints)
+    seen, surface = _look(capture, views, motion, options, effort.side), surface_of(body, RESOLUTION)
+    if given:
+        tried = _from_given(motion.clip, surface, seen, report, effort)
+    else:
+        clip = first_poses(motion.clip.times, surface, seen.used.__getitem__, _ticker("poses", report, 0))
+        motion = CapturedMotion(clip, motion.frames)
+        tried = _from_silhouettes(clip, surface, seen, report, effort)
+    chosen = max(tried, key=lambda candidate: candidate.iou)
+    return CaptureFit(body_fit(chosen.learned, motion.clip), motion, chosen, tried, seen.held_out, not given)
+
+
+def numbered(views: Sequence[View]) -> tuple[View, ...]:
+    """Return the views with frame numbers; those without get them by the order of their times."""
+    if all(view.frame is not None for view in views):
+        return tuple(views)
+    times = sorted({view.time or 0.0 for view in views})
+    order = {time: i for i, time in enumerate(times)}
+    return tuple(replace(view, frame=order[view.time or 0.0]) for view in views)
+
+
+def split_views(views: Sequence[View], motion: CapturedMotion) -> tuple[dict[int, list[int]], dict[int, list[int]]]:
+    """Return, per row of the clip, the indices of the views to fit to, and of those left out to judge by.
+
+    One view of each frame is left out, another one in each frame, where a frame has at least five.
+    """
+    rows = motion.rows
+    by_row: dict[int, list[int]] = {row: [] for row in range(len(motion.clip))}
+    for i, view in enumerate(views):
+        by_row[rows[-1 if view.frame is None else view.frame]].append(i)
+    used: dict[int, list[int]] = {}
+    left_out: dict[int, list[int]] = {}
+    for row, own in by_row.items():
+        apart = own[row % len(own)] if len(own) >= 5 else -1
+        rest = [i for i in own if i != apart]
+        step = max(1, -(-len(rest) // MOST_VIEWS))
+        used[row] = rest[row % step :: step]
+        left_out[row] = [apart] if apart >= 0 else []
+    return used, left_out
+
+
+def _placeholder(views: Sequence[View]) -> BodyFrames:
+    """Return body parameters that say nothing, for the frames of the views."""
+    frames = tuple(sorted({view.frame or 0 for view in views}))
+    zeros = np.zeros((len(frames), 3))
+    return BodyFrames(frames, np.zeros((len(frames), 55, 3)), zeros, np.zeros(0), np.ones(len(frames)))
+
+
+def _look(capture: Capture, views: Sequence[View], motion: CapturedMotion, options: DataConfig, largest: int) -> _Seen:
+    """Return the squares around the person in all frames.
+
+    Raises:
+        DyngsError: nobody is seen.
+    """
+    pictures = PictureLoader(views, options.model_copy(update={"longest_side": PICTURE_SIDE, "downscale": 1}))
+    used, left_out = split_views(views, motion)
+    shown = [i for rows in (used, left_out) for own in rows.values() for i in own]
+    side = longest_box_side(pictures[i] for i in shown)
+    if side < 8:
+        raise DyngsError(f"{capture.root}: nobody is seen in the silhouettes; check the masks (docs/human.md)")
+    size = min(largest, 2 * (side // 2))
+
+    def frames(rows: dict[int, list[int]]) -> dict[int, ObservedFrame | None]:
+        return {row: observed_frame([pictures[i] for i in own], side, size) for row, own in rows.items()}
+
+    held_out, seen = sum(map(len, left_out.values())), frames(used)
+    return _Seen(seen, frames(left_out) if held_out else seen, held_out)
+
+
+def _from_given(
+    clip: MotionClip, surface: Surface, seen: _Seen, report: Report, effort: FitEffort
+) -> tuple[Candidate, ...]:
+    """Return the poses as given, with a fitted shape, and with fitted poses."""
+    start, expected, few = new_fit(clip, surface), near_given(clip), (*SHAPE, "turns")
+    tried = [_measured("the poses as given", start, clip, surface, seen)]
+    coarse, fine = Stage(effort.steps, FRAMES, few), Stage(effort.steps_for(clip), FRAMES, (*few, "poses"))
+    tick = _ticker("shape", report, 2 * coarse.steps)
+    shape = run_stage(start, coarse, clip, surface, seen.halved, expected, tick)
+    shape = run_stage(shape, coarse, clip, surface, seen.used.__getitem__, expected, tick)
+    tried.append(_measured("one shape, and turns that are the same in all frames", shape, clip, surface, seen))
+    tick = _ticker("poses", report, fine.steps)
+    poses = run_stage(shape, fine, clip, surface, seen.used.__getitem__, expected, tick)
+    tried.append(_measured("turns of every frame as well", poses, clip, surface, seen))
+    return tuple(tried)
+
+
+def _from_silhouettes(
+    clip: MotionClip, surface: Surface, seen: _Seen, report: Report, effort: FitEffort
+) -> tuple[Candidate, ...]:
+    """Return the poses as they were found first, and shape and poses fitted together."""
+    start, expected = new_fit(clip, surface), usual(clip)
+    tried = [_measured("poses found frame by frame", start, clip, surface, seen)]
+    stage = Stage(effort.steps_for(clip), FRAMES, (*SHAPE, "poses"))
+    tick = _ticker("shape", report, 2 * stage.steps)
+    found = start
+    for look in (seen.halved, seen.used.__getitem__):
+        found = run_stage(found, stage, clip, surface, look, expected, tick)
+    tried.append(_measured("one shape, and poses of every frame", found, clip, surface, seen))
+    return tuple(tried)
+
+
+def _ticker(name: str, report: Report, total: int) -> Callable[[], None]:
+    """Return a function that reports one more step of ``total``; 0: their number is not known."""
+    done = 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        report(name, done, max(total, done + 1))
+
+    return tick
+
+
+@torch.no_grad()
+def _measured(name: str, learned: Parameters, clip: MotionClip, surface: Surface, seen: _Seen) -> Candidate:
+    """Return the candidate with its IoU in the frames that judge."""
+    found = []
+    for row, frame in seen.judged.items():
+        if frame is not None:
+            drawn = drawn_frame(learned, clip, surface, row, frame.cameras)
+            found.append(_iou(drawn, frame))
+        else:
+            found.append(torch.zeros(0))
+    per_frame = tuple(float(x.mean()) if len(x) else float("nan") for x in found)
+    return Candidate(name, learned, float(torch.cat(found).mean()), per_frame)
+
+
+def _iou(drawn: Tensor, seen: ObservedFrame) -> Tensor:
+    """Return the IoU (V,) of coverages above a half, where pictures are known."""
+    known = seen.known > 0
+    ours, theirs = (drawn > 0.5) & known, (seen.alpha > 0.5) & known
+    return (ours & theirs).sum((1, 2)) / (ours | theirs).sum((1, 2)).clamp_min(1)

@@ -1,0 +1,125 @@
+"""``dyngs data fit``: a capture of a person with the body fitted to it, and a report of the fit."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dyngs.config import DataConfig
+from dyngs.data.capture import Capture
+from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.loader import PictureLoader
+from dyngs.data.read import read_capture
+from dyngs.data.synthetic.captures import require_new_folder
+from dyngs.files.write import write_image, write_text
+from dyngs.human.avatar.posing import frame_pose
+from dyngs.human.fit.capture_fit import CaptureFit, Report, fit_capture, numbered
+from dyngs.human.fit.overlays import FITTED, GIVEN, overlay, side_by_side
+from dyngs.human.fit.surface import surface_of
+from dyngs.human.fit.written import write_body, write_split
+from dyngs.human.motion.captured import captured_motion, same_bodies
+from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.template.load import default_template
+
+REPORT_NAME, OVERLAYS_NAME = "fit_report.json", "fit_overlays.png"
+_SHOWN, _COLUMNS, _SHOWN_SIDE, _SHOWN_RESOLUTION = 8, 4, 400, 72
+"""Overlays, how many in a row, their longest side in pixels, and the texels per side of the body drawn over them."""
+
+
+@dataclass(frozen=True)
+class FittedCapture:
+    """Result of ``write_fitted_capture``: the new capture's folder, and the fit."""
+
+    root: Path
+    found: CaptureFit
+
+    def summary(self) -> str:
+        """Return lines for people: how good the fit is."""
+        found, frames = self.found, len(self.found.motion.clip)
+        where = f"{found.held_out} views left out of the fit" if found.held_out else "the views fitted to"
+        worst = int(np.nanargmin(found.chosen.per_frame))
+        tried = ", ".join(f"{candidate.iou:.3f} with {candidate.name}" for candidate in found.tried)
+        return (
+            f"{frames} frames; overlap of silhouettes (IoU) on {where}: {tried}\n"
+            f"taken: {found.chosen.name}; worst frame {found.motion.frames[worst]} with "
+            f"{found.chosen.per_frame[worst]:.3f}; look at {self.root / OVERLAYS_NAME}"
+        )
+
+
+def write_fitted_capture(options: DataConfig, out: Path, report: Report) -> FittedCapture:
+    """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
+
+    Files: ``transforms_SPLIT.json``, ``images/``, ``body_train.npz``, ``body_pose.npz`` for another clip whose poses
+    were given by the same means, ``fit_report.json``, and ``fit_overlays.png`` to look at.
+
+    Raises:
+        DyngsError: see ``fit_capture``; ``out`` is not empty.
+    """
+    require_new_folder(out)
+    capture, body = read_capture(options), default_template()
+    found = fit_capture(capture, options, body, report)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
+        _write(Path(folder), capture, options, body, found)
+        write_image(Path(folder) / OVERLAYS_NAME, _overlays(capture, options, body, found))
+        write_text(Path(folder) / REPORT_NAME, json.dumps(_report(found), indent=1) + "\n")
+        if out.exists():
+            out.rmdir()
+        Path(folder).rename(out)
+        Path(folder).mkdir()  # for the context manager to remove
+    return FittedCapture(out, found)
+
+
+def _write(out: Path, capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> None:
+    """Write all splits of the capture with their body parameters."""
+    fit, betas, bodies = found.fit, found.fit.betas.numpy(), capture.body
+    full = options.model_copy(update={"longest_side": None, "downscale": 1})
+    write_body(out / "body_train.npz", fit.fitted(found.motion.clip), betas, capture.world_offset)
+    for split, given in capture.splits.items():
+        views, motion = numbered(given), found.motion
+        if bodies is not None and not same_bodies(bodies.get(split, bodies["train"]), bodies["train"]):
+            motion = captured_motion(capture.root, bodies[split], views, body.joints)
+            write_body(out / f"body_{split}.npz", fit.applied(motion.clip), betas, capture.world_offset)
+        pictures = PictureLoader(views, full)
+        shown = ((view, pictures[i]) for i, view in enumerate(views))
+        write_split(out, split, shown, motion.rows, capture.world_offset)
+
+
+def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> np.ndarray:
+    """Return pictures of the training views with the body's outline as given (red) and as fitted (green)."""
+    views = numbered(capture.splits["train"])
+    pictures = PictureLoader(views, options.model_copy(update={"longest_side": _SHOWN_SIDE, "downscale": 1}))
+    given, fitted, rows = found.motion.clip, found.fit.fitted(found.motion.clip), found.motion.rows
+    surface, sheets = surface_of(body, _SHOWN_RESOLUTION), []
+    for i in evenly_spaced(len(views), _SHOWN):
+        row = rows[-1 if views[i].frame is None else views[i].frame or 0]
+        mean = torch.zeros_like(found.fit.betas)
+        before, after = frame_pose(given, row), frame_pose(fitted, row)
+        sheets.append(overlay(pictures[i], surface, [(mean, before, GIVEN), (found.fit.betas, after, FITTED)]))
+    return side_by_side(sheets, _COLUMNS)
+
+
+def _report(found: CaptureFit) -> dict[str, object]:
+    """Return the report as JSON values."""
+    fit, chosen = found.fit, found.chosen
+    turns = np.degrees(fit.shared.turns.norm(dim=1).double().numpy())
+    return {
+        "frames": len(found.motion.clip),
+        "taken": chosen.name,
+        "iou": {candidate.name: round(candidate.iou, 4) for candidate in found.tried},
+        "views_left_out": found.held_out,
+        "iou_per_frame": {
+            str(frame): round(iou, 4)
+            for frame, iou in zip(found.motion.frames, chosen.per_frame, strict=True)
+            if iou == iou
+        },
+        "scale": float(np.exp(fit.shared.log_scale)),
+        "betas": [round(beta, 4) for beta in fit.betas.tolist()],
+        "turns_degrees": {name: round(float(turn), 2) for name, turn in zip(JOINT_NAMES, turns, strict=True) if turn},
+    }

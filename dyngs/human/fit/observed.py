@@ -1,0 +1,109 @@
+"""The observations that a body is fitted to: squares around the person, cut out of the pictures of each frame.
+
+Local letters: F frames, V views of one frame, S side of a square in pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.data.loader import Picture
+from dyngs.data.pictures.images import area_downscale
+
+_MARGIN = 1.25
+"""Side of the square over the longest side of the person's box."""
+
+
+@dataclass(frozen=True)
+class ObservedFrame:
+    """The views of one frame in which the person is seen.
+
+    Attributes:
+        cameras: V, of squares of S px.
+        alpha: (V, S, S) float32 in [0, 1]: coverage by the person.
+        known: (V, S, S) float32, 1 inside the picture that the square was cut out of and where its mask counts, else 0.
+    """
+
+    cameras: Cameras
+    alpha: Tensor
+    known: Tensor
+
+    def __len__(self) -> int:
+        return len(self.alpha)
+
+    def shrunk(self, factor: int) -> ObservedFrame:
+        """Return the squares with sides divided by ``factor``."""
+        size = self.cameras.width // factor
+        scale = self.cameras.intrinsics.new_tensor([1 / factor, 1 / factor, 1.0])
+        cameras = Cameras(self.cameras.cam_from_world, scale[:, None] * self.cameras.intrinsics, size, size)
+        return ObservedFrame(cameras, _resized(self.alpha, size), (_resized(self.known, size) > 0.999).float())
+
+
+def longest_box_side(pictures: Iterable[Picture]) -> int:
+    """Return the longest side of the person's box in the pictures (with alpha), px; 0 if nobody is seen."""
+    longest = 0
+    for picture in pictures:
+        box = _box(picture)
+        longest = longest if box is None else max(longest, box[1] - box[0], box[3] - box[2])
+    return longest
+
+
+def observed_frame(pictures: Sequence[Picture], box_side: int, size: int) -> ObservedFrame | None:
+    """Return the squares around the person in the pictures of one frame; None if no picture shows anybody.
+
+    Args:
+        pictures: with alpha.
+        box_side: ``longest_box_side`` of all pictures of the capture, so that all squares show the same scale.
+        size: S.
+    """
+    side = max(round(_MARGIN * box_side), 1)
+    squares = [square for picture in pictures if (square := _square(picture, side, size)) is not None]
+    if not squares:
+        return None
+    poses, intrinsics, alphas, known = (torch.cat(parts) for parts in zip(*squares, strict=True))
+    return ObservedFrame(Cameras(poses, intrinsics, size, size), alphas, known)
+
+
+def _square(picture: Picture, side: int, size: int) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
+    """Return pose (1, 4, 4), intrinsics (1, 3, 3), alpha and known (1, S, S) of the square around the person."""
+    box = _box(picture)
+    if box is None or picture.alpha is None:
+        return None
+    top, left = ((box[i] + box[i + 1] - side) // 2 for i in (0, 2))
+    weights = torch.ones_like(picture.alpha) if picture.mask is None else picture.mask
+    shift = picture.cameras.intrinsics.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+    scale = picture.cameras.intrinsics.new_tensor([size / side, size / side, 1.0])
+    cut = [_resized(_cut(x, top, left, side)[None], size) for x in (picture.alpha, weights)]
+    intrinsics = scale[:, None] * (picture.cameras.intrinsics - shift)
+    return picture.cameras.cam_from_world, intrinsics, cut[0], (cut[1] > 0.999).float()
+
+
+def _cut(values: Tensor, top: int, left: int, side: int) -> Tensor:
+    """Return the square (side, side) of values (H, W), 0 outside."""
+    height, width = values.shape
+    square = values.new_zeros(side, side)
+    rows = slice(max(top, 0), min(top + side, height))
+    columns = slice(max(left, 0), min(left + side, width))
+    square[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = values[rows, columns]
+    return square
+
+
+def _resized(values: Tensor, size: int) -> Tensor:
+    """Return values (V, S', S') averaged over the areas of the pixels of (V, size, size)."""
+    return area_downscale(values.permute(1, 2, 0), size, size).permute(2, 0, 1).contiguous()
+
+
+def _box(picture: Picture) -> tuple[int, int, int, int] | None:
+    """Return first and last + 1 row, first and last + 1 column of the person; None if nobody is seen."""
+    if picture.alpha is None:
+        return None
+    inside = picture.alpha > 0.5
+    rows, columns = (inside.any(axis).nonzero()[:, 0] for axis in (1, 0))
+    if not len(rows):
+        return None
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1

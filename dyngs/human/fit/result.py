@@ -1,0 +1,61 @@
+"""A fitted body: its shape, and the correction of the poses it was given, for the fitted clip and for others.
+
+Local letters: F frames, J joints, B shape parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.parameters import Parameters
+
+
+@dataclass(frozen=True)
+class BodyFit:
+    """A body fitted to a clip of F frames, as a correction of the poses that were given.
+
+    Attributes:
+        betas: (B,) shape parameters of the template.
+        shared: turns of the joints and factor on the size, the same in all frames.
+        offset: (3,) m, mean of the corrections of the translation, in the frame of the pelvis.
+        poses: (F, J, 3) axis-angle, rad, added to the turns per frame.
+        trans: (F, 3) added to the given translations.
+    """
+
+    betas: Tensor
+    shared: SharedCorrection
+    offset: Tensor
+    poses: Tensor
+    trans: Tensor
+
+    def fitted(self, clip: MotionClip) -> MotionClip:
+        """Return the clip that was fitted, with its corrections."""
+        return corrected_clip(self.shared, clip, self.poses, self.trans)
+
+    def applied(self, clip: MotionClip) -> MotionClip:
+        """Return another clip whose poses were given by the same means, with what holds for all frames."""
+        turned = corrected_clip(self.shared, clip)
+        roots = axis_angle_to_matrix(turned.poses[:, 0])
+        offsets = turned.scale[:, None] * (roots @ self.offset[:, None])[..., 0]
+        return MotionClip(turned.times, turned.poses, turned.trans + offsets, turned.scale)
+
+
+def body_fit(learned: Parameters, clip: MotionClip) -> BodyFit:
+    """Return what was learned (``new_fit``) about the clip as a fit of all its joints."""
+    values, joints = learned.values(), clip.poses.shape[1]
+
+    def padded(turns: Tensor) -> Tensor:
+        blank = turns.new_zeros(*turns.shape[:-2], joints - turns.shape[-2], 3)
+        return torch.cat([turns, blank], dim=-2)
+
+    shared = SharedCorrection(padded(values["turns"]), float(values["log_scale"][0]))
+    fitted = corrected_clip(shared, clip, padded(values["poses"]), values["trans"])
+    roots = axis_angle_to_matrix(fitted.poses[:, 0])
+    offset = (roots.transpose(1, 2) @ (values["trans"] / fitted.scale[:, None])[..., None])[..., 0].mean(0)
+    return BodyFit(values["betas"], shared, offset, padded(values["poses"]), values["trans"])

@@ -1,0 +1,169 @@
+"""The fit of a body to silhouettes and key points: few numbers for the whole clip first, then every frame's pose.
+
+Rasterized silhouettes are differentiable, so that everything is found by Adam. Local letters: F frames, J joints, B
+shape parameters, P discs, V views, K key points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.human.avatar.posing import BodyPose
+from dyngs.human.fit.observed import ObservedFrame
+from dyngs.human.fit.pose_prior import NUM_TURNED, PosePrior
+from dyngs.human.fit.surface import Surface, drawn_silhouettes
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
+from dyngs.parameters import Parameters
+
+LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e-3, "padding": 1e-3}
+"""Learning rates at the first step; ``trans`` per metre of the person's unit."""
+LR_DECAY = 0.1
+BETAS_WEIGHT = 1e-3
+"""Of the mean squared shape parameter, whose unit is the spread among adults."""
+TURN, STEP = 0.25, 0.1
+"""Rotations, rad, that cost as much as one unit of shape: of all frames, and from one frame to the next."""
+TURN_WEIGHT = POSE_WEIGHT = STEP_WEIGHT = 1e-3
+PADDING, PADDING_WEIGHT = 0.01, 2e-3
+"""Metres between skin and silhouette that cost as much as one unit of shape, and the weight of their mean square."""
+
+
+Observations = Callable[[int], ObservedFrame | None]
+"""Returns what is seen in a row of the clip."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a fit.
+
+    Attributes:
+        steps: of Adam.
+        frames: drawn in each step.
+        learned: names of what is learned.
+    """
+
+    steps: int
+    frames: int
+    learned: tuple[str, ...]
+
+
+def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
+    """Return what is learned, all zero.
+
+    Tensors: ``betas`` (B,) shape parameters; ``log_scale`` (1,) natural logarithm of the factor on the given scale;
+    ``turns`` (22, 3) axis-angle, rad, rotations of the joints applied before those of the given poses, in all frames;
+    ``poses`` (F, 22, 3) the same per frame, added to ``turns``; ``trans`` (F, 3) added to the given translations;
+    ``padding`` (P,) m between skin and silhouette: clothes and hair.
+    """
+    joints = surface.body.joints
+    zeros = {
+        "log_scale": joints.new_zeros(()).reshape(1),
+        "betas": joints.new_zeros(surface.shape_dirs.shape[-1]),
+        "turns": joints.new_zeros(NUM_TURNED, 3),
+        "poses": joints.new_zeros(len(clip), NUM_TURNED, 3),
+        "trans": joints.new_zeros(len(clip), 3),
+        "padding": joints.new_zeros(len(surface)),
+    }
+    unit = float(clip.scale.mean())
+    return Parameters(zeros, LR | {"trans": LR["trans"] * unit}, LR_DECAY)
+
+
+def frame_pose_of(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
+    """Return the fitted pose of frame ``row``."""
+    own = learned["turns"] + learned["poses"][row]
+    given = axis_angle_to_matrix(clip.poses[row])
+    turned = given[: len(own)] @ axis_angle_to_matrix(own)
+    return BodyPose(
+        torch.cat([turned, given[len(own) :]]),
+        clip.trans[row] + learned["trans"][row],
+        clip.scale[row] * learned["log_scale"][0].exp(),
+    )
+
+
+def posed_joints(learned: Parameters, clip: MotionClip, surface: Surface, row: int) -> Tensor:
+    """Return the joints (J, 3) of frame ``row`` in the world."""
+    skeleton, pose = surface.skeleton(learned["betas"]), frame_pose_of(learned, clip, row)
+    moves = joint_transforms(skeleton.joints, skeleton.parents, pose.rotations)
+    return pose.scale * ((moves[..., :3] @ skeleton.joints[..., None])[..., 0] + moves[..., 3]) + pose.trans
+
+
+def silhouette_error(drawn: Tensor, seen: ObservedFrame) -> Tensor:
+    """Return the squared difference of coverages, summed, over the sum of what is seen; a mean over the V views."""
+    wrong = ((drawn - seen.alpha) * seen.known).square().sum((1, 2))
+    return (wrong / (seen.alpha * seen.known).sum((1, 2)).clamp_min(1.0)).mean()
+
+
+def prior(learned: Parameters, expected: PosePrior) -> Tensor:
+    """Return the penalty of shapes, turns and poses that are far from those given, or that jump."""
+    total = BETAS_WEIGHT * learned["betas"].square().mean()
+    total = total + TURN_WEIGHT * (learned["turns"][1:] / TURN).square().mean()
+    away = (learned["poses"] - expected.centre) / expected.spread
+    total = total + POSE_WEIGHT * away[:, 1:].square().mean()
+    if len(learned["poses"]) > 1:
+        jumps = learned["poses"][1:] - learned["poses"][:-1]
+        total = total + STEP_WEIGHT * (jumps / STEP).square().mean()
+    return total + PADDING_WEIGHT * (learned["padding"] / PADDING).square().mean()
+
+
+def run_stage(
+    start: Parameters,
+    stage: Stage,
+    clip: MotionClip,
+    surface: Surface,
+    observed: Observations,
+    expected: PosePrior,
+    tick: Callable[[], None] = lambda: None,
+) -> Parameters:
+    """Return the fit after ``stage``; frames are taken in a fixed order that covers the clip evenly.
+
+    Args:
+        start: of ``new_fit`` or of the stage before.
+        stage: what to learn.
+        clip: the given poses, F frames.
+        surface: of the template.
+        observed: observations of a row of the clip.
+        expected: of the poses.
+        tick: called after every step.
+    """
+    learned = Parameters(start.values(), start.rates, start.decay)  # without moments
+    order = spread_order(len(clip))
+    for step in range(1, stage.steps + 1):
+        first = (step - 1) * stage.frames
+        rows = {order[(first + i) % len(order)] for i in range(stage.frames)}
+        loss = prior(learned, expected)
+        for row in sorted(rows):
+            seen = observed(row)
+            if seen is not None:
+                drawn = drawn_frame(learned, clip, surface, row, seen.cameras)
+                loss = loss + silhouette_error(drawn, seen) / len(rows)
+        loss.backward()
+        _forget_others(learned, stage.learned)
+        learned.step(step, step / stage.steps)
+        tick()
+    return learned
+
+
+def drawn_frame(learned: Parameters, clip: MotionClip, surface: Surface, row: int, cameras: Cameras) -> Tensor:
+    """Return the silhouettes (V, H, W) of frame ``row`` for V cameras."""
+    discs = surface.in_pose(learned["betas"], learned["padding"], frame_pose_of(learned, clip, row))
+    return drawn_silhouettes(discs, cameras)
+
+
+def spread_order(count: int) -> list[int]:
+    """Return 0 .. count - 1 in an order whose every stretch is spread over the whole range."""
+    stride = max(1, round(count * 0.618))
+    while count > 1 and torch.gcd(torch.tensor(stride), torch.tensor(count)) != 1:
+        stride += 1
+    return [(i * stride) % count for i in range(count)]
+
+
+def _forget_others(learned: Parameters, names: Sequence[str]) -> None:
+    """Drop the gradients of everything but ``names``."""
+    for name in learned.values():
+        if name not in names:
+            learned[name].grad = None

@@ -1,0 +1,201 @@
+"""First poses of a person of whom only silhouettes are known: where they stand, how they face, frame after frame.
+
+Local letters: F frames, V views, J joints.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.human.fit.observed import ObservedFrame
+from dyngs.human.fit.pose_prior import NUM_TURNED, usual, usual_pose
+from dyngs.human.fit.solve import Observations, Stage, drawn_frame, new_fit, run_stage, silhouette_error
+from dyngs.human.fit.surface import Surface
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.template.joints import JOINT_NAMES
+
+HEADINGS = 8
+"""Directions that a person may face in the first frame, all of which are tried."""
+STEPS = 40
+"""Steps of Adam for each of them, and for each frame from the pose of the one before."""
+ARMS = (((0, 0, -75), (0, 0, 0)), ((0, 0, 0), (0, 0, 0)), ((0, -30, -60), (0, -90, 0)))
+"""Rotations of the left shoulder and elbow, degrees, that are tried: hanging, spread, bent forward."""
+MOMENTUM = 0.8
+"""Share of the last rotation that is expected again, so that legs which pass each other are not exchanged."""
+STATURE = 1.70
+"""Height of a person in a usual pose, m, where a single camera leaves it open."""
+PELVIS_SHARE = 0.53
+"""Height of the pelvis, of that of the person."""
+
+
+def first_poses(
+    times: Tensor, surface: Surface, observed: Observations, tick: Callable[[], None] = lambda: None
+) -> MotionClip:
+    """Return poses of a person in F frames, found in the silhouettes of ``observed`` (per row) alone.
+
+    In the first frame every heading is tried; each later frame starts from the pose of the one before. The two best
+    headings are followed through the clip, and the better of them is taken.
+
+    Raises:
+        ValueError: nobody is seen in the first frame.
+    """
+    seen = observed(0)
+    if seen is None:
+        raise ValueError("nobody is seen in the first frame")
+    standing, up = standing_clip(times, surface, observed), up_of(seen)
+    tried = []
+    for turn in range(HEADINGS):
+        clip = turned(standing, 2 * math.pi * turn / HEADINGS, up)
+        tried.append(_followed(clip, surface, observed, [0], tick))
+    rows, followed = range(1, len(times)), []
+    for i in sorted(range(HEADINGS), key=lambda i: tried[i][1])[:2]:
+        clip = _with_better_arms(tried[i][0], tried[i][1], surface, seen)
+        followed.append(_followed(clip, surface, observed, rows, tick))
+    return min(followed, key=lambda found: found[1])[0]
+
+
+def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> MotionClip:
+    """Return the usual pose, upright, at the place and in the size of the silhouettes of each frame.
+
+    Where nobody is seen, the place is that of the frame before.
+    """
+    joints, up, places, heights = surface.body.joints, torch.zeros(3), [], []
+    for row in range(len(times)):
+        seen = observed(row)
+        if seen is None:
+            places.append(places[-1] if places else torch.zeros(3))
+            continue
+        up = up if up.any() else up_of(seen)
+        place, height = place_and_height(seen, up)
+        places.append(place)
+        heights += [] if height is None else [height]
+    upright = Rotation.align_vectors(up[None].numpy(), np.array([[0.0, 1.0, 0.0]]))[0]
+    poses = usual_pose(len(joints)).to(joints).repeat(len(times), 1, 1)
+    poses[:, 0] = torch.from_numpy(upright.as_rotvec()).to(poses)
+    scale = float(np.median(heights)) / STATURE if heights else 1.0
+    trans = torch.stack(places) - scale * joints[0]  # the root turns about the pelvis
+    return MotionClip(times, poses, trans, torch.full((len(times),), scale))
+
+
+def up_of(seen: ObservedFrame) -> Tensor:
+    """Return the unit vector (3,) that points up in the pictures, a mean over cameras."""
+    up = -seen.cameras.cam_from_world[:, 1, :3].mean(0)
+    return up / up.norm()
+
+
+def place_and_height(seen: ObservedFrame, up: Tensor) -> tuple[Tensor, float | None]:
+    """Return the place (3,) of the pelvis in the world and the height of the person, None if one camera sees them."""
+    rays = [_ray(seen.cameras.select(i), seen.alpha[i]) for i in range(len(seen))]
+    rays = [ray for ray in rays if ray is not None]
+    if not rays:
+        return torch.zeros(3), None
+    starts, directions, angles = (torch.stack(x) for x in zip(*rays, strict=True))
+    if len(rays) == 1:
+        middle = starts[0] + directions[0] * STATURE / angles[0]
+        height = None
+    else:
+        across = torch.eye(3) - directions[:, :, None] * directions[:, None]
+        middle = torch.linalg.lstsq(across.sum(0), (across @ starts[..., None]).sum(0)).solution[:, 0]
+        height = float((angles * (middle - starts).norm(dim=1)).median())
+    return middle + up * (PELVIS_SHARE - 0.5) * (height or STATURE), height
+
+
+def turned(clip: MotionClip, angle: float, up: Tensor) -> MotionClip:
+    """Return the clip with the person turned by ``angle``, rad, about ``up`` through the pelvis."""
+    turn = Rotation.from_rotvec(angle * up.numpy()) * Rotation.from_rotvec(clip.poses[:, 0].numpy())
+    poses = clip.poses.clone()
+    poses[:, 0] = torch.from_numpy(turn.as_rotvec()).to(poses)
+    return replace(clip, poses=poses)
+
+
+def _ray(camera: Cameras, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Return start and unit direction (3,) of the ray through the middle of a silhouette, and its height as an angle.
+
+    The angle is the height over the distance, for a person who stands upright in the picture. None if nobody is seen.
+    """
+    inside = alpha > 0.5
+    rows, columns = (inside.any(axis).nonzero()[:, 0] for axis in (1, 0))
+    if len(rows) < 2:
+        return None
+    top, bottom = float(rows[0]), float(rows[-1]) + 1
+    middle = torch.tensor([(float(columns[0]) + float(columns[-1]) + 1) / 2, (top + bottom) / 2, 1.0])
+    intrinsics, pose = camera.intrinsics[0], camera.cam_from_world[0]
+    local = torch.linalg.solve(intrinsics, middle)
+    direction = pose[:3, :3].T @ local
+    return camera.centers[0], direction / direction.norm(), (bottom - top) / (intrinsics[1, 1] * local.norm())
+
+
+def _followed(
+    clip: MotionClip,
+    surface: Surface,
+    observed: Observations,
+    rows: range | list[int],
+    tick: Callable[[], None],
+) -> tuple[MotionClip, float]:
+    """Return the clip with the poses of ``rows`` found one after the other, and the mean error of their silhouettes."""
+    poses, trans, errors = clip.poses.clone(), clip.trans.clone(), []
+    for row in rows:
+        seen = observed(row)
+        if row > 0:
+            poses[row] = _extrapolated(poses, row)
+            trans[row] = trans[row - 1] + clip.trans[row] - clip.trans[row - 1]
+        if seen is not None:
+            poses[row], trans[row], error = _found_from(clip, poses[row], trans[row], row, surface, seen)
+            errors.append(error)
+        tick()
+    return replace(clip, poses=poses, trans=trans), sum(errors) / max(len(errors), 1)
+
+
+def _with_better_arms(clip: MotionClip, error: float, surface: Surface, seen: ObservedFrame) -> MotionClip:
+    """Return the clip whose first frame has the arms that fit best, of those found from other positions as well.
+
+    A forearm that starts in front of the trunk does not find its way out of it.
+    """
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        for shoulder, elbow in ARMS:
+            pose = clip.poses[0].clone()
+            for name, degrees in (("shoulder", shoulder), ("elbow", elbow)):
+                turn = pose.new_tensor([degrees[0], sign * degrees[1], sign * degrees[2]])
+                pose[JOINT_NAMES.index(f"{side}_{name}")] = torch.deg2rad(turn)
+            pose, trans, found = _found_from(clip, pose, clip.trans[0], 0, surface, seen)
+            if found < error:
+                error, poses, places = found, clip.poses.clone(), clip.trans.clone()
+                poses[0], places[0] = pose, trans
+                clip = replace(clip, poses=poses, trans=places)
+    return clip
+
+
+def _found_from(
+    clip: MotionClip, pose: Tensor, trans: Tensor, row: int, surface: Surface, seen: ObservedFrame
+) -> tuple[Tensor, Tensor, float]:
+    """Return pose (J, 3), translation and error of one frame, found from a start."""
+    one = MotionClip(clip.times[row : row + 1], pose[None], trans[None], clip.scale[row : row + 1])
+    learned = new_fit(one, surface)
+    for level in (2, 1):
+        shown = seen.shrunk(level)
+        stage = Stage(STEPS, 1, ("poses", "trans"))
+        learned = run_stage(learned, stage, one, surface, lambda _, at=shown: at, usual(one))
+    with torch.no_grad():
+        error = float(silhouette_error(drawn_frame(learned, one, surface, 0, seen.cameras), seen))
+    own = Rotation.from_rotvec(learned["poses"][0].detach().numpy())
+    given = Rotation.from_rotvec(pose[:NUM_TURNED].numpy())
+    found = pose.clone()
+    found[:NUM_TURNED] = torch.from_numpy((given * own).as_rotvec()).to(found)
+    return found, trans + learned["trans"][0].detach(), error
+
+
+def _extrapolated(poses: Tensor, row: int) -> Tensor:
+    """Return the pose (J, 3) expected in frame ``row``: that before it, turned on as it turned before."""
+    if row < 2:
+        return poses[row - 1].clone()
+    before, last = (Rotation.from_rotvec(x.numpy()) for x in (poses[row - 2], poses[row - 1]))
+    on = Rotation.from_rotvec(MOMENTUM * (before.inv() * last).as_rotvec())
+    return torch.from_numpy((last * on).as_rotvec()).to(poses)

@@ -1,0 +1,74 @@
+"""Writer of a fitted capture in the layout that ``dyngs.data.readers.body_json`` reads.
+
+Local letters: F frames, J joints, B shape parameters.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from dyngs.data.capture import Split, View
+from dyngs.data.geometry.poses import opengl_from_cam
+from dyngs.data.loader import Picture
+from dyngs.files.write import atomic_file, to_uint8, write_image, write_text
+from dyngs.human.motion.clip import MotionClip
+
+
+def write_body(path: Path, clip: MotionClip, betas: np.ndarray, world_offset: np.ndarray) -> None:
+    """Write the body parameters of a clip: one row per frame, betas (B,) of the free template's shape space."""
+    with atomic_file(path) as temporary, temporary.open("wb") as file:
+        np.savez(
+            file,
+            poses=clip.poses.reshape(len(clip), -1).cpu().numpy(),
+            trans=(clip.trans.double().cpu().numpy() + world_offset).astype(np.float32),
+            betas=betas.astype(np.float32),
+            scale=clip.scale.cpu().numpy(),
+            surface_model_type="anny",
+            gender="neutral",
+            up_axis="y",
+        )
+
+
+def write_split(
+    out: Path,
+    split: Split,
+    shown: Iterator[tuple[View, Picture]],
+    rows: Mapping[int, int],
+    world_offset: np.ndarray,
+) -> None:
+    """Write ``transforms_SPLIT.json`` and the pictures of a split as PNG with straight alpha, undistorted.
+
+    Args:
+        out: folder.
+        split: name.
+        shown: the views with their pictures.
+        rows: frame number to row of the body parameters.
+        world_offset: (3,) added to all positions: where the capture was recentred from.
+    """
+    frames: list[dict[str, object]] = []
+    for view, picture in shown:
+        row = rows[-1 if view.frame is None else view.frame]
+        name = f"images/{split}/f{row:04d}_c{view.camera_id:02d}_{len(frames):05d}.png"
+        write_image(out / name, to_uint8(_straight(picture)))
+        camera = picture.cameras
+        intrinsics = camera.intrinsics[0].double().numpy()
+        pose = opengl_from_cam(view.cam_from_world).copy()
+        pose[:3, 3] += world_offset
+        entry: dict[str, object] = {"file_path": name, "frame": row, "camera": view.camera_id}
+        entry |= {} if view.time is None else {"time": view.time}
+        entry |= {"w": camera.width, "h": camera.height, "fl_x": intrinsics[0, 0], "fl_y": intrinsics[1, 1]}
+        frames.append(entry | {"cx": intrinsics[0, 2], "cy": intrinsics[1, 2], "transform_matrix": pose.tolist()})
+    write_text(out / f"transforms_{split}.json", json.dumps({"frames": frames}, indent=1) + "\n")
+
+
+def _straight(picture: Picture) -> np.ndarray:
+    """Return straight colours and alpha (H, W, 4) in [0, 1]."""
+    rgb = picture.rgb_premultiplied
+    if picture.alpha is None:
+        return rgb.numpy()
+    alpha = picture.alpha[..., None]
+    return np.concatenate([(rgb / alpha.clamp_min(1e-6)).clamp(0, 1).numpy() * (alpha > 0).numpy(), alpha.numpy()], -1)

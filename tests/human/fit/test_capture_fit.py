@@ -1,0 +1,99 @@
+"""The fit of whole captures: a person of another shape than the given poses are for is found from silhouettes."""
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dyngs.config import DataConfig
+from dyngs.data.capture import Capture
+from dyngs.data.read import read_capture
+from dyngs.errors import DyngsError
+from dyngs.human.fit.capture_fit import CaptureFit, FitEffort, fit_capture, numbered, split_views
+from dyngs.human.motion.captured import captured_motion
+from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
+from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.human.template.load import default_template, rest_shape
+
+OPTIONS = HumanOptions(size=96, num_frames=4, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1, body_seed=5)
+
+
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Capture]:
+    """A capture with exact body parameters, and the same with the poses of the mean shape."""
+    root = write_human_capture(tmp_path_factory.mktemp("fit") / "person", OPTIONS)
+    exact = read_capture(DataConfig(root=root))
+    arrays = dict(np.load(root / "body_train.npz"))
+    np.savez(root / "body_train.npz", **(arrays | {"betas": np.zeros(10), "surface_model_type": np.array("smplx")}))
+    return exact, read_capture(DataConfig(root=root))
+
+
+@lru_cache(maxsize=1)
+def found(capture_root: Path) -> CaptureFit:
+    capture = read_capture(DataConfig(root=capture_root))
+    effort = FitEffort(side=64, steps=30, visits=18)
+    return fit_capture(capture, DataConfig(root=capture_root), default_template(), lambda *_: None, effort)
+
+
+def joints_of(capture: Capture, fit: CaptureFit | None) -> torch.Tensor:
+    """(F, 22, 3) joints in the world, m: of the capture's own parameters, or of the fit."""
+    body = default_template()
+    assert capture.body is not None
+    _, rest = rest_shape(body, capture.body["train"])
+    clip = captured_motion(capture.root, capture.body["train"], capture.splits["train"], rest).clip
+    if fit is not None:
+        assert body.joint_shape_dirs is not None
+        clip, rest = fit.fit.fitted(clip), body.joints + body.joint_shape_dirs @ fit.fit.betas
+    moves = joint_transforms(rest, body.parents, axis_angle_to_matrix(clip.poses))
+    posed = (moves[..., :3] @ rest[..., None])[..., 0] + moves[..., 3]
+    return (clip.scale[:, None, None] * posed + clip.trans[:, None])[:, :22]
+
+
+def test_the_joints_come_nearer_to_the_truth(wrong: tuple[Capture, Capture]) -> None:
+    exact, given = wrong
+    truth = joints_of(exact, None)
+    before, after = ((joints_of(given, fit) - truth).norm(dim=-1).mean() for fit in (None, found(given.root)))
+    assert before > 0.03
+    assert after < 0.5 * before
+
+
+def test_the_fit_is_judged_on_views_that_it_did_not_see(wrong: tuple[Capture, Capture]) -> None:
+    fit = found(wrong[1].root)
+    assert fit.held_out == 4
+    assert fit.chosen.iou == max(candidate.iou for candidate in fit.tried)
+    assert fit.chosen.iou > fit.tried[0].iou + 0.03
+
+
+def test_the_same_capture_gives_the_same_fit(wrong: tuple[Capture, Capture]) -> None:
+    options, effort = DataConfig(root=wrong[1].root), FitEffort(side=32, steps=2, visits=0)
+    body = default_template()
+    first, again = (fit_capture(wrong[1], options, body, lambda *_: None, effort).chosen.learned for _ in range(2))
+    assert torch.equal(first["betas"], again["betas"])
+    assert torch.equal(first["trans"], again["trans"])
+
+
+def test_one_view_of_each_frame_is_left_out(wrong: tuple[Capture, Capture]) -> None:
+    capture = wrong[1]
+    views = capture.splits["train"]
+    assert capture.body is not None
+    motion = captured_motion(capture.root, capture.body["train"], views, default_template().joints)
+    used, left_out = split_views(views, motion)
+    assert sorted(i for rows in (*used.values(), *left_out.values()) for i in rows) == list(range(len(views)))
+    assert [len(rows) for rows in left_out.values()] == [1, 1, 1, 1]
+    assert len({views[rows[0]].name.split("_")[-1] for rows in left_out.values()}) == 4
+    few, none = split_views(views[:4], motion)
+    assert not any(none.values())
+    assert few[0] == [0, 1, 2, 3]
+
+
+def test_views_without_frames_are_numbered_by_time(wrong: tuple[Capture, Capture]) -> None:
+    views = [replace(view, frame=None) for view in wrong[1].splits["train"]]
+    assert [view.frame for view in numbered(views)] == [view.frame for view in wrong[1].splits["train"]]
+
+
+def test_pictures_without_silhouettes_are_refused(wrong: tuple[Capture, Capture]) -> None:
+    with pytest.raises(DyngsError, match="no silhouettes"):
+        fit_capture(wrong[1].replace(has_alpha=False), DataConfig(root=wrong[1].root), default_template(), print)
