@@ -258,7 +258,7 @@ def _measured(name: str, learned: Parameters, clip: MotionClip, surface: Surface
             drawn = drawn_frame(learned, clip, surface, row, frame.cameras)
             found.append(_iou(drawn, frame))
         else:
-            found.append(torch.zeros(0))
+            found.append(torch.zeros(0, device="cpu"))
     per_frame = tuple(float(x.mean()) if len(x) else float("nan") for x in found)
     return Candidate(name, learned, float(torch.cat(found).mean()), per_frame)
 

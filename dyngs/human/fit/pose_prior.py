@@ -68,7 +68,7 @@ def usual_pose(joints: int) -> Tensor:
 
 def usual_spread(joints: int) -> Tensor:
     """Return the standard deviations (joints, 3) about it, rad, at least 8 degrees."""
-    return _table(1, joints).abs().clamp_min(torch.deg2rad(torch.tensor(_LEAST)))
+    return _table(1, joints).abs().clamp_min(torch.deg2rad(torch.tensor(_LEAST, device="cpu")))
 
 
 def _table(which: int, joints: int) -> Tensor:

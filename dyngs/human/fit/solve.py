@@ -6,6 +6,7 @@ shape parameters, P discs, V views, K key points.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -157,7 +158,7 @@ def drawn_frame(learned: Parameters, clip: MotionClip, surface: Surface, row: in
 def spread_order(count: int) -> list[int]:
     """Return 0 .. count - 1 in an order whose every stretch is spread over the whole range."""
     stride = max(1, round(count * 0.618))
-    while count > 1 and torch.gcd(torch.tensor(stride), torch.tensor(count)) != 1:
+    while count > 1 and math.gcd(stride, count) != 1:
         stride += 1
     return [(i * stride) % count for i in range(count)]
 

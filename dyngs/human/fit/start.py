@@ -67,11 +67,11 @@ def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> Mo
 
     Where nobody is seen, the place is that of the frame before.
     """
-    joints, up, places, heights = surface.body.joints, torch.zeros(3), [], []
+    joints, up, places, heights = surface.body.joints, torch.zeros(3, device="cpu"), [], []
     for row in range(len(times)):
         seen = observed(row)
         if seen is None:
-            places.append(places[-1] if places else torch.zeros(3))
+            places.append(places[-1] if places else torch.zeros(3, device="cpu"))
             continue
         up = up if up.any() else up_of(seen)
         place, height = place_and_height(seen, up)
@@ -82,7 +82,7 @@ def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> Mo
     poses[:, 0] = torch.from_numpy(upright.as_rotvec()).to(poses)
     scale = float(np.median(heights)) / STATURE if heights else 1.0
     trans = torch.stack(places) - scale * joints[0]  # the root turns about the pelvis
-    return MotionClip(times, poses, trans, torch.full((len(times),), scale))
+    return MotionClip(times, poses, trans, torch.full((len(times),), scale, device="cpu"))
 
 
 def up_of(seen: ObservedFrame) -> Tensor:
@@ -96,13 +96,13 @@ def place_and_height(seen: ObservedFrame, up: Tensor) -> tuple[Tensor, float | N
     rays = [_ray(seen.cameras.select(i), seen.alpha[i]) for i in range(len(seen))]
     rays = [ray for ray in rays if ray is not None]
     if not rays:
-        return torch.zeros(3), None
+        return torch.zeros(3, device="cpu"), None
     starts, directions, angles = (torch.stack(x) for x in zip(*rays, strict=True))
     if len(rays) == 1:
         middle = starts[0] + directions[0] * STATURE / angles[0]
         height = None
     else:
-        across = torch.eye(3) - directions[:, :, None] * directions[:, None]
+        across = torch.eye(3, device="cpu") - directions[:, :, None] * directions[:, None]
         middle = torch.linalg.lstsq(across.sum(0), (across @ starts[..., None]).sum(0)).solution[:, 0]
         height = float((angles * (middle - starts).norm(dim=1)).median())
     return middle + up * (PELVIS_SHARE - 0.5) * (height or STATURE), height
@@ -126,7 +126,7 @@ def _ray(camera: Cameras, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor] | None
     if len(rows) < 2:
         return None
     top, bottom = float(rows[0]), float(rows[-1]) + 1
-    middle = torch.tensor([(float(columns[0]) + float(columns[-1]) + 1) / 2, (top + bottom) / 2, 1.0])
+    middle = torch.tensor([(float(columns[0]) + float(columns[-1]) + 1) / 2, (top + bottom) / 2, 1.0], device="cpu")
     intrinsics, pose = camera.intrinsics[0], camera.cam_from_world[0]
     local = torch.linalg.solve(intrinsics, middle)
     direction = pose[:3, :3].T @ local
