@@ -104,10 +104,22 @@ def _with_poses(config: Config) -> Config:
                 f"{config.data.root}: a person needs a capture with body parameters (docs/human.md); of photos or "
                 f"videos alone a scene can be made: `dyngs train static data.root={config.data.root}`, or dynamic"
             )
-        return config
+        return _with_fitted_body(config)
     with ProgressBar() as report:
         data = with_poses(config.data, needs_times=field_of(config) is not None, report=report)
     return config.model_copy(update={"data": data})
+
+
+def _with_fitted_body(config: Config) -> Config:
+    """Return the configuration with the free template fitted to the person, unless ``model.fit`` is off."""
+    from dyngs.config.kinds import person_of
+    from dyngs.human.fit.before_training import with_fitted_body
+
+    model = person_of(config)
+    if model is None or not model.fit or model.body is not None:
+        return config
+    with ProgressBar() as report:
+        return config.model_copy(update={"data": with_fitted_body(config.data, report=report)})
 
 
 def _next(folder: Path, config: Config) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, Lens, PointCloud, Splits, View, all_views
+from dyngs.data.fitted_body import with_fitted_body
 from dyngs.data.frame_selection import hold_out_frames, select_frames, split_by_camera
 from dyngs.data.geometry.recenter import recenter
 from dyngs.data.name_order import times_by_name
@@ -185,7 +186,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         seconds=seconds,
         warnings=(*warnings, *by_name, *notes, *more, *absent),
     )
-    return recenter(capture)
+    return recenter(capture if options.body is None else with_fitted_body(capture, options.body))
 
 
 def _wide(views: tuple[View, ...]) -> tuple[View, ...]:

@@ -69,6 +69,9 @@ class DataConfig(Section):
         description="colour behind the Gaussians; auto: white where the pictures have alpha, black otherwise; "
         "random: another one in each step",
     )
+    body: Path | None = Field(
+        default=None, description="folder of a fit by `dyngs data fit`, read in place of the capture's body parameters"
+    )
     cache_mb: float = Field(default=4096, ge=0, description="memory for decoded pictures, MB")
     frame_cache_mb: float = Field(default=4096, ge=0, description="disk space for decoded video frames, MB")
     follow_links: bool = Field(default=False, description="allow files of the capture that lie outside its folder")

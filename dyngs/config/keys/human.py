@@ -36,6 +36,9 @@ class HumanModel(_OnTemplate):
     kind: Literal["human"] = Field(
         default="human", description="one person: Gaussians on a body template, moved by its skeleton (docs/human.md)"
     )
+    fit: bool = Field(
+        default=True, description="fit the free template to the silhouettes before training, as `dyngs data fit` does"
+    )
     refine: bool = Field(
         default=True, description="learn corrections of poses, skeleton and skinning weights with the Gaussians"
     )

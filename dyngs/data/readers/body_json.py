@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
-from dyngs.data.body_frames import body_frames, rows_of
+from dyngs.data.body_frames import rows_of
 from dyngs.data.capture import BodyFrames, Capture, Split, View
+from dyngs.data.fitted_body import read_body_file
 from dyngs.data.readers.blender import read_blender
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import read_frame_file, read_views
 from dyngs.errors import DyngsError, reading
-from dyngs.files.numpy_files import read_npz
 
 _TRAIN = "body_train.npz"
 _NEW_POSES = cast(Split, "pose")
@@ -47,7 +46,7 @@ def _read(root: Path) -> Capture:
         views, notes = read_views(read_frame_file(path))
         splits[_NEW_POSES] = tuple(views.values())
         warnings = (*warnings, *(f"{path.name}: {note}" for note in notes))
-    train = _read_body(root / _TRAIN)
+    train = read_body_file(root / _TRAIN)
     body: dict[Split, BodyFrames] = {name: _body_of(root, name, views, train) for name, views in splits.items()}
     return capture.replace(
         format="body_json",
@@ -65,16 +64,9 @@ def _body_of(root: Path, split: Split, views: tuple[View, ...], train: BodyFrame
         raise DyngsError(
             f"{path}: no such file; transforms_pose.json shows another clip, which needs its own parameters"
         )
-    body = _read_body(path) if path.is_file() and split != "train" else train
+    body = read_body_file(path) if path.is_file() and split != "train" else train
     rows_of(path if path.is_file() else root / _TRAIN, body, views)
     return body
-
-
-def _read_body(path: Path) -> BodyFrames:
-    found = read_npz(path, ("poses", "trans", "betas"), ("scale", "surface_model_type"))
-    frames = range(len(found["poses"]) if found["poses"].ndim else 0)
-    body = body_frames(path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0))
-    return replace(body, shape_space="anny") if str(found.get("surface_model_type")) == "anny" else body
 
 
 FORMAT = CaptureFormat(

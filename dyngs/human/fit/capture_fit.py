@@ -6,14 +6,16 @@ Local letters: F frames, V views.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dyngs.config import DataConfig
+from dyngs.conventions import ReportProgress
 from dyngs.data.capture import BodyFrames, Capture, View
+from dyngs.data.fitted_body import numbered
 from dyngs.data.loader import PictureLoader
 from dyngs.errors import DyngsError
 from dyngs.human.fit.observed import ObservedFrame, longest_box_side, observed_frame
@@ -35,11 +37,8 @@ MOST_VIEWS = 8
 """Views of one frame that are looked at."""
 FRAMES = 3
 """Frames drawn in each step."""
-SHAPE = ("log_scale", "betas", "trans", "padding")
-"""What is the same in all frames, and where the person stands."""
-
-Report = Callable[[str, int, int], None]
-"""Called with what is being done, and how many of how many steps are done."""
+SHAPE = ("log_scale", "betas", "padding", "offset", "shift")
+"""What is the same in all frames."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ class _Seen:
 
 
 def fit_capture(
-    capture: Capture, options: DataConfig, body: BodyTemplate, report: Report, effort: FitEffort = FitEffort()
+    capture: Capture, options: DataConfig, body: BodyTemplate, report: ReportProgress, effort: FitEffort = FitEffort()
 ) -> CaptureFit:
     """Return the fit of ``body`` to the silhouettes of a capture's training views.
 
@@ -133,7 +132,7 @@ def fit_capture(
     """
     if not capture.has_alpha:
         raise DyngsError(f"{capture.root}: the pictures have no silhouettes; add masks of the person (docs/human.md)")
-    views = numbered(capture.splits["train"])
+    views = numbered(capture.splits)["train"]
     given = capture.body is not None
     bodies = capture.body["train"] if capture.body is not None else _placeholder(views)
     motion = captured_motion(capture.root, bodies, views, body.joints)
@@ -145,16 +144,7 @@ def fit_capture(
         motion = CapturedMotion(clip, motion.frames)
         tried = _from_silhouettes(clip, surface, seen, report, effort)
     chosen = max(tried, key=lambda candidate: candidate.iou)
-    return CaptureFit(body_fit(chosen.learned, motion.clip), motion, chosen, tried, seen.held_out, not given)
-
-
-def numbered(views: Sequence[View]) -> tuple[View, ...]:
-    """Return the views with frame numbers; those without get them by the order of their times."""
-    if all(view.frame is not None for view in views):
-        return tuple(views)
-    times = sorted({view.time or 0.0 for view in views})
-    order = {time: i for i, time in enumerate(times)}
-    return tuple(replace(view, frame=order[view.time or 0.0]) for view in views)
+    return CaptureFit(body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, not given)
 
 
 def split_views(views: Sequence[View], motion: CapturedMotion) -> tuple[dict[int, list[int]], dict[int, list[int]]]:
@@ -206,12 +196,12 @@ def _look(capture: Capture, views: Sequence[View], motion: CapturedMotion, optio
 
 
 def _from_given(
-    clip: MotionClip, surface: Surface, seen: _Seen, report: Report, effort: FitEffort
+    clip: MotionClip, surface: Surface, seen: _Seen, report: ReportProgress, effort: FitEffort
 ) -> tuple[Candidate, ...]:
     """Return the poses as given, with a fitted shape, and with fitted poses."""
     start, expected, few = new_fit(clip, surface), near_given(clip), (*SHAPE, "turns")
     tried = [_measured("the poses as given", start, clip, surface, seen)]
-    coarse, fine = Stage(effort.steps, FRAMES, few), Stage(effort.steps_for(clip), FRAMES, (*few, "poses"))
+    coarse, fine = Stage(effort.steps, FRAMES, few), Stage(effort.steps_for(clip), FRAMES, (*few, "poses", "trans"))
     tick = _ticker("shape", report, 2 * coarse.steps)
     shape = run_stage(start, coarse, clip, surface, seen.halved, expected, tick)
     shape = run_stage(shape, coarse, clip, surface, seen.used.__getitem__, expected, tick)
@@ -223,12 +213,12 @@ def _from_given(
 
 
 def _from_silhouettes(
-    clip: MotionClip, surface: Surface, seen: _Seen, report: Report, effort: FitEffort
+    clip: MotionClip, surface: Surface, seen: _Seen, report: ReportProgress, effort: FitEffort
 ) -> tuple[Candidate, ...]:
     """Return the poses as they were found first, and shape and poses fitted together."""
     start, expected = new_fit(clip, surface), usual(clip)
     tried = [_measured("poses found frame by frame", start, clip, surface, seen)]
-    stage = Stage(effort.steps_for(clip), FRAMES, (*SHAPE, "poses"))
+    stage = Stage(effort.steps_for(clip), FRAMES, (*SHAPE, "poses", "trans"))
     tick = _ticker("shape", report, 2 * stage.steps)
     found = start
     for look in (seen.halved, seen.used.__getitem__):
@@ -237,7 +227,7 @@ def _from_silhouettes(
     return tuple(tried)
 
 
-def _ticker(name: str, report: Report, total: int) -> Callable[[], None]:
+def _ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]:
     """Return a function that reports one more step of ``total``; 0: their number is not known."""
     done = 0
 

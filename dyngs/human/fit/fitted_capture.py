@@ -11,18 +11,20 @@ import numpy as np
 import torch
 
 from dyngs.config import DataConfig
-from dyngs.data.capture import Capture
+from dyngs.conventions import ReportProgress
+from dyngs.data.capture import Capture, Split
+from dyngs.data.fitted_body import numbered
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.files.write import write_image, write_text
 from dyngs.human.avatar.posing import frame_pose
-from dyngs.human.fit.capture_fit import CaptureFit, Report, fit_capture, numbered
+from dyngs.human.fit.capture_fit import CaptureFit, fit_capture
 from dyngs.human.fit.overlays import FITTED, GIVEN, overlay, side_by_side
 from dyngs.human.fit.surface import surface_of
 from dyngs.human.fit.written import write_body, write_split
-from dyngs.human.motion.captured import captured_motion, same_bodies
+from dyngs.human.motion.captured import CapturedMotion, captured_motion, same_bodies
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.human.template.load import default_template
@@ -52,7 +54,7 @@ class FittedCapture:
         )
 
 
-def write_fitted_capture(options: DataConfig, out: Path, report: Report) -> FittedCapture:
+def write_fitted_capture(options: DataConfig, out: Path, report: ReportProgress) -> FittedCapture:
     """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
 
     Files: ``transforms_SPLIT.json``, ``images/``, ``body_train.npz``, ``body_pose.npz`` for another clip whose poses
@@ -61,12 +63,24 @@ def write_fitted_capture(options: DataConfig, out: Path, report: Report) -> Fitt
     Raises:
         DyngsError: see ``fit_capture``; ``out`` is not empty.
     """
+    return _fitted(options, out, report, with_pictures=True)
+
+
+def write_fit(options: DataConfig, out: Path, report: ReportProgress) -> FittedCapture:
+    """As ``write_fitted_capture``, but without pictures and cameras: for ``data.body``."""
+    return _fitted(options, out, report, with_pictures=False)
+
+
+def _fitted(options: DataConfig, out: Path, report: ReportProgress, *, with_pictures: bool) -> FittedCapture:
     require_new_folder(out)
     capture, body = read_capture(options), default_template()
+    capture = capture.replace(splits=numbered(capture.splits))
     found = fit_capture(capture, options, body, report)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
-        _write(Path(folder), capture, options, body, found)
+        _write_bodies(Path(folder), capture, body, found, by_number=not with_pictures)
+        if with_pictures:
+            _write_pictures(Path(folder), capture, options, body, found)
         write_image(Path(folder) / OVERLAYS_NAME, _overlays(capture, options, body, found))
         write_text(Path(folder) / REPORT_NAME, json.dumps(_report(found), indent=1) + "\n")
         if out.exists():
@@ -76,24 +90,39 @@ def write_fitted_capture(options: DataConfig, out: Path, report: Report) -> Fitt
     return FittedCapture(out, found)
 
 
-def _write(out: Path, capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> None:
-    """Write all splits of the capture with their body parameters."""
-    fit, betas, bodies = found.fit, found.fit.betas.numpy(), capture.body
+def _motions(capture: Capture, body: BodyTemplate, found: CaptureFit) -> dict[Split, CapturedMotion]:
+    """Return the given motion of each split; that of training where a split shows its clip."""
+    motions: dict[Split, CapturedMotion] = dict.fromkeys(capture.splits, found.motion)
+    for split, own in (capture.body or {}).items():
+        if capture.splits.get(split) and capture.body and not same_bodies(own, capture.body["train"]):
+            motions[split] = captured_motion(capture.root, own, capture.splits[split], body.joints)
+    return motions
+
+
+def _write_bodies(out: Path, capture: Capture, body: BodyTemplate, found: CaptureFit, *, by_number: bool) -> None:
+    """Write the fitted clip and others, rows named by their frame numbers or counted."""
+    fit, betas = found.fit, found.fit.betas.numpy()
+    for split, motion in _motions(capture, body, found).items():
+        if split == "train" or motion is not found.motion:
+            clip = fit.fitted(motion.clip) if motion is found.motion else fit.applied(motion.clip)
+            frames = motion.frames if by_number and len(clip) == len(motion.frames) else None
+            write_body(out / f"body_{split}.npz", clip, betas, capture.world_offset, frames)
+
+
+def _write_pictures(out: Path, capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> None:
+    """Write the pictures and cameras of all splits."""
     full = options.model_copy(update={"longest_side": None, "downscale": 1})
-    write_body(out / "body_train.npz", fit.fitted(found.motion.clip), betas, capture.world_offset)
-    for split, given in capture.splits.items():
-        views, motion = numbered(given), found.motion
-        if bodies is not None and not same_bodies(bodies.get(split, bodies["train"]), bodies["train"]):
-            motion = captured_motion(capture.root, bodies[split], views, body.joints)
-            write_body(out / f"body_{split}.npz", fit.applied(motion.clip), betas, capture.world_offset)
-        pictures = PictureLoader(views, full)
-        shown = ((view, pictures[i]) for i, view in enumerate(views))
-        write_split(out, split, shown, motion.rows, capture.world_offset)
+    for split, motion in _motions(capture, body, found).items():
+        views = capture.splits[split]
+        if views:
+            pictures = PictureLoader(views, full)
+            shown = ((view, pictures[i]) for i, view in enumerate(views))
+            write_split(out, split, shown, motion.rows, capture.world_offset)
 
 
 def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> np.ndarray:
     """Return pictures of the training views with the body's outline as given (red) and as fitted (green)."""
-    views = numbered(capture.splits["train"])
+    views = capture.splits["train"]
     pictures = PictureLoader(views, options.model_copy(update={"longest_side": _SHOWN_SIDE, "downscale": 1}))
     given, fitted, rows = found.motion.clip, found.fit.fitted(found.motion.clip), found.motion.rows
     surface, sheets = surface_of(body, _SHOWN_RESOLUTION), []
@@ -116,7 +145,7 @@ def _report(found: CaptureFit) -> dict[str, object]:
         "views_left_out": found.held_out,
         "iou_per_frame": {
             str(frame): round(iou, 4)
-            for frame, iou in zip(found.motion.frames, chosen.per_frame, strict=True)
+            for frame, iou in zip(found.motion.frames, chosen.per_frame, strict=False)
             if iou == iou
         },
         "scale": float(np.exp(fit.shared.log_scale)),

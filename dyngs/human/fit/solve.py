@@ -22,8 +22,11 @@ from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.parameters import Parameters
 
-LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e-3, "padding": 1e-3}
-"""Learning rates at the first step; ``trans`` per metre of the person's unit."""
+LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e-3, "padding": 1e-3} | {
+    "offset": 3e-3,
+    "shift": 3e-3,
+}
+"""Learning rates at the first step; those of places per metre of the person's unit."""
 LR_DECAY = 0.1
 BETAS_WEIGHT = 1e-3
 """Of the mean squared shape parameter, whose unit is the spread among adults."""
@@ -58,7 +61,8 @@ def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
 
     Tensors: ``betas`` (B,) shape parameters; ``log_scale`` (1,) natural logarithm of the factor on the given scale;
     ``turns`` (22, 3) axis-angle, rad, rotations of the joints applied before those of the given poses, in all frames;
-    ``poses`` (F, 22, 3) the same per frame, added to ``turns``; ``trans`` (F, 3) added to the given translations;
+    ``poses`` (F, 22, 3) the same per frame, added to ``turns``; ``shift`` (3,) added to the given translations, and
+    ``offset`` (3,) m in the frame of the pelvis; ``trans`` (F, 3) the same as ``shift`` per frame;
     ``padding`` (P,) m between skin and silhouette: clothes and hair.
     """
     joints = surface.body.joints
@@ -69,9 +73,11 @@ def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
         "poses": joints.new_zeros(len(clip), NUM_TURNED, 3),
         "trans": joints.new_zeros(len(clip), 3),
         "padding": joints.new_zeros(len(surface)),
+        "offset": joints.new_zeros(3),
+        "shift": joints.new_zeros(3),
     }
     unit = float(clip.scale.mean())
-    return Parameters(zeros, LR | {"trans": LR["trans"] * unit}, LR_DECAY)
+    return Parameters(zeros, LR | {name: LR[name] * unit for name in ("trans", "shift")}, LR_DECAY)
 
 
 def frame_pose_of(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
@@ -79,11 +85,9 @@ def frame_pose_of(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
     own = learned["turns"] + learned["poses"][row]
     given = axis_angle_to_matrix(clip.poses[row])
     turned = given[: len(own)] @ axis_angle_to_matrix(own)
-    return BodyPose(
-        torch.cat([turned, given[len(own) :]]),
-        clip.trans[row] + learned["trans"][row],
-        clip.scale[row] * learned["log_scale"][0].exp(),
-    )
+    scale = clip.scale[row] * learned["log_scale"][0].exp()
+    away = learned["shift"] + learned["trans"][row] + scale * (turned[0] @ learned["offset"])
+    return BodyPose(torch.cat([turned, given[len(own) :]]), clip.trans[row] + away, scale)
 
 
 def posed_joints(learned: Parameters, clip: MotionClip, surface: Surface, row: int) -> Tensor:

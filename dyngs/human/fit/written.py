@@ -6,7 +6,7 @@ Local letters: F frames, J joints, B shape parameters.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +18,13 @@ from dyngs.files.write import atomic_file, to_uint8, write_image, write_text
 from dyngs.human.motion.clip import MotionClip
 
 
-def write_body(path: Path, clip: MotionClip, betas: np.ndarray, world_offset: np.ndarray) -> None:
-    """Write the body parameters of a clip: one row per frame, betas (B,) of the free template's shape space."""
+def write_body(
+    path: Path, clip: MotionClip, betas: np.ndarray, world_offset: np.ndarray, frames: Sequence[int] | None = None
+) -> None:
+    """Write the body parameters of a clip, one row per frame, with betas (B,) of the free template's shape space.
+
+    ``frames`` are the numbers of the rows; None: 0, 1, ...
+    """
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
@@ -30,6 +35,7 @@ def write_body(path: Path, clip: MotionClip, betas: np.ndarray, world_offset: np
             surface_model_type="anny",
             gender="neutral",
             up_axis="y",
+            frames=np.arange(len(clip)) if frames is None else np.asarray(frames, dtype=np.int64),
         )
 
 

@@ -1,6 +1,5 @@
 """The fit of whole captures: a person of another shape than the given poses are for is found from silhouettes."""
 
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.human.fit.capture_fit import CaptureFit, FitEffort, fit_capture, numbered, split_views
+from dyngs.human.fit.capture_fit import CaptureFit, FitEffort, fit_capture, split_views
 from dyngs.human.motion.captured import captured_motion
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
@@ -87,11 +86,6 @@ def test_one_view_of_each_frame_is_left_out(wrong: tuple[Capture, Capture]) -> N
     few, none = split_views(views[:4], motion)
     assert not any(none.values())
     assert few[0] == [0, 1, 2, 3]
-
-
-def test_views_without_frames_are_numbered_by_time(wrong: tuple[Capture, Capture]) -> None:
-    views = [replace(view, frame=None) for view in wrong[1].splits["train"]]
-    assert [view.frame for view in numbered(views)] == [view.frame for view in wrong[1].splits["train"]]
 
 
 def test_pictures_without_silhouettes_are_refused(wrong: tuple[Capture, Capture]) -> None:
