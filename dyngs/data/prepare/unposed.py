@@ -58,7 +58,10 @@ def with_poses(
             "order of time, a video, or train configs/static.yaml"
         )
     files = [*videos, *(path for path in [source / VIDEOS_FILE] if path.is_file())] if videos else None
-    folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{digest_of(source, files)}"
+    beside = data.root / "masks"
+    masks = beside if source != data.root and beside.is_dir() else None
+    digest = digest_of(source, files) + ("" if masks is None else digest_of(masks))
+    folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{digest}"
     if folder.is_dir():
         say(f"{source} has no poses; those of before are in {folder}")
         return data.model_copy(update={"root": folder})
@@ -67,8 +70,6 @@ def with_poses(
         several = VideosOptions(follow_links=data.follow_links, max_megapixels=data.max_megapixels)
         say(poses_of_videos(source, folder, several, report).summary())
     else:
-        beside = data.root / "masks"
-        masks = beside if source != data.root and beside.is_dir() else None
         options = SfmOptions(masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels)
         say(estimate_poses(source, folder, options, report).summary())
     return data.model_copy(update={"root": folder})

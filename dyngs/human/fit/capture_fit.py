@@ -22,7 +22,7 @@ from dyngs.human.fit.observed import ObservedFrame, longest_box_side, observed_f
 from dyngs.human.fit.pose_prior import near_given, usual
 from dyngs.human.fit.result import BodyFit, body_fit
 from dyngs.human.fit.solve import Stage, drawn_frame, new_fit, run_stage
-from dyngs.human.fit.start import first_poses
+from dyngs.human.fit.start import first_poses, num_ticks
 from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.captured import CapturedMotion, captured_motion
 from dyngs.human.motion.clip import MotionClip
@@ -140,7 +140,8 @@ def fit_capture(
     if given:
         tried = _from_given(motion.clip, surface, seen, report, effort)
     else:
-        clip = first_poses(motion.clip.times, surface, seen.used.__getitem__, _ticker("poses", report, 0))
+        tick = _ticker("first poses", report, num_ticks(len(motion.clip)))
+        clip = first_poses(motion.clip.times, surface, seen.used.__getitem__, tick)
         motion = CapturedMotion(clip, motion.frames)
         tried = _from_silhouettes(clip, surface, seen, report, effort)
     chosen = max(tried, key=lambda candidate: candidate.iou)
@@ -228,13 +229,13 @@ def _from_silhouettes(
 
 
 def _ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]:
-    """Return a function that reports one more step of ``total``; 0: their number is not known."""
+    """Return a function that reports one more step of ``total``."""
     done = 0
 
     def tick() -> None:
         nonlocal done
         done += 1
-        report(name, done, max(total, done + 1))
+        report(name, done, total)
 
     return tick
 

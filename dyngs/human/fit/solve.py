@@ -20,6 +20,7 @@ from dyngs.human.fit.pose_prior import NUM_TURNED, PosePrior
 from dyngs.human.fit.surface import Surface, drawn_silhouettes
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
+from dyngs.human.template.bone_shapes import NUM_BONE_SHAPES
 from dyngs.parameters import Parameters
 
 LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e-3, "padding": 1e-3} | {
@@ -28,7 +29,7 @@ LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e
 }
 """Learning rates at the first step; those of places per metre of the person's unit."""
 LR_DECAY = 0.1
-BETAS_WEIGHT = 1e-3
+BETAS_WEIGHT = BONES_WEIGHT = 1e-3
 """Of the mean squared shape parameter, whose unit is the spread among adults."""
 TURN, STEP = 0.25, 0.1
 """Rotations, rad, that cost as much as one unit of shape: of all frames, and from one frame to the next."""
@@ -105,7 +106,8 @@ def silhouette_error(drawn: Tensor, seen: ObservedFrame) -> Tensor:
 
 def prior(learned: Parameters, expected: PosePrior) -> Tensor:
     """Return the penalty of shapes, turns and poses that are far from those given, or that jump."""
-    total = BETAS_WEIGHT * learned["betas"].square().mean()
+    body, bones = learned["betas"].square().tensor_split([-NUM_BONE_SHAPES])
+    total = BETAS_WEIGHT * body.mean() + BONES_WEIGHT * bones.mean()
     total = total + TURN_WEIGHT * (learned["turns"][1:] / TURN).square().mean()
     away = (learned["poses"] - expected.centre) / expected.spread
     total = total + POSE_WEIGHT * away[:, 1:].square().mean()

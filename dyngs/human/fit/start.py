@@ -62,6 +62,11 @@ def first_poses(
     return min(followed, key=lambda found: found[1])[0]
 
 
+def num_ticks(frames: int) -> int:
+    """Return how often ``first_poses`` calls ``tick`` for a clip of so many frames."""
+    return HEADINGS + 2 * (frames - 1)
+
+
 def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> MotionClip:
     """Return the usual pose, upright, at the place and in the size of the silhouettes of each frame.
 

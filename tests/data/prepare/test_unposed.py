@@ -74,6 +74,15 @@ def test_masks_beside_the_images_are_no_photos(tmp_path: Path, asked: list[Path]
     assert asked == [tmp_path / "scan" / "images"]
 
 
+def test_masks_that_come_later_give_new_poses(tmp_path: Path, asked: list[Path]) -> None:
+    data = DataConfig(root=tmp_path)
+    _photos(tmp_path / "images")
+    before = with_poses(data, say=lambda _: None)
+    _photos(tmp_path / "masks")
+    assert with_poses(data, say=lambda _: None).root != before.root
+    assert len(asked) == 2
+
+
 def test_a_video_gets_poses_and_has_times(tmp_path: Path, asked: list[Path]) -> None:
     with VideoWriter(tmp_path / "clip.mp4", fps=10) as video:
         for i in range(3):

@@ -1,0 +1,57 @@
+"""Squares around the person: the same person, seen by cameras that fit the squares."""
+
+import pytest
+import torch
+
+from dyngs.camera import Cameras
+from dyngs.data.loader import Picture
+from dyngs.human.fit.observed import longest_box_side, observed_frame
+
+
+def picture(rows: slice, columns: slice, height: int = 40, width: int = 60) -> Picture:
+    alpha = torch.zeros(height, width)
+    alpha[rows, columns] = 1.0
+    camera = Cameras(torch.eye(4)[None], torch.tensor([[[50.0, 0, 30], [0, 50, 20], [0, 0, 1]]]), width, height)
+    return Picture("p", camera, alpha[..., None].expand(-1, -1, 3), alpha, None, None, 0)
+
+
+def test_a_point_of_the_world_falls_on_the_same_part_of_the_person() -> None:
+    shown = picture(slice(10, 30), slice(20, 28))
+    side = longest_box_side([shown])
+    assert side == 20
+    frame = observed_frame([shown], side, 10)
+    assert frame is not None
+    corner = torch.tensor([[20.0, 10.0, 1.0], [28.0, 30.0, 1.0]])  # of the box, in the picture
+    directions = torch.linalg.solve(shown.cameras.intrinsics[0], corner.T)
+    inside = (frame.cameras.intrinsics[0] @ directions).T[:, :2]
+    covered = frame.alpha[0] > 0.5
+    rows, columns = covered.any(1).nonzero()[:, 0], covered.any(0).nonzero()[:, 0]
+    assert inside[0].round().tolist() == [float(columns[0]), float(rows[0])]
+    assert inside[1].round().tolist() == [float(columns[-1]) + 1, float(rows[-1]) + 1]
+    assert float(frame.alpha.sum()) * (25 / 10) ** 2 == pytest.approx(160, rel=0.01)
+
+
+def test_what_lies_outside_of_the_picture_is_not_known() -> None:
+    frame = observed_frame([picture(slice(0, 20), slice(0, 5))], 20, 25)
+    assert frame is not None
+    assert frame.known[0, :, 12:].mean() > 0.8
+    assert not frame.known[0, :, 0].any(), "left of the picture"
+    assert not frame.known[0, 0].any(), "above it"
+
+
+def test_half_the_size_shows_the_same() -> None:
+    frame = observed_frame([picture(slice(10, 30), slice(20, 28))], 20, 24)
+    assert frame is not None
+    small = frame.shrunk(2)
+    assert small.alpha.shape == (1, 12, 12)
+    assert float(small.alpha.mean()) == pytest.approx(float(frame.alpha.mean()), rel=1e-5)
+    assert small.cameras.intrinsics[0, 0, 0] * 2 == frame.cameras.intrinsics[0, 0, 0]
+
+
+def test_pictures_without_anybody_are_left_out() -> None:
+    nobody = picture(slice(0, 0), slice(0, 0))
+    assert longest_box_side([nobody]) == 0
+    assert observed_frame([nobody], 20, 10) is None
+    found = observed_frame([nobody, picture(slice(10, 30), slice(20, 28))], 20, 10)
+    assert found is not None
+    assert len(found) == 1

@@ -1,0 +1,98 @@
+"""First poses from silhouettes: place, size and heading of a person of whom nothing else is known."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from dyngs.camera import Cameras
+from dyngs.human.fit.observed import ObservedFrame
+from dyngs.human.fit.pose_prior import usual_pose
+from dyngs.human.fit.solve import drawn_frame, new_fit
+from dyngs.human.fit.start import PELVIS_SHARE, STATURE, first_poses, num_ticks, place_and_height, standing_clip, up_of
+from dyngs.human.fit.surface import Surface, surface_of
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.template.load import default_template
+
+SIZE = 48
+
+
+@pytest.fixture(scope="module")
+def surface() -> Surface:
+    return surface_of(default_template(), 48)
+
+
+def ring(count: int, centre: torch.Tensor, distance: float = 4.0) -> Cameras:
+    """Cameras around a place, looking at it, y up."""
+    poses = torch.eye(4).repeat(count, 1, 1)
+    for i in range(count):
+        angle = 2 * math.pi * (i + 0.2) / count
+        back = torch.tensor([math.sin(angle), 0.0, math.cos(angle)])
+        rotation = torch.stack(
+            [torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), back), torch.tensor([0.0, -1.0, 0.0]), -back]
+        )
+        poses[i, :3, :3], poses[i, :3, 3] = rotation, -rotation @ (centre + distance * back)
+    focal = torch.tensor([[1.6 * SIZE, 0, SIZE / 2], [0, 1.6 * SIZE, SIZE / 2], [0, 0, 1]])
+    return Cameras(poses, focal.repeat(count, 1, 1), SIZE, SIZE)
+
+
+def standing(place: torch.Tensor, heading: float, scale: float = 1.0) -> MotionClip:
+    """One frame of the usual pose with the pelvis at ``place``."""
+    poses = usual_pose(55)[None].clone()
+    poses[0, 0] = torch.tensor([0.0, heading, 0.0])
+    joints = default_template().joints
+    time = torch.zeros(1, dtype=torch.float64)
+    return MotionClip(time, poses, (place - scale * joints[0])[None], torch.tensor([scale]))
+
+
+def seen_by(surface: Surface, clip: MotionClip, cameras: Cameras) -> ObservedFrame:
+    with torch.no_grad():
+        alpha = drawn_frame(new_fit(clip, surface), clip, surface, 0, cameras)
+    return ObservedFrame(cameras, alpha, torch.ones_like(alpha))
+
+
+def test_place_and_size_of_who_stands_somewhere(surface: Surface) -> None:
+    place = torch.tensor([1.0, 2.0, -3.0])
+    seen = seen_by(surface, standing(place, 0.3, scale=1.2), ring(4, place))
+    assert up_of(seen) == pytest.approx([0, 1, 0], abs=1e-6)
+    found, height = place_and_height(seen, up_of(seen))
+    assert found == pytest.approx(place, abs=0.2)  # the middle of the box is not the pelvis
+    assert height == pytest.approx(1.2 * STATURE, rel=0.06)
+    clip = standing_clip(torch.zeros(1, dtype=torch.float64), surface, lambda _: seen)
+    assert float(clip.scale[0]) == pytest.approx(1.2, rel=0.06)
+
+
+def test_one_camera_leaves_the_size_open(surface: Surface) -> None:
+    place = torch.tensor([0.0, 1.0, 0.0])
+    seen = seen_by(surface, standing(place, 0.3), ring(1, place))
+    found, height = place_and_height(seen, up_of(seen))
+    assert height is None
+    assert found == pytest.approx(place, abs=0.25)
+    assert 0.5 < PELVIS_SHARE < 0.56
+
+
+def test_nobody_has_the_place_of_the_frame_before(surface: Surface) -> None:
+    place = torch.tensor([0.0, 1.0, 0.0])
+    seen = seen_by(surface, standing(place, 0.0), ring(4, place))
+    times = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    clip = standing_clip(times, surface, lambda row: seen if row == 0 else None)
+    assert torch.equal(clip.trans[0], clip.trans[1])
+
+
+def test_the_heading_is_found(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 12)
+    monkeypatch.setattr("dyngs.human.fit.start.ARMS", ())
+    place, heading = torch.tensor([0.0, 1.0, 0.0]), 2.0
+    seen = seen_by(surface, standing(place, heading), ring(3, place))
+    ticks: list[int] = []
+    clip = first_poses(torch.zeros(1, dtype=torch.float64), surface, lambda _: seen, lambda: ticks.append(1))
+    facing = Rotation.from_rotvec(clip.poses[0, 0].double().numpy()).apply([0.0, 0.0, 1.0])
+    assert facing @ np.array([math.sin(heading), 0.0, math.cos(heading)]) > 0.8  # few steps, from 45 degrees apart
+    assert len(ticks) == num_ticks(1)
+
+
+def test_nobody_at_all_is_an_error(surface: Surface) -> None:
+    with pytest.raises(ValueError, match="nobody is seen"):
+        first_poses(torch.zeros(1, dtype=torch.float64), surface, lambda _: None)
