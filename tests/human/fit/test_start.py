@@ -59,9 +59,9 @@ def test_place_and_size_of_who_stands_somewhere(surface: Surface) -> None:
     assert up_of(seen) == pytest.approx([0, 1, 0], abs=1e-6)
     found, height = place_and_height(seen, up_of(seen))
     assert found == pytest.approx(place, abs=0.2)  # the middle of the box is not the pelvis
-    assert height == pytest.approx(1.2 * STATURE, rel=0.06)
+    assert height == pytest.approx(1.2 * STATURE, rel=0.1)
     clip = standing_clip(torch.zeros(1, dtype=torch.float64), surface, lambda _: seen)
-    assert float(clip.scale[0]) == pytest.approx(1.2, rel=0.06)
+    assert float(clip.scale[0]) == pytest.approx(1.2, rel=0.1)
 
 
 def test_one_camera_leaves_the_size_open(surface: Surface) -> None:
