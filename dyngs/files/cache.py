@@ -9,7 +9,7 @@ from typing import Literal
 CACHE_VARIABLE = "DYNGS_CACHE_DIR"
 
 
-def cache_folder(kind: Literal["frames", "poses"]) -> Path:
+def cache_folder(kind: Literal["frames", "poses", "bodies"]) -> Path:
     """Return the folder of one kind of cached files: in ``$DYNGS_CACHE_DIR``, else in the system's cache of the user.
 
     Args:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress
@@ -21,10 +23,10 @@ from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.files.write import write_image, write_text
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, fit_capture
+from dyngs.human.fit.clips import FittedClip, fitted_clips
 from dyngs.human.fit.overlays import FITTED, GIVEN, overlay, side_by_side
 from dyngs.human.fit.surface import surface_of
 from dyngs.human.fit.written import write_body, write_split
-from dyngs.human.motion.captured import CapturedMotion, captured_motion, same_bodies
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.human.template.load import default_template
@@ -78,9 +80,12 @@ def _fitted(options: DataConfig, out: Path, report: ReportProgress, *, with_pict
     found = fit_capture(capture, options, body, report)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
-        _write_bodies(Path(folder), capture, body, found, by_number=not with_pictures)
+        clips = fitted_clips(capture, body, found)
         if with_pictures:
-            _write_pictures(Path(folder), capture, options, body, found)
+            _write_pictures(Path(folder), capture, options, clips)
+            for split, clip in clips.items():
+                clips[split] = replace(clip, frames=tuple(range(len(clip.frames))))
+        _write_bodies(Path(folder), capture, clips, found.fit.betas)
         write_image(Path(folder) / OVERLAYS_NAME, _overlays(capture, options, body, found))
         write_text(Path(folder) / REPORT_NAME, json.dumps(_report(found), indent=1) + "\n")
         if out.exists():
@@ -90,34 +95,20 @@ def _fitted(options: DataConfig, out: Path, report: ReportProgress, *, with_pict
     return FittedCapture(out, found)
 
 
-def _motions(capture: Capture, body: BodyTemplate, found: CaptureFit) -> dict[Split, CapturedMotion]:
-    """Return the given motion of each split; that of training where a split shows its clip."""
-    motions: dict[Split, CapturedMotion] = dict.fromkeys(capture.splits, found.motion)
-    for split, own in (capture.body or {}).items():
-        if capture.splits.get(split) and capture.body and not same_bodies(own, capture.body["train"]):
-            motions[split] = captured_motion(capture.root, own, capture.splits[split], body.joints)
-    return motions
+def _write_bodies(out: Path, capture: Capture, clips: Mapping[Split, FittedClip], betas: Tensor) -> None:
+    """Write the clips, rows named by their frame numbers."""
+    for split, found in clips.items():
+        write_body(out / f"body_{split}.npz", found.clip, betas.numpy(), capture.world_offset, found.frames)
 
 
-def _write_bodies(out: Path, capture: Capture, body: BodyTemplate, found: CaptureFit, *, by_number: bool) -> None:
-    """Write the fitted clip and others, rows named by their frame numbers or counted."""
-    fit, betas = found.fit, found.fit.betas.numpy()
-    for split, motion in _motions(capture, body, found).items():
-        if split == "train" or motion is not found.motion:
-            clip = fit.fitted(motion.clip) if motion is found.motion else fit.applied(motion.clip)
-            frames = motion.frames if by_number and len(clip) == len(motion.frames) else None
-            write_body(out / f"body_{split}.npz", clip, betas, capture.world_offset, frames)
-
-
-def _write_pictures(out: Path, capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> None:
+def _write_pictures(out: Path, capture: Capture, options: DataConfig, clips: Mapping[Split, FittedClip]) -> None:
     """Write the pictures and cameras of all splits."""
-    full = options.model_copy(update={"longest_side": None, "downscale": 1})
-    for split, motion in _motions(capture, body, found).items():
-        views = capture.splits[split]
+    full = options.model_copy(update={"longest_side": None, "downscale": 1, "body": None})
+    for split, views in capture.splits.items():
         if views:
-            pictures = PictureLoader(views, full)
+            pictures, found = PictureLoader(views, full), clips["pose" if split == "pose" else "train"]
             shown = ((view, pictures[i]) for i, view in enumerate(views))
-            write_split(out, split, shown, motion.rows, capture.world_offset)
+            write_split(out, split, shown, found.rows, capture.world_offset)
 
 
 def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> np.ndarray:

@@ -16,7 +16,7 @@ from dyngs.human.template.joints import JOINT_NAMES
 
 NUM_TURNED = 22
 """Joints that are turned: those of the body. Fingers, jaw and eyes do not show in silhouettes."""
-_GIVEN = 0.25
+_GIVEN = 0.05
 """Expected error of given poses, rad."""
 _LEAST = 8.0
 """Least spread, degrees: a few clips do not show how far a joint can go."""

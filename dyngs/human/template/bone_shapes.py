@@ -71,7 +71,7 @@ def _following(vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...
             ends = [joint, *bones]
             away = np.linalg.norm(vertices[rows, None] - joints[ends], axis=-1) + _NEAREST
             parts = away**-2 / (away**-2).sum(1, keepdims=True)
-            follow[np.ix_(rows, ends)] += weights[rows, joint, None] * parts
+            follow[rows[:, None], np.array(ends)] += weights[rows, joint, None] * parts
         else:
             follow[rows, joint] += weights[rows, joint]
     return follow
