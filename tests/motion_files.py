@@ -265,3 +265,27 @@ def as_local(motion: Motion, own: Skeleton) -> np.ndarray:
     rows = [JOINT_NAMES.index(name) for name in own.names]
     poses = motion.poses.double().numpy()[:, rows]
     return Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)
+
+
+# --- VRM animations ---------------------------------------------------------------------------------------------------
+
+VRM = {"pelvis": "hips", "spine1": "spine", "spine2": "chest", "spine3": "upperChest", "neck": "neck", "head": "head"}
+_VRM_LIMBS = {"collar": "Shoulder", "shoulder": "UpperArm", "elbow": "LowerArm", "wrist": "Hand", "hip": "UpperLeg"}
+_VRM_LIMBS |= {"knee": "LowerLeg", "ankle": "Foot", "foot": "Toes"}
+_VRM_FINGERS = {"index": "Index", "middle": "Middle", "ring": "Ring", "pinky": "Little"}
+for _side in ("left", "right"):
+    VRM |= {f"{_side}_{ours}": _side + theirs for ours, theirs in _VRM_LIMBS.items()}
+    for _i, _word in enumerate(("Proximal", "Intermediate", "Distal"), 1):
+        VRM |= {f"{_side}_{ours}{_i}": f"{_side}{theirs}{_word}" for ours, theirs in _VRM_FINGERS.items()}
+    VRM |= {f"{_side}_thumb{i}": f"{_side}Thumb{x}" for i, x in enumerate(("Metacarpal", "Proximal", "Distal"), 1)}
+
+
+def vrma_of(own: Skeleton, clip: Clip) -> Glb:
+    """A VRM animation of joints that VRM knows: the extension, not the names of nodes, says which bone each is."""
+    glb = glb_of(own, clip)
+    glb.json.pop("skins")
+    for i, node in enumerate(glb.json["nodes"]):
+        node["name"] = f"node {i}"
+    bones = {VRM[name]: {"node": i} for i, name in enumerate(own.names)}
+    glb.json["extensions"] = {"VRMC_vrm_animation": {"specVersion": "1.0", "humanoid": {"humanBones": bones}}}
+    return glb

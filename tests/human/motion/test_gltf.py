@@ -12,7 +12,19 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from measured import cost_of
-from motion_files import Clip, Glb, as_local, glb_of, pelvis_path, random_motion, skeleton, tiny_body, world_rotations
+from motion_files import (
+    VRM,
+    Clip,
+    Glb,
+    as_local,
+    glb_of,
+    pelvis_path,
+    random_motion,
+    skeleton,
+    tiny_body,
+    vrma_of,
+    world_rotations,
+)
 from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
@@ -109,29 +121,13 @@ def test_a_file_without_a_skin_moves_its_animated_nodes(tmp_path: Path) -> None:
 
 # --- VRM animations ---------------------------------------------------------------------------------------------------
 
-VRM = {"pelvis": "hips", "spine1": "spine", "spine2": "chest", "spine3": "upperChest", "neck": "neck", "head": "head"}
-LIMBS = {"collar": "Shoulder", "shoulder": "UpperArm", "elbow": "LowerArm", "wrist": "Hand", "hip": "UpperLeg"}
-LIMBS |= {"knee": "LowerLeg", "ankle": "Foot", "foot": "Toes"}
-PHALANGES = {"index": "Index", "middle": "Middle", "ring": "Ring", "pinky": "Little"}
-for _side in ("left", "right"):
-    VRM |= {f"{_side}_{ours}": _side + theirs for ours, theirs in LIMBS.items()}
-    for _i, _word in enumerate(("Proximal", "Intermediate", "Distal"), 1):
-        VRM |= {f"{_side}_{ours}{_i}": f"{_side}{theirs}{_word}" for ours, theirs in PHALANGES.items()}
-    VRM |= {f"{_side}_thumb{i}": f"{_side}Thumb{x}" for i, x in enumerate(("Metacarpal", "Proximal", "Distal"), 1)}
 BONES = skeleton(tuple(VRM))
 
 
 def vrma(**changes: object) -> Glb:
-    """The motion as a VRM animation: nodes have names of no meaning, the extension says which bone each is."""
+    """The motion as a VRM animation."""
     moved = Clip(as_local(MOTION, BONES), pelvis_path(BODY, MOTION), bind_matrices=False, **changes)  # pyright: ignore[reportArgumentType]
-    glb = glb_of(BONES, moved)
-    glb.json.pop("skins")
-    for i, node in enumerate(glb.json["nodes"]):
-        node["name"] = f"node {i}"
-    bones = {VRM[name]: {"node": i} for i, name in enumerate(BONES.names)}
-    own = {"specVersion": "1.0", "humanoid": {"humanBones": bones}}
-    glb.json["extensions"] = {"VRMC_vrm_animation": own}
-    return glb
+    return vrma_of(BONES, moved)
 
 
 def test_a_vrm_animation_moves_the_bones_that_it_names(tmp_path: Path) -> None:

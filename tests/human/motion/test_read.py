@@ -7,7 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from motion_files import Clip, as_local, glb_of, pelvis_path, random_motion, skeleton, tiny_body, write_bvh
+from motion_files import (
+    VRM,
+    Clip,
+    as_local,
+    glb_of,
+    pelvis_path,
+    random_motion,
+    skeleton,
+    tiny_body,
+    vrma_of,
+    write_bvh,
+)
 from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
@@ -16,6 +27,7 @@ from dyngs.human.motion.motion import (
 )
 from dyngs.human.motion.read import read_motion
 from dyngs.human.template.body import posed_vertices
+from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.human.template.load import default_template
 
 BODY = tiny_body()
@@ -26,7 +38,7 @@ def matrices(motion: Motion) -> np.ndarray:
 
 
 def test_the_suffix_says_what_a_file_is(tmp_path: Path) -> None:
-    """The same motion from BVH and GLB, in upper case too."""
+    """The same motion from BVH, GLB and VRM animation, in upper case too."""
     motion, own = random_motion(), skeleton()
     local, root = as_local(motion, own), pelvis_path(BODY, motion)
     files = [write_bvh(tmp_path / "x.BVH", own, local, root), glb_of(own, Clip(local, root)).write(tmp_path / "x.glb")]
@@ -40,6 +52,11 @@ def test_the_suffix_says_what_a_file_is(tmp_path: Path) -> None:
         matrices(halved), matrices(motion).reshape(4, 55, 3, 3)[::2].reshape(-1, 3, 3), atol=1e-5
     )
     assert len(read_motion(files[1], BODY, fps=60.0, clip="Walk")) == 7
+    bones = skeleton(tuple(VRM))
+    waving = vrma_of(bones, Clip(as_local(motion, bones), root, bind_matrices=False)).write(tmp_path / "x.vrma")
+    found = read_motion(waving, BODY, fps=60.0, clip="Walk")
+    rows = [i for i, name in enumerate(JOINT_NAMES) if name in VRM]
+    np.testing.assert_allclose(found.poses[::2, rows].numpy(), motion.poses[:, rows].numpy(), atol=1e-5)
 
 
 def test_the_body_that_comes_with_dyngs_is_the_default(tmp_path: Path) -> None:
