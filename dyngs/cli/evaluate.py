@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from dyngs.evaluate.report import evaluate_run, report_path
 
-    if arguments.refine:
+    if arguments.refine and arguments.split != "train":
         print("refining poses on the tested pictures, beside the scores as given: this takes a while", file=sys.stderr)
     report = evaluate_run(
         arguments.run_dir,
