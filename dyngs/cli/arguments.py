@@ -7,8 +7,12 @@ import math
 import re
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dyngs.errors import DyngsError
+
+if TYPE_CHECKING:
+    from dyngs.config import DataConfig
 
 MAX_THREADS = 1024
 
@@ -78,3 +82,15 @@ def print_notes(notes: tuple[str, ...], warnings: tuple[str, ...] = ()) -> None:
         print(f"note: {note}")
     for warning in warnings:
         print(f"dyngs: warning: {warning}", file=sys.stderr)
+
+
+def data_section(overrides: list[str], capture_format: str = "auto") -> DataConfig:
+    """Return the data section with overrides ``data.key=value``; its root has no meaning."""
+    from dyngs.config.io import load_config
+
+    other = [
+        word for word in overrides if not word.startswith("data.") or word.startswith(("data.root=", "data.format="))
+    ]
+    if other:
+        raise DyngsError(f"{other[0]!r}: give keys of data here, such as data.follow_links=true")
+    return load_config(None, ["data.root=.", f"data.format={capture_format}", *overrides]).data

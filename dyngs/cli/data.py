@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import threads
+from dyngs.cli import data_fit
+from dyngs.cli.arguments import data_section, threads
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import DyngsError
 
@@ -26,7 +27,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     verbs = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_inspect(verbs)
     _add_sfm(verbs)
-    _add_fit(verbs)
+    data_fit.add_parser(verbs)
     _add_motion(verbs)
     _add_synth(verbs)
 
@@ -85,19 +86,6 @@ def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
     parser.set_defaults(run=run_sfm)
 
 
-def _add_fit(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = verbs.add_parser(
-        "fit",
-        help="fit the free body template to pictures of a person",
-        description="Fit the free body template to the silhouettes of a person: one shape and skeleton, and the pose "
-        "of every frame. OUT is a capture for `dyngs train human`.",
-    )
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder of a capture with silhouettes")
-    parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
-    parser.add_argument("overrides", nargs="*", default=[], metavar="data.key=value", help="keys of data")
-    parser.set_defaults(run=run_fit)
-
-
 def _add_motion(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "motion",
@@ -143,7 +131,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
     if is_videos(arguments.path):
         return _inspect_videos(arguments)
-    options = _data_section(arguments.overrides, arguments.format).model_copy(update={"root": arguments.path})
+    options = data_section(arguments.overrides, arguments.format).model_copy(update={"root": arguments.path})
     report = inspect_capture(options, arguments.deep)
     if report.capture is None:
         for problem in report.problems[1:]:
@@ -165,21 +153,9 @@ def _inspect_videos(arguments: argparse.Namespace) -> int:
 
     if arguments.picture is not None:
         raise DyngsError(f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first")
-    with pictures_up_to(_data_section(arguments.overrides).max_megapixels):
+    with pictures_up_to(data_section(arguments.overrides).max_megapixels):
         print(video_report(arguments.path))
     return 0
-
-
-def _data_section(overrides: list[str], capture_format: str = "auto") -> DataConfig:
-    """Return the data section with overrides ``data.key=value``; its root has no meaning."""
-    from dyngs.config.io import load_config
-
-    other = [
-        word for word in overrides if not word.startswith("data.") or word.startswith(("data.root=", "data.format="))
-    ]
-    if other:
-        raise DyngsError(f"{other[0]!r}: give keys of data here, such as data.follow_links=true")
-    return load_config(None, ["data.root=.", f"data.format={capture_format}", *overrides]).data
 
 
 def run_sfm(arguments: argparse.Namespace) -> int:
@@ -187,7 +163,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     from dyngs.data.prepare.sfm import SfmOptions, estimate_poses
     from dyngs.data.prepare.unposed import is_several_videos
 
-    limits = _data_section(arguments.overrides)
+    limits = data_section(arguments.overrides)
     if is_several_videos(arguments.images):
         return _run_sfm_of_videos(arguments, limits)
     if arguments.start:
@@ -206,18 +182,6 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     print(result.summary())
     print(f"next: dyngs data inspect {result.root} --picture cameras.png")
     print(f"      dyngs train static data.root={result.root}")
-    return 0
-
-
-def run_fit(arguments: argparse.Namespace) -> int:
-    """Fit a body and print how good the fit is, and the next command."""
-    from dyngs.human.fit.fitted_capture import write_fitted_capture
-
-    options = _data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
-    with ProgressBar() as report:
-        result = write_fitted_capture(options, arguments.out, report)
-    print(result.summary())
-    print(f"next: dyngs train human data.root={result.root}")
     return 0
 
 

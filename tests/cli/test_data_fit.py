@@ -1,0 +1,50 @@
+"""``dyngs data fit``: what it prints, writes and refuses."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import pytest
+from tiny_captures import write_colmap
+
+from dyngs.cli import main
+from dyngs.human.fit import fitted_capture
+from dyngs.human.fit.capture_fit import FitEffort, fit_capture
+from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+
+PrintedOutput = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(autouse=True)
+def _cheap(monkeypatch: pytest.MonkeyPatch) -> None:
+    effort = FitEffort(side=32, steps=1, visits=0)
+    monkeypatch.setattr(fitted_capture, "fit_capture", partial(fit_capture, effort=effort))
+
+
+def test_a_fitted_capture_says_how_good_it_is(tmp_path: Path, capsys: PrintedOutput) -> None:
+    options = HumanOptions(size=48, num_frames=2, num_new=0, num_cameras=5, num_test=1, samples=1)
+    root = write_human_capture(tmp_path / "person", options)
+    assert main(["data", "fit", str(root), str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert "2 frames; overlap of silhouettes (IoU) on 2 views left out of the fit" in printed
+    assert "taken: the poses as given" in printed, "they are exact"
+    assert f"next: dyngs train human data.root={tmp_path / 'out'}" in printed
+    report = json.loads((tmp_path / "out" / "fit_report.json").read_text())
+    assert report["taken"] == "the poses as given"
+    assert set(report["iou_per_frame"]) == {"0", "1"}
+
+
+def test_what_cannot_be_fitted_is_refused_in_one_line(tmp_path: Path, capsys: PrintedOutput) -> None:
+    write_colmap(tmp_path / "scene")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    for words, wanted in (
+        ([str(tmp_path / "nothing"), str(tmp_path / "out")], "no such folder"),
+        ([str(tmp_path / "scene"), str(tmp_path / "full")], "exists already"),
+        ([str(tmp_path / "scene"), str(tmp_path / "out")], "no silhouettes; add masks"),
+    ):
+        assert main(["data", "fit", *words]) == 2
+        error = capsys.readouterr().err.strip().splitlines()
+        assert len(error) == 1
+        assert wanted in error[0]
+    assert not (tmp_path / "out").exists()
