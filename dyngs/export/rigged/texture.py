@@ -24,9 +24,9 @@ from dyngs.ops.reference import harmonics_basis
 
 _NEAR = 20
 """Gaussians that are looked for at each height above a texel."""
-_HEIGHTS = (-0.04, -0.015, 0.005, 0.03, 0.06)
+_HEIGHTS = (-0.015, 0.005, 0.025, 0.05)
 """Heights, m, where they are looked for: below the skin, on it, in clothes and hair."""
-_REACH = (-0.06, 0.1)
+_REACH = (-0.04, 0.07)
 """Heights, m, between which Gaussians belong to a texel."""
 _FACING = 0.3
 """Least cosine between the normals of a texel and of a Gaussian that belongs to it: arms do not colour the trunk."""
