@@ -8,13 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress
-from dyngs.data.capture import BodyFrames, Capture, View
+from dyngs.data.capture import Capture, View
 from dyngs.data.fitted_body import numbered
 from dyngs.data.loader import PictureLoader
 from dyngs.errors import DyngsError
@@ -136,8 +135,11 @@ def fit_capture(
         raise DyngsError(f"{capture.root}: the pictures have no silhouettes; add masks of the person (docs/human.md)")
     views = numbered(capture.splits)["train"]
     given = capture.body is not None
-    bodies = capture.body["train"] if capture.body is not None else _placeholder(views)
-    motion = captured_motion(capture.root, bodies, views, body.joints)
+    motion = (
+        _unposed(views, body.joints)
+        if capture.body is None
+        else captured_motion(capture.root, capture.body["train"], views, body.joints)
+    )
     seen, surface = _look(capture, views, motion, options, effort.side), surface_of(body, RESOLUTION)
     if given:
         tried = _from_given(motion.clip, surface, seen, report, effort)
@@ -178,11 +180,17 @@ def split_views(views: Sequence[View], motion: CapturedMotion) -> tuple[dict[int
     return used, left_out
 
 
-def _placeholder(views: Sequence[View]) -> BodyFrames:
-    """Return body parameters that say nothing, for the frames of the views."""
-    frames = tuple(sorted({view.frame or 0 for view in views}))
-    zeros = np.zeros((len(frames), 3))
-    return BodyFrames(frames, np.zeros((len(frames), 55, 3)), zeros, np.zeros(0), np.ones(len(frames)))
+def _unposed(views: Sequence[View], joints: Tensor) -> CapturedMotion:
+    """Return a clip of the views' frames that says nothing about poses, for a body with ``joints`` (J, 3)."""
+    times = {-1 if view.frame is None else view.frame: view.time for view in views}
+    frames = tuple(sorted(times))
+    last = max(len(frames) - 1, 1)
+    moments = [row / last if times[frame] is None else times[frame] for row, frame in enumerate(frames)]
+    zeros = joints.new_zeros(len(frames), len(joints), 3)
+    clip = MotionClip(
+        torch.tensor(moments, dtype=torch.float64, device="cpu"), zeros, zeros[:, 0], torch.ones_like(zeros[:, 0, 0])
+    )
+    return CapturedMotion(clip, frames)
 
 
 def _look(capture: Capture, views: Sequence[View], motion: CapturedMotion, options: DataConfig, largest: int) -> _Seen:

@@ -12,7 +12,9 @@ from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
+from dyngs.human.fit import start
 from dyngs.human.fit.capture_fit import CaptureFit, FitEffort, fit_capture, simplest_of_the_best, split_views
+from dyngs.human.fit.clips import fitted_clips
 from dyngs.human.motion.captured import captured_motion
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
@@ -96,6 +98,22 @@ def test_one_view_of_each_frame_is_left_out(wrong: tuple[Capture, Capture]) -> N
     few, none = split_views(views[:4], motion)
     assert not any(none.values())
     assert few[0] == [0, 1, 2, 3]
+
+
+def test_without_given_poses_every_frame_has_its_own(
+    wrong: tuple[Capture, Capture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(start, "STEPS", 1)
+    monkeypatch.setattr(start, "ARMS", ())
+    capture, effort = wrong[1].replace(body=None), FitEffort(side=32, steps=1, visits=0)
+    fit = fit_capture(capture, DataConfig(root=capture.root), default_template(), lambda *_: None, effort)
+    assert fit.from_silhouettes
+    assert fit.motion.frames == (0, 1, 2, 3)
+    poses = fit.fit.fitted(fit.motion.clip).poses
+    assert len({tuple(pose.flatten().tolist()) for pose in poses}) == 4
+    clips = fitted_clips(capture, default_template(), fit)
+    assert clips["train"].frames == (0, 1, 2, 3)
+    assert torch.equal(clips["train"].clip.poses, poses)
 
 
 def test_pictures_without_silhouettes_are_refused(wrong: tuple[Capture, Capture]) -> None:
