@@ -19,6 +19,9 @@ def add_parser(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     )
     parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder of a capture with silhouettes")
     parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
+    parser.add_argument(
+        "--keypoints", type=Path, metavar="PATH", help="key points: a folder of OpenPose files, or a COCO file"
+    )
     parser.add_argument("overrides", nargs="*", default=[], metavar="data.key=value", help="keys of data")
     parser.set_defaults(run=run_fit)
 
@@ -29,7 +32,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
 
     options = data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
     with ProgressBar() as report:
-        result = write_fitted_capture(options, arguments.out, report)
+        result = write_fitted_capture(options, arguments.out, report, arguments.keypoints)
     print(result.summary())
     print(f"next: dyngs train human data.root={result.root}")
     return 0

@@ -14,6 +14,8 @@ from dyngs.errors import DyngsError, reading
 from dyngs.files.cache import cache_folder
 from dyngs.human.fit.fitted_capture import write_fit
 
+KEYPOINTS = "keypoints"
+"""Folder of a capture with key points of its pictures, as OpenPose writes them."""
 _LARGEST = 100_000_000
 """Files of a capture larger than this many bytes, such as videos, are not what it says about bodies and cameras."""
 
@@ -51,7 +53,8 @@ def with_fitted_body(
         say(f"body:    the fit of before, in {folder}")
     else:
         say(f"body:    fitted to the silhouettes first, as by `dyngs data fit`, into {folder} (model.fit=false: not)")
-        say(write_fit(data, folder, report).summary())
+        points = data.root / KEYPOINTS
+        say(write_fit(data, folder, report, points if points.is_dir() else None).summary())
     return data.model_copy(update={"body": folder})
 
 

@@ -15,6 +15,7 @@ from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress
 from dyngs.data.capture import Capture, View
 from dyngs.data.fitted_body import numbered
+from dyngs.data.keypoints import Keypoints
 from dyngs.data.loader import PictureLoader
 from dyngs.errors import DyngsError
 from dyngs.human.fit.observed import ObservedFrame, longest_box_side, observed_frame
@@ -114,7 +115,12 @@ class _Seen:
 
 
 def fit_capture(
-    capture: Capture, options: DataConfig, body: BodyTemplate, report: ReportProgress, effort: FitEffort = FitEffort()
+    capture: Capture,
+    options: DataConfig,
+    body: BodyTemplate,
+    report: ReportProgress,
+    keypoints: Keypoints | None = None,
+    effort: FitEffort = FitEffort(),
 ) -> CaptureFit:
     """Return the fit of ``body`` to the silhouettes of a capture's training views.
 
@@ -126,6 +132,7 @@ def fit_capture(
         options: how its pictures are read.
         body: with a shape space.
         report: of progress.
+        keypoints: of the training views, see ``dyngs.data.keypoints``; None without.
         effort: how much it may cost.
 
     Raises:
@@ -133,14 +140,15 @@ def fit_capture(
     """
     if not capture.has_alpha:
         raise DyngsError(f"{capture.root}: the pictures have no silhouettes; add masks of the person (docs/human.md)")
-    views = numbered(capture.splits)["train"]
+    capture = capture.replace(splits=numbered(capture.splits))
+    views = capture.splits["train"]
     given = capture.body is not None
     motion = (
         _unposed(views, body.joints)
         if capture.body is None
         else captured_motion(capture.root, capture.body["train"], views, body.joints)
     )
-    seen, surface = _look(capture, views, motion, options, effort.side), surface_of(body, RESOLUTION)
+    seen, surface = _look(capture, motion, options, effort, keypoints or {}), surface_of(body, RESOLUTION)
     if given:
         tried = _from_given(motion.clip, surface, seen, report, effort)
     else:
@@ -193,25 +201,41 @@ def _unposed(views: Sequence[View], joints: Tensor) -> CapturedMotion:
     return CapturedMotion(clip, frames)
 
 
-def _look(capture: Capture, views: Sequence[View], motion: CapturedMotion, options: DataConfig, largest: int) -> _Seen:
+def _look(
+    capture: Capture, motion: CapturedMotion, options: DataConfig, effort: FitEffort, keypoints: Keypoints
+) -> _Seen:
     """Return the squares around the person in all frames.
 
     Raises:
         DyngsError: nobody is seen.
     """
+    views = capture.splits["train"]
     pictures = PictureLoader(views, options.model_copy(update={"longest_side": PICTURE_SIDE, "downscale": 1}))
     used, left_out = split_views(views, motion)
     shown = [i for rows in (used, left_out) for own in rows.values() for i in own]
     side = longest_box_side(pictures[i] for i in shown)
     if side < 8:
         raise DyngsError(f"{capture.root}: nobody is seen in the silhouettes; check the masks (docs/human.md)")
-    size = min(largest, 2 * (side // 2))
+    size = min(effort.side, 2 * (side // 2))
+    marked = _marked(views, pictures, shown, keypoints)
 
     def frames(rows: dict[int, list[int]]) -> dict[int, ObservedFrame | None]:
-        return {row: observed_frame([pictures[i] for i in own], side, size) for row, own in rows.items()}
+        return {row: observed_frame([pictures[i] for i in own], side, size, marked) for row, own in rows.items()}
 
     held_out, seen = sum(map(len, left_out.values())), frames(used)
     return _Seen(seen, frames(left_out) if held_out else seen, held_out)
+
+
+def _marked(views: Sequence[View], pictures: PictureLoader, shown: Sequence[int], points: Keypoints) -> Keypoints:
+    """Return the key points (55, 3) in the pixels of the pictures, of those of the stored pictures."""
+    found: Keypoints = {}
+    for i in shown if points else ():
+        view = views[i]
+        if view.name in points:
+            camera = pictures[i].cameras
+            scale = points[view.name].new_tensor([camera.width / view.width, camera.height / view.height, 1.0])
+            found[view.name] = points[view.name] * scale
+    return found
 
 
 def _from_given(

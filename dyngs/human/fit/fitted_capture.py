@@ -17,6 +17,7 @@ from dyngs.conventions import ReportProgress
 from dyngs.data.capture import Capture, Split
 from dyngs.data.fitted_body import numbered
 from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.keypoints import read_keypoints
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import require_new_folder
@@ -56,28 +57,34 @@ class FittedCapture:
         )
 
 
-def write_fitted_capture(options: DataConfig, out: Path, report: ReportProgress) -> FittedCapture:
+def write_fitted_capture(
+    options: DataConfig, out: Path, report: ReportProgress, keypoints: Path | None = None
+) -> FittedCapture:
     """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
 
     Files: ``transforms_SPLIT.json``, ``images/``, ``body_train.npz``, ``body_pose.npz`` for another clip whose poses
-    were given by the same means, ``fit_report.json``, and ``fit_overlays.png`` to look at.
+    were given by the same means, ``fit_report.json``, and ``fit_overlays.png`` to look at. ``keypoints`` names a folder
+    or file of key points, see ``read_keypoints``.
 
     Raises:
         DyngsError: see ``fit_capture``; ``out`` is not empty.
     """
-    return _fitted(options, out, report, with_pictures=True)
+    return _fitted(options, out, report, keypoints, with_pictures=True)
 
 
-def write_fit(options: DataConfig, out: Path, report: ReportProgress) -> FittedCapture:
+def write_fit(options: DataConfig, out: Path, report: ReportProgress, keypoints: Path | None = None) -> FittedCapture:
     """As ``write_fitted_capture``, but without pictures and cameras: for ``data.body``."""
-    return _fitted(options, out, report, with_pictures=False)
+    return _fitted(options, out, report, keypoints, with_pictures=False)
 
 
-def _fitted(options: DataConfig, out: Path, report: ReportProgress, *, with_pictures: bool) -> FittedCapture:
+def _fitted(
+    options: DataConfig, out: Path, report: ReportProgress, keypoints: Path | None, *, with_pictures: bool
+) -> FittedCapture:
     require_new_folder(out)
     capture, body = read_capture(options), default_template()
     capture = capture.replace(splits=numbered(capture.splits))
-    found = fit_capture(capture, options, body, report)
+    points = {} if keypoints is None else read_keypoints(keypoints, capture.splits["train"])
+    found = fit_capture(capture, options, body, report, points)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
         clips = fitted_clips(capture, body, found)

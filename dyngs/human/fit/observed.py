@@ -5,13 +5,14 @@ Local letters: F frames, V views of one frame, S side of a square in pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.data.keypoints import NUM_JOINTS
 from dyngs.data.loader import Picture
 from dyngs.data.pictures.images import area_downscale
 
@@ -27,11 +28,14 @@ class ObservedFrame:
         cameras: V, of squares of S px.
         alpha: (V, S, S) float32 in [0, 1]: coverage by the person.
         known: (V, S, S) float32, 1 inside the picture that the square was cut out of and where its mask counts, else 0.
+        joints: (V, 55, 3) column and row in the square, as shares of its side, and confidence of joints that were
+            marked as key points; None without any.
     """
 
     cameras: Cameras
     alpha: Tensor
     known: Tensor
+    joints: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.alpha)
@@ -41,7 +45,8 @@ class ObservedFrame:
         size = self.cameras.width // factor
         scale = self.cameras.intrinsics.new_tensor([1 / factor, 1 / factor, 1.0])
         cameras = Cameras(self.cameras.cam_from_world, scale[:, None] * self.cameras.intrinsics, size, size)
-        return ObservedFrame(cameras, _resized(self.alpha, size), (_resized(self.known, size) > 0.999).float())
+        known = (_resized(self.known, size) > 0.999).float()
+        return ObservedFrame(cameras, _resized(self.alpha, size), known, self.joints)
 
 
 def longest_box_side(pictures: Iterable[Picture]) -> int:
@@ -53,24 +58,29 @@ def longest_box_side(pictures: Iterable[Picture]) -> int:
     return longest
 
 
-def observed_frame(pictures: Sequence[Picture], box_side: int, size: int) -> ObservedFrame | None:
+def observed_frame(
+    pictures: Sequence[Picture], box_side: int, size: int, marked: Mapping[str, Tensor] | None = None
+) -> ObservedFrame | None:
     """Return the squares around the person in the pictures of one frame; None if no picture shows anybody.
 
     Args:
         pictures: with alpha.
         box_side: ``longest_box_side`` of all pictures of the capture, so that all squares show the same scale.
         size: S.
+        marked: name of a picture to key points (55, 3) in its pixels, see ``dyngs.data.keypoints``; None without.
     """
     side = max(round(_MARGIN * box_side), 1)
-    squares = [square for picture in pictures if (square := _square(picture, side, size)) is not None]
+    squares = [square for picture in pictures if (square := _square(picture, side, size, marked or {})) is not None]
     if not squares:
         return None
-    poses, intrinsics, alphas, known = (torch.cat(parts) for parts in zip(*squares, strict=True))
-    return ObservedFrame(Cameras(poses, intrinsics, size, size), alphas, known)
+    poses, intrinsics, alphas, known, joints = (torch.cat(parts) for parts in zip(*squares, strict=True))
+    return ObservedFrame(Cameras(poses, intrinsics, size, size), alphas, known, joints if marked else None)
 
 
-def _square(picture: Picture, side: int, size: int) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
-    """Return pose (1, 4, 4), intrinsics (1, 3, 3), alpha and known (1, S, S) of the square around the person."""
+def _square(
+    picture: Picture, side: int, size: int, marked: Mapping[str, Tensor]
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor] | None:
+    """Return pose (1, 4, 4), intrinsics (1, 3, 3), alpha and known (1, S, S) and joints (1, 55, 3) of the square."""
     box = _box(picture)
     if box is None or picture.alpha is None:
         return None
@@ -80,7 +90,9 @@ def _square(picture: Picture, side: int, size: int) -> tuple[Tensor, Tensor, Ten
     scale = picture.cameras.intrinsics.new_tensor([size / side, size / side, 1.0])
     cut = [_resized(_cut(x, top, left, side)[None], size) for x in (picture.alpha, weights)]
     intrinsics = scale[:, None] * (picture.cameras.intrinsics - shift)
-    return picture.cameras.cam_from_world, intrinsics, cut[0], (cut[1] > 0.999).float()
+    joints = marked.get(picture.name, torch.zeros(NUM_JOINTS, 3, device="cpu")).clone()
+    joints[:, :2] = (joints[:, :2] - joints.new_tensor([left, top])) / side
+    return picture.cameras.cam_from_world, intrinsics, cut[0], (cut[1] > 0.999).float(), joints[None]
 
 
 def _cut(values: Tensor, top: int, left: int, side: int) -> Tensor:

@@ -29,13 +29,15 @@ LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e
 }
 """Learning rates at the first step; those of places per metre of the person's unit."""
 LR_DECAY = 0.1
-BETAS_WEIGHT = BONES_WEIGHT = 1e-2
+BETAS_WEIGHT = BONES_WEIGHT = 1e-3
 """Of the mean squared shape parameter, whose unit is the spread among adults."""
 TURN, STEP = 0.25, 0.1
 """Rotations, rad, that cost as much as one unit of shape: of all frames, and from one frame to the next."""
 TURN_WEIGHT, POSE_WEIGHT, STEP_WEIGHT = 3e-2, 1e-3, 1e-3
 """Of their mean squares. What silhouettes do not show, such as a limb turned about itself, follows the noise of Adam's
 steps where these are much smaller: renders of new poses then lose 1 to 3 dB, while the silhouettes look as good."""
+KEYPOINT, KEYPOINT_WEIGHT = 0.02, 0.1
+"""Expected error of a key point, as a share of the square's side, and the weight of their robust mean."""
 PADDING, PADDING_WEIGHT = 0.01, 2e-3
 """Metres between skin and silhouette that cost as much as one unit of shape, and the weight of their mean square."""
 
@@ -106,6 +108,20 @@ def silhouette_error(drawn: Tensor, seen: ObservedFrame) -> Tensor:
     return (wrong / (seen.alpha * seen.known).sum((1, 2)).clamp_min(1.0)).mean()
 
 
+def keypoint_error(joints: Tensor, marked: Tensor, cameras: Cameras) -> Tensor:
+    """Return the mean robust distance of joints (J, 3) in the world from key points (V, 55, 3), see ``ObservedFrame``.
+
+    sqrt(1 + (d / ``KEYPOINT``)^2) - 1, weighted by the confidences: large errors count linearly.
+    """
+    count = min(len(joints), marked.shape[1])
+    local = joints[:count] @ cameras.cam_from_world[:, :3, :3].mT + cameras.cam_from_world[:, None, :3, 3]
+    pixels = local @ cameras.intrinsics.mT
+    places = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-3) / cameras.width
+    away = (places - marked[:, :count, :2]).square().sum(-1) / KEYPOINT**2
+    weights = marked[:, :count, 2]
+    return (weights * ((1 + away).sqrt() - 1)).sum() / weights.sum().clamp_min(1.0)
+
+
 def prior(learned: Parameters, expected: PosePrior) -> Tensor:
     """Return the penalty of shapes, turns and poses that are far from those given, or that jump."""
     body, bones = learned["betas"].square().tensor_split([-NUM_BONE_SHAPES])
@@ -150,6 +166,9 @@ def run_stage(
             if seen is not None:
                 drawn = drawn_frame(learned, clip, surface, row, seen.cameras)
                 loss = loss + silhouette_error(drawn, seen) / len(rows)
+                if seen.joints is not None:
+                    places = posed_joints(learned, clip, surface, row)
+                    loss = loss + KEYPOINT_WEIGHT * keypoint_error(places, seen.joints, seen.cameras) / len(rows)
         loss.backward()
         _forget_others(learned, stage.learned)
         learned.step(step, step / stage.steps)

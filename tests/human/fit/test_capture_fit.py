@@ -37,7 +37,7 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Capture]:
 def found(capture_root: Path) -> CaptureFit:
     capture = read_capture(DataConfig(root=capture_root))
     effort = FitEffort(side=64, steps=30, visits=18)
-    return fit_capture(capture, DataConfig(root=capture_root), default_template(), lambda *_: None, effort)
+    return fit_capture(capture, DataConfig(root=capture_root), default_template(), lambda *_: None, effort=effort)
 
 
 def joints_of(capture: Capture, fit: CaptureFit | None) -> torch.Tensor:
@@ -72,7 +72,9 @@ def test_the_fit_is_judged_on_views_that_it_did_not_see(wrong: tuple[Capture, Ca
 def test_the_same_capture_gives_the_same_fit(wrong: tuple[Capture, Capture]) -> None:
     options, effort = DataConfig(root=wrong[1].root), FitEffort(side=32, steps=2, visits=0)
     body = default_template()
-    first, again = (fit_capture(wrong[1], options, body, lambda *_: None, effort).chosen.learned for _ in range(2))
+    first, again = (
+        fit_capture(wrong[1], options, body, lambda *_: None, effort=effort).chosen.learned for _ in range(2)
+    )
     assert torch.equal(first["betas"], again["betas"])
     assert torch.equal(first["trans"], again["trans"])
 
@@ -106,7 +108,7 @@ def test_without_given_poses_every_frame_has_its_own(
     monkeypatch.setattr(start, "STEPS", 1)
     monkeypatch.setattr(start, "ARMS", ())
     capture, effort = wrong[1].replace(body=None), FitEffort(side=32, steps=1, visits=0)
-    fit = fit_capture(capture, DataConfig(root=capture.root), default_template(), lambda *_: None, effort)
+    fit = fit_capture(capture, DataConfig(root=capture.root), default_template(), lambda *_: None, effort=effort)
     assert fit.from_silhouettes
     assert fit.motion.frames == (0, 1, 2, 3)
     poses = fit.fit.fitted(fit.motion.clip).poses

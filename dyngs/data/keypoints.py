@@ -1,0 +1,166 @@
+"""2D key points of a person in pictures, as detectors write them: OpenPose and COCO.
+
+Local letters: J joints of SMPL-X, K key points of a format, V views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.data.capture import View
+from dyngs.data.pictures.lens import undistorted_points
+from dyngs.errors import DyngsError, reading
+from dyngs.files.fields import numbers_of
+from dyngs.files.json_files import read_json_object
+
+NUM_JOINTS = 55
+JOINTS = {
+    "left_eye": 23,
+    "right_eye": 24,
+    "left_shoulder": 16,
+    "right_shoulder": 17,
+    "left_elbow": 18,
+    "right_elbow": 19,
+    "left_wrist": 20,
+    "right_wrist": 21,
+    "left_hip": 1,
+    "right_hip": 2,
+    "left_knee": 4,
+    "right_knee": 5,
+    "left_ankle": 7,
+    "right_ankle": 8,
+}
+"""Joints of SMPL-X that detectors mark. Nose and ears are no joints; necks and toes are marked elsewhere."""
+_COCO = (
+    *("nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder", "left_elbow"),
+    *("right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle"),
+    "right_ankle",
+)
+_BODY_25 = (
+    *("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist"),
+    *("pelvis", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle", "right_eye"),
+    "left_eye",
+)
+_COCO_18 = (
+    *("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist"),
+    *("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle", "right_eye", "left_eye"),
+)
+_ORDERS = {17: _COCO, 133: _COCO, 25: _BODY_25, 18: _COCO_18}
+"""Number of key points of a format to the names of the first ones, as published."""
+
+Keypoints = dict[str, Tensor]
+"""Name of a view to (55, 3): column, row and confidence of joints in its stored picture, undistorted; confidence 0
+where a joint is not marked."""
+
+
+def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
+    """Return the key points of the views: of a folder of OpenPose files, or of one COCO file.
+
+    OpenPose: ``NAME_keypoints.json`` or ``NAME.json``, NAME being the picture's name without suffix; ``people`` with
+    ``pose_keypoints_2d`` of 25 or 18 points. COCO: ``images`` (id, file_name) and
+    ``annotations`` (image_id, keypoints of 17 or 133 points). Of several people the most confident one is taken.
+
+    Raises:
+        DyngsError: a file that is neither, or no key points for any view.
+    """
+    stems = _by_stem(views)
+    rows = _openpose(path, stems) if path.is_dir() else _coco(path, stems)
+    if not rows:
+        raise DyngsError(
+            f"{path}: no key points for any picture of the capture; files of OpenPose are called "
+            "PICTURE_keypoints.json, and COCO's images have the pictures' names as file_name"
+        )
+    by_name = {view.name: view for view in views}
+    return {name: _placed(by_name[name], joints) for name, joints in rows.items()}
+
+
+def _by_stem(views: Sequence[View]) -> dict[str, str]:
+    """Return picture name without folder and suffix to name of the view, and with the folder, too."""
+    found: dict[str, str] = {}
+    twice: set[str] = set()
+    for view in views:
+        stem = PurePosixPath(view.image_path.name).stem
+        twice |= {stem} if stem in found else set()
+        found[stem] = view.name
+        found[view.name] = view.name
+    return {stem: name for stem, name in found.items() if stem not in twice}
+
+
+def _openpose(folder: Path, stems: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Return view name to (K, 3) points of a folder of OpenPose files."""
+    with reading(folder):
+        files = sorted(folder.rglob("*.json"))
+    found: dict[str, np.ndarray] = {}
+    for file in files:
+        stem = file.name.removesuffix(".json").removesuffix("_keypoints")
+        name = stems.get(str(file.relative_to(folder).with_name(stem)), stems.get(stem))
+        if name is None:
+            continue
+        people = read_json_object(file).get("people")
+        if not isinstance(people, list):
+            raise DyngsError(f"{file}: lacks the list 'people'; give files of OpenPose")
+        points = [
+            _points(file, "pose_keypoints_2d", person.get("pose_keypoints_2d"))
+            for person in people
+            if isinstance(person, dict)
+        ]
+        if points:
+            found[name] = max(points, key=_confidence)
+    return found
+
+
+def _coco(file: Path, stems: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Return view name to (K, 3) points of a COCO file."""
+    if not file.is_file():
+        raise DyngsError(f"{file}: no such file or folder of key points")
+    fields = read_json_object(file)
+    images, annotations = fields.get("images"), fields.get("annotations")
+    if not isinstance(images, list) or not isinstance(annotations, list):
+        raise DyngsError(f"{file}: lacks the lists 'images' and 'annotations' of COCO")
+    names: dict[object, str] = {}
+    for image in images:
+        path = PurePosixPath(str(image.get("file_name"))) if isinstance(image, dict) else PurePosixPath()
+        name = stems.get(str(path.with_suffix("")) if path.name else "", stems.get(path.stem))
+        if name is not None and isinstance(image, dict) and isinstance(image.get("id"), (int, str)):
+            names[image["id"]] = name
+    found: dict[str, np.ndarray] = {}
+    for person in annotations:
+        name = names.get(person.get("image_id")) if isinstance(person, dict) else None
+        if name is not None and person.get("keypoints"):
+            points = _points(file, "keypoints", person["keypoints"])
+            points[:, 2] = np.minimum(points[:, 2], 2) / (2 if points[:, 2].max() > 1 else 1)
+            found[name] = max((points, found.get(name, points)), key=_confidence)
+    return found
+
+
+def _points(file: Path, key: str, value: object) -> np.ndarray:
+    """Return (K, 3) numbers of a list of column, row, confidence.
+
+    Raises:
+        DyngsError: another number of points than a known format has.
+    """
+    points = numbers_of(f"{file}: '{key}'", value, None).reshape(-1)
+    if len(points) % 3 or len(points) // 3 not in _ORDERS:
+        known = ", ".join(map(str, sorted(_ORDERS)))
+        raise DyngsError(f"{file}: '{key}' holds {len(points) / 3:g} points of 3 numbers; known are {known}")
+    return points.reshape(-1, 3)
+
+
+def _confidence(points: np.ndarray) -> float:
+    return float(points[:17, 2].sum())
+
+
+def _placed(view: View, points: np.ndarray) -> Tensor:
+    """Return the joints (55, 3) of the points of a format, undistorted."""
+    joints = torch.zeros(NUM_JOINTS, 3, dtype=torch.float64, device="cpu")
+    for row, name in enumerate(_ORDERS[len(points)]):
+        if name in JOINTS and points[row, 2] > 0:
+            joints[JOINTS[name]] = torch.from_numpy(points[row])
+    places = undistorted_points(view.lens, view.intrinsics, joints[:, :2])
+    confidence = joints[:, 2:] * torch.isfinite(places).all(1, keepdim=True)
+    return torch.cat([torch.nan_to_num(places), confidence.clamp(0, 1)], dim=1).float()

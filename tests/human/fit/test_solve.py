@@ -1,0 +1,107 @@
+"""Errors and stages of the fit: known values, and key points that lead a pose."""
+
+import math
+
+import pytest
+import torch
+
+from dyngs.camera import Cameras
+from dyngs.human.fit.observed import ObservedFrame
+from dyngs.human.fit.pose_prior import near_given
+from dyngs.human.fit.solve import (
+    KEYPOINT,
+    Stage,
+    drawn_frame,
+    keypoint_error,
+    new_fit,
+    posed_joints,
+    run_stage,
+    silhouette_error,
+    spread_order,
+)
+from dyngs.human.fit.surface import Surface, surface_of
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.template.load import default_template
+
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def surface() -> Surface:
+    return surface_of(default_template(), 24)
+
+
+def camera() -> Cameras:
+    """In front of a person at the origin, y up."""
+    pose = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    pose[2, 3] = 4.0
+    intrinsics = torch.tensor([[1.6 * SIZE, 0, SIZE / 2], [0, 1.6 * SIZE, SIZE / 2], [0, 0, 1]])
+    return Cameras(pose[None], intrinsics[None], SIZE, SIZE)
+
+
+def clip(elbow: float = 0.0) -> MotionClip:
+    """The rest pose, with the left elbow bent."""
+    poses = torch.zeros(1, 55, 3)
+    poses[0, JOINT_NAMES.index("left_elbow"), 2] = elbow
+    return MotionClip(torch.zeros(1, dtype=torch.float64), poses, torch.zeros(1, 3), torch.ones(1))
+
+
+def test_key_points_in_place_cost_nothing_and_others_their_distance() -> None:
+    joints = torch.tensor([[0.0, 0.0, 0.0], [0.5, 1.0, 0.0]])
+    places = torch.tensor([[0.5, 0.5, 1.0], [0.5 + 1.6 * 0.125, 0.5 - 1.6 * 0.25, 1.0]])[None]
+    assert float(keypoint_error(joints, places, camera())) == pytest.approx(0, abs=1e-6)
+    moved = places.clone()
+    moved[0, 0, 0] += 3 * KEYPOINT
+    assert float(keypoint_error(joints, moved, camera())) == pytest.approx((math.sqrt(10) - 1) / 2, rel=1e-4)
+    moved[0, 0, 2] = 0
+    assert float(keypoint_error(joints, moved, camera())) == pytest.approx(0, abs=1e-6)
+
+
+def test_silhouettes_count_where_they_are_known() -> None:
+    seen = ObservedFrame(camera(), torch.ones(1, SIZE, SIZE), torch.ones(1, SIZE, SIZE))
+    assert float(silhouette_error(torch.zeros(1, SIZE, SIZE), seen)) == 1
+    half = torch.ones(1, SIZE, SIZE)
+    half[:, : SIZE // 2] = 0
+    drawn = torch.zeros(1, SIZE, SIZE)
+    drawn[:, SIZE // 2 :] = 1
+    assert float(silhouette_error(drawn, ObservedFrame(camera(), seen.alpha, half))) == 0
+
+
+def test_key_points_lead_an_arm_where_silhouettes_do_not(surface: Surface) -> None:
+    """The given arm is bent by 2 rad; the picture shows it straight."""
+    given, straight, view = clip(2.0), clip(), camera()
+    with torch.no_grad():
+        truth = posed_joints(new_fit(straight, surface), straight, surface, 0)
+        alpha = drawn_frame(new_fit(straight, surface), straight, surface, 0, view)
+    marked = torch.zeros(1, 55, 3)
+    wrist = JOINT_NAMES.index("left_wrist")
+    for name in ("left_shoulder", "left_elbow", "left_wrist"):
+        row = JOINT_NAMES.index(name)
+        marked[0, row] = torch.tensor([0.5 + 1.6 * truth[row, 0] / 4, 0.5 - 1.6 * truth[row, 1] / 4, 1.0])
+    errors = []
+    for joints in (None, marked):
+        seen = ObservedFrame(view, alpha, torch.ones_like(alpha), joints)
+        stage = Stage(120, 1, ("poses",))
+        found = run_stage(new_fit(given, surface), stage, given, surface, lambda _, seen=seen: seen, near_given(given))
+        errors.append(float((posed_joints(found, given, surface, 0) - truth)[wrist].detach().norm()))
+    assert errors[1] < 0.2, "the prior of given poses still pulls"
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_frames_are_taken_from_all_over_the_clip() -> None:
+    for count in (1, 2, 7, 20, 33):
+        order = spread_order(count)
+        assert sorted(order) == list(range(count))
+    assert max(spread_order(20)[:4]) - min(spread_order(20)[:4]) > 9
+
+
+def test_only_what_a_stage_names_is_learned(surface: Surface) -> None:
+    given, view = clip(), camera()
+    alpha = torch.ones(1, SIZE, SIZE)
+    seen = ObservedFrame(view, alpha, alpha)
+    found = run_stage(
+        new_fit(given, surface), Stage(2, 1, ("betas",)), given, surface, lambda _: seen, near_given(given)
+    )
+    changed = {name for name, value in found.values().items() if value.any()}
+    assert changed == {"betas"}
