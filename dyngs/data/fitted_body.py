@@ -24,8 +24,9 @@ def read_body_file(path: Path) -> BodyFrames:
         DyngsError: names the file and what is wrong.
     """
     found = read_npz(path, ("poses", "trans", "betas"), ("scale", "surface_model_type", "frames"))
-    numbers = found.get("frames", np.arange(len(found["poses"]) if found["poses"].ndim else 0))
-    if numbers.ndim != 1 or numbers.dtype.kind not in "iu" or len(numbers) != len(np.atleast_1d(found["poses"])):
+    count = len(found["poses"]) if found["poses"].ndim else 0
+    numbers = found.get("frames", np.arange(count))
+    if numbers.ndim != 1 or numbers.dtype.kind not in "iu" or len(numbers) != count:
         raise DyngsError(f"{path}: 'frames' must hold one whole number for each row of 'poses'; export it again")
     frames = [int(number) for number in numbers]
     body = body_frames(path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0))
