@@ -303,7 +303,7 @@ _TURNING = (
 
 
 def _parallax_seen(task: FeatureTask, is_video: bool) -> tuple[str, ...]:
-    """Return a line where the camera hardly moved, none where it moved enough.
+    """Return a line where the camera hardly moved, or where matches may be of something that moves; else none.
 
     Raises:
         DyngsError: it only turned. Mapping would not notice: it finds a lens and points that fit.
@@ -311,6 +311,11 @@ def _parallax_seen(task: FeatureTask, is_video: bool) -> tuple[str, ...]:
     found = parallax_of(matched_pairs(task.database), task.side)
     if found.kind is Parallax.NONE:
         raise DyngsError(_TURNING)
+    if found.may_follow_a_mover:
+        return (
+            f"matches cover only {found.covered:.0%} of where the pictures have features: they may be of something "
+            "that moves, which the poses then follow; give masks of it (--masks), or film more of what stands",
+        )
     if found.kind is Parallax.ENOUGH:
         return ()
     return (

@@ -38,10 +38,20 @@ class SeenParallax:
     Attributes:
         share: of the longest side of a picture.
         kind: what that says about the camera.
+        covered: median over pairs of the share of a picture, as far as it has features, in which some match.
     """
 
     share: float
     kind: Parallax
+    covered: float = 1.0
+
+    @property
+    def may_follow_a_mover(self) -> bool:
+        """Whether so little of the pictures matches that it may be a thing that moves.
+
+        Hand-held clips and photos at hand have 62 to 94 %, one with a mover over a third of each frame 35 %.
+        """
+        return self.covered < _COVERED
 
 
 @dataclass(frozen=True)
@@ -78,12 +88,13 @@ def parallax_of(pairs: list[MatchedPair], longest_side: int) -> SeenParallax:
     low, high = _FOCALS[max(best - 1, 0)], _FOCALS[min(best + 1, len(_FOCALS) - 1)]
     fine = np.array([_left_of(pairs, focal) for focal in np.linspace(low, high, _FINE)])
     share = float(np.percentile(fine[fine.mean(1).argmin()], _WIDEST))
-    if np.median([pair.covered for pair in pairs]) < _COVERED:
-        return SeenParallax(share, Parallax.ENOUGH)
+    covered = float(np.median([pair.covered for pair in pairs]))
+    if covered < _COVERED:
+        return SeenParallax(share, Parallax.ENOUGH, covered)
     if share < max(_NONE, _NONE_PX / longest_side):
-        return SeenParallax(share, Parallax.NONE)
+        return SeenParallax(share, Parallax.NONE, covered)
     small = share < max(_SMALL, _SMALL_PX / longest_side)
-    return SeenParallax(share, Parallax.SMALL if small else Parallax.ENOUGH)
+    return SeenParallax(share, Parallax.SMALL if small else Parallax.ENOUGH, covered)
 
 
 def matched_pairs(database: Path) -> list[MatchedPair]:

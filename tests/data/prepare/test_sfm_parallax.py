@@ -48,6 +48,14 @@ def test_matches_of_a_small_part_of_the_pictures_refuse_nothing() -> None:
     assert parallax_of(part, SIDE).kind is Parallax.ENOUGH, "they may be those of a thing that moves"
 
 
+def test_matches_of_a_small_part_of_the_pictures_may_be_of_a_mover() -> None:
+    for covered, wanted in ((0.35, True), (0.62, False)):
+        found = parallax_of([replace(pair, covered=covered) for pair in _pairs(8.0, 0.1)], 1000)
+        assert found.covered == covered
+        assert found.may_follow_a_mover is wanted
+    assert not parallax_of([], 1000).may_follow_a_mover
+
+
 def test_coarse_pictures_have_more_noise_and_no_pairs_say_nothing() -> None:
     noisy = _pairs(8.0, 0.0, noise_px=0.4)
     assert parallax_of(noisy, SIDE // 2).kind is Parallax.NONE
