@@ -308,8 +308,6 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def shortened(command: Command) -> list[str]:
     """The command with less to do."""
     words, extra = list(command.words), SHORTER.get(command.verb, ())
-    if words[1:2] == ["human"] or words[1:2] == ["configs/human.yaml"]:
-        extra = (*extra, "model.fit=false")  # the body is fitted in tests/human/fit
     if "--resume" in words:
         words, extra = [re.sub(r"^train\.steps=\d+", "train.steps=6", word) for word in words], ("run.threads=1",)
     elif words[2:3] in (["room"], ["human"]):

@@ -111,15 +111,16 @@ def _with_poses(config: Config) -> Config:
 
 
 def _with_fitted_body(config: Config) -> Config:
-    """Return the configuration with the free template fitted to the person, unless ``model.fit`` is off."""
+    """Return the configuration with the free template fitted to the person, where asked for or needed."""
     from dyngs.config.kinds import person_of
     from dyngs.human.fit.before_training import with_fitted_body
 
     model = person_of(config)
-    if model is None or not model.fit or model.body is not None:
+    if model is None or model.body is not None:
         return config
     with ProgressBar() as report:
-        return config.model_copy(update={"data": with_fitted_body(config.data, report=report)})
+        data = with_fitted_body(config.data, only_if_needed=not model.fit, report=report)
+    return config.model_copy(update={"data": data})
 
 
 def _next(folder: Path, config: Config) -> str:

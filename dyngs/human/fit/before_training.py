@@ -21,7 +21,11 @@ _LARGEST = 100_000_000
 
 
 def with_fitted_body(
-    data: DataConfig, *, say: Callable[[str], None] = print, report: ReportProgress = report_nothing
+    data: DataConfig,
+    *,
+    only_if_needed: bool = False,
+    say: Callable[[str], None] = print,
+    report: ReportProgress = report_nothing,
 ) -> DataConfig:
     """Return the options with a fit of the free template to the capture; the same capture is fitted once.
 
@@ -29,6 +33,7 @@ def with_fitted_body(
 
     Args:
         data: its ``root`` is a capture of a person.
+        only_if_needed: fit nothing where the capture has body parameters.
         say: is told in a line what is done, and what came out.
         report: is told how far the fit has come.
 
@@ -38,7 +43,7 @@ def with_fitted_body(
     if data.body is not None:
         return data
     capture = read_capture(data)
-    if capture.body is not None and capture.body["train"].shape_space == "anny":
+    if capture.body is not None and (only_if_needed or capture.body["train"].shape_space == "anny"):
         return data
     if not capture.has_alpha:
         if capture.body is None:
@@ -52,7 +57,7 @@ def with_fitted_body(
     if folder.is_dir():
         say(f"body:    the fit of before, in {folder}")
     else:
-        say(f"body:    fitted to the silhouettes first, as by `dyngs data fit`, into {folder} (model.fit=false: not)")
+        say(f"body:    fitted to the silhouettes first, as by `dyngs data fit`, into {folder}")
         points = data.root / KEYPOINTS
         say(write_fit(data, folder, report, points if points.is_dir() else None).summary())
     return data.model_copy(update={"body": folder})

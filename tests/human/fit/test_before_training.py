@@ -49,6 +49,10 @@ def test_a_capture_is_fitted_once(data: DataConfig) -> None:
     assert "the fit of before" in said[-1]
 
 
+def test_given_poses_are_left_alone_unless_asked_for(data: DataConfig) -> None:
+    assert with_fitted_body(data, only_if_needed=True, say=pytest.fail) == data
+
+
 def test_what_is_a_fit_is_not_fitted_again(data: DataConfig, tmp_path: Path) -> None:
     out = write_fitted_capture(data, tmp_path / "fitted", lambda *_: None).root
     given = DataConfig(root=out)
