@@ -55,7 +55,8 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
             nothing outside it, whatever the order of the overrides.
 
     Returns:
-        the checked configuration; ``data.root`` is made absolute, so that later commands work from any folder.
+        the checked configuration; ``data.root`` and ``data.body`` are made absolute, so that later commands work from
+        any folder.
 
     Raises:
         DyngsError: naming the file and line or the override, the key, and what is allowed.
@@ -68,7 +69,9 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
         layers.add(leaves)
     layers.add_overrides(overrides)
     config = _validate(layers)
-    data = config.data.model_copy(update={"root": config.data.root.absolute()})
+    body = config.data.body
+    paths = {"root": config.data.root.absolute(), "body": None if body is None else body.absolute()}
+    data = config.data.model_copy(update=paths)
     return config.model_copy(update={"data": data})
 
 

@@ -6,10 +6,10 @@ the same render scores many dB more than inside the box.
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from dyngs.data.loader import Picture
+from dyngs.data.pictures.silhouettes import silhouette_box
 from dyngs.metrics import Lpips, psnr, ssim
 from dyngs.rendering import Rendering
 
@@ -40,8 +40,4 @@ def person_scores(picture: Picture, rendering: Rendering, background: Tensor, lp
 
 def person_box(picture: Picture) -> tuple[slice, slice] | None:
     """Return rows and columns of the smallest box around opaque pixels; None without alpha or where there are none."""
-    if picture.alpha is None or not bool((picture.alpha > 0).any()):
-        return None
-    shown = picture.alpha > 0
-    rows, columns = (torch.nonzero(shown.any(axis))[:, 0] for axis in (1, 0))
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+    return None if picture.alpha is None else silhouette_box(picture.alpha)

@@ -48,3 +48,9 @@ def test_what_cannot_be_fitted_is_refused_in_one_line(tmp_path: Path, capsys: Pr
         assert len(error) == 1
         assert wanted in error[0]
     assert not (tmp_path / "out").exists()
+
+
+def test_a_fit_of_another_template_is_refused(tmp_path: Path, capsys: PrintedOutput) -> None:
+    keys = [f"data.root={tmp_path}", "model.fit=true", "model.body=smplx.npz", f"run.dir={tmp_path / 'run'}"]
+    assert main(["train", "human", *keys]) == 2
+    assert "model.fit=true fits the free template only" in capsys.readouterr().err

@@ -339,3 +339,12 @@ def test_a_failed_save_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Mo
         save_config(config.model_copy(update={"train": TrainConfig(steps=1)}), path)
     assert path.read_bytes() == before
     assert [f.name for f in tmp_path.iterdir()] == ["config.yaml"]
+
+
+def test_folders_of_data_are_absolute_so_that_later_commands_find_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    data = load_config("human", ["data.root=capture", "data.body=fits/ann"]).data
+    assert (data.root, data.body) == (tmp_path / "capture", tmp_path / "fits" / "ann")
+    assert load_config("human", ["data.root=capture"]).data.body is None

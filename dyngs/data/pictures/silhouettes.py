@@ -45,3 +45,10 @@ def _read_alpha(silhouette: Silhouette) -> Tensor:
     if silhouette.person == "nonzero":
         return (levels > 0).to(torch.uint8) * 255
     return 255 - levels if silhouette.person == "black" else levels
+
+
+def silhouette_box(alpha: Tensor, above: float = 0.0) -> tuple[slice, slice] | None:
+    """Return rows and columns of the smallest box around the pixels of alpha (H, W) above a limit; None without any."""
+    shown = alpha > above
+    rows, columns = (torch.nonzero(shown.any(axis))[:, 0] for axis in (1, 0))
+    return (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)) if len(rows) else None

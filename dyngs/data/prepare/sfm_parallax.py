@@ -9,18 +9,23 @@ from pathlib import Path
 import numpy as np
 
 _WELL = 30
+"""Matches of a pair that is looked at."""
 _MOST_PAIRS, _MOST_MATCHES = 120, 200
+"""Pairs, and matches of each, that are looked at."""
 _FOCALS = np.geomspace(0.4, 3.0, 13)
 """Focal lengths that are tried, as shares of the picture's longest side."""
 _FINE = 9
+"""Focal lengths that are tried between the neighbours of the best of these."""
 _ROUNDS = 3
-_WIDEST = 90
-_FAR = 75
-
-
+"""How often a turn is found anew from the matches that it explains best."""
+_WIDEST, _FAR = 90, 75
+"""Percentiles: of the pairs, and of the matches of a pair."""
 _NONE, _NONE_PX = 0.0015, 1.0
+"""Parallax below which the camera did not move: share of the longest side, and pixels."""
 _SMALL, _SMALL_PX = 0.008, 2.0
+"""The same, below which it hardly moved."""
 _COVERED, _CELLS = 0.5, 8
+"""Share of the picture that matches must cover to tell that, in cells of which the longest side has so many."""
 
 
 class Parallax(Enum):

@@ -15,9 +15,9 @@ from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress
 from dyngs.data.capture import Capture, View
 from dyngs.data.fitted_body import numbered
-from dyngs.data.keypoints import Keypoints
 from dyngs.data.loader import PictureLoader
 from dyngs.errors import DyngsError
+from dyngs.human.fit.keypoints import Keypoints
 from dyngs.human.fit.observed import ObservedFrame, longest_box_side, observed_frame
 from dyngs.human.fit.pose_prior import near_given, usual
 from dyngs.human.fit.result import BodyFit, body_fit
@@ -136,7 +136,7 @@ def fit_capture(
         options: how its pictures are read.
         body: with a shape space.
         report: of progress.
-        keypoints: of the training views, see ``dyngs.data.keypoints``; None without.
+        keypoints: of the training views, see ``dyngs.human.fit.keypoints``; None without.
         effort: how much it may cost.
 
     Raises:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import tempfile
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,14 +17,15 @@ from dyngs.conventions import ReportProgress
 from dyngs.data.capture import Capture, Split
 from dyngs.data.fitted_body import numbered
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.keypoints import read_keypoints
 from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import require_new_folder
+from dyngs.files.temporary import temporary_folder_beside
 from dyngs.files.write import write_image, write_text
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, fit_capture
 from dyngs.human.fit.clips import FittedClip, fitted_clips
+from dyngs.human.fit.keypoints import read_keypoints
 from dyngs.human.fit.overlays import FITTED, GIVEN, overlay, side_by_side
 from dyngs.human.fit.surface import surface_of
 from dyngs.human.fit.written import write_body, write_split
@@ -85,20 +86,19 @@ def _fitted(
     capture = capture.replace(splits=numbered(capture.splits))
     points = {} if keypoints is None else read_keypoints(keypoints, capture.splits["train"])
     found = fit_capture(capture, options, body, report, points)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
+    folder = temporary_folder_beside(out)
+    try:
         clips = fitted_clips(capture, body, found)
         if with_pictures:
-            _write_pictures(Path(folder), capture, options, clips)
+            _write_pictures(folder, capture, options, clips)
             for split, clip in clips.items():
                 clips[split] = replace(clip, frames=tuple(range(len(clip.frames))))
-        _write_bodies(Path(folder), capture, clips, found.fit.betas)
-        write_image(Path(folder) / OVERLAYS_NAME, _overlays(capture, options, body, found))
-        write_text(Path(folder) / REPORT_NAME, json.dumps(_report(found), indent=1) + "\n")
-        if out.exists():
-            out.rmdir()
-        Path(folder).rename(out)
-        Path(folder).mkdir()  # for the context manager to remove
+        _write_bodies(folder, capture, clips, found.fit.betas)
+        write_image(folder / OVERLAYS_NAME, _overlays(capture, options, body, found))
+        write_text(folder / REPORT_NAME, json.dumps(_report(found), indent=1) + "\n")
+        folder.replace(out)  # also where ``out`` is an empty folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
     return FittedCapture(out, found)
 
 

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.keypoints import NUM_JOINTS
 from dyngs.data.loader import Picture
 from dyngs.data.pictures.images import area_downscale
+from dyngs.data.pictures.silhouettes import silhouette_box
+from dyngs.human.template.joints import JOINT_NAMES
 
 _MARGIN = 1.25
 """Side of the square over the longest side of the person's box."""
@@ -67,7 +68,7 @@ def observed_frame(
         pictures: with alpha.
         box_side: ``longest_box_side`` of all pictures of the capture, so that all squares show the same scale.
         size: S.
-        marked: name of a picture to key points (55, 3) in its pixels, see ``dyngs.data.keypoints``; None without.
+        marked: name of a picture to key points (55, 3) in its pixels, see ``dyngs.human.fit.keypoints``; None without.
     """
     side = max(round(_MARGIN * box_side), 1)
     squares = [square for picture in pictures if (square := _square(picture, side, size, marked or {})) is not None]
@@ -90,7 +91,7 @@ def _square(
     scale = picture.cameras.intrinsics.new_tensor([size / side, size / side, 1.0])
     cut = [_resized(_cut(x, top, left, side)[None], size) for x in (picture.alpha, weights)]
     intrinsics = scale[:, None] * (picture.cameras.intrinsics - shift)
-    joints = marked.get(picture.name, torch.zeros(NUM_JOINTS, 3, device="cpu")).clone()
+    joints = marked.get(picture.name, torch.zeros(len(JOINT_NAMES), 3, device="cpu")).clone()
     joints[:, :2] = (joints[:, :2] - joints.new_tensor([left, top])) / side
     return picture.cameras.cam_from_world, intrinsics, cut[0], (cut[1] > 0.999).float(), joints[None]
 
@@ -112,10 +113,5 @@ def _resized(values: Tensor, size: int) -> Tensor:
 
 def _box(picture: Picture) -> tuple[int, int, int, int] | None:
     """Return first and last + 1 row, first and last + 1 column of the person; None if nobody is seen."""
-    if picture.alpha is None:
-        return None
-    inside = picture.alpha > 0.5
-    rows, columns = (inside.any(axis).nonzero()[:, 0] for axis in (1, 0))
-    if not len(rows):
-        return None
-    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+    box = None if picture.alpha is None else silhouette_box(picture.alpha, 0.5)
+    return None if box is None else (box[0].start, box[0].stop, box[1].start, box[1].stop)

@@ -19,7 +19,7 @@ from dyngs.human.fit.observed import ObservedFrame
 from dyngs.human.fit.pose_prior import NUM_TURNED, PosePrior
 from dyngs.human.fit.surface import Surface, drawn_silhouettes
 from dyngs.human.motion.clip import MotionClip
-from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
+from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.bone_shapes import NUM_BONE_SHAPES
 from dyngs.parameters import Parameters
 
@@ -99,7 +99,7 @@ def posed_joints(learned: Parameters, clip: MotionClip, surface: Surface, row: i
     """Return the joints (J, 3) of frame ``row`` in the world."""
     skeleton, pose = surface.skeleton(learned["betas"]), frame_pose_of(learned, clip, row)
     moves = joint_transforms(skeleton.joints, skeleton.parents, pose.rotations)
-    return pose.scale * ((moves[..., :3] @ skeleton.joints[..., None])[..., 0] + moves[..., 3]) + pose.trans
+    return pose.scale * apply_transforms(moves, skeleton.joints) + pose.trans
 
 
 def silhouette_error(drawn: Tensor, seen: ObservedFrame) -> Tensor:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.data.pictures.silhouettes import silhouette_box
 from dyngs.human.fit.observed import ObservedFrame
 from dyngs.human.fit.pose_prior import NUM_TURNED, usual, usual_pose
 from dyngs.human.fit.solve import Observations, Stage, drawn_frame, new_fit, run_stage, silhouette_error
@@ -126,12 +127,11 @@ def _ray(camera: Cameras, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor] | None
 
     The angle is the height over the distance, for a person who stands upright in the picture. None if nobody is seen.
     """
-    inside = alpha > 0.5
-    rows, columns = (inside.any(axis).nonzero()[:, 0] for axis in (1, 0))
-    if len(rows) < 2:
+    box = silhouette_box(alpha, 0.5)
+    if box is None:
         return None
-    top, bottom = float(rows[0]), float(rows[-1]) + 1
-    middle = torch.tensor([(float(columns[0]) + float(columns[-1]) + 1) / 2, (top + bottom) / 2, 1.0], device="cpu")
+    (top, bottom), (left, right) = ((part.start, part.stop) for part in box)
+    middle = torch.tensor([(left + right) / 2, (top + bottom) / 2, 1.0], device="cpu")
     intrinsics, pose = camera.intrinsics[0], camera.cam_from_world[0]
     local = torch.linalg.solve(intrinsics, middle)
     direction = pose[:3, :3].T @ local

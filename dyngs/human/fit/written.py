@@ -10,11 +10,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from dyngs.data.capture import Split, View
 from dyngs.data.geometry.poses import opengl_from_cam
 from dyngs.data.loader import Picture
-from dyngs.files.write import atomic_file, to_uint8, write_image, write_text
+from dyngs.data.pictures.images import straight_uint8
+from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.motion.clip import MotionClip
 
 
@@ -59,7 +61,7 @@ def write_split(
     for view, picture in shown:
         row = rows[-1 if view.frame is None else view.frame]
         name = f"images/{split}/f{row:04d}_c{view.camera_id:02d}_{len(frames):05d}.png"
-        write_image(out / name, to_uint8(_straight(picture)))
+        write_image(out / name, _straight(picture))
         camera = picture.cameras
         intrinsics = camera.intrinsics[0].double().numpy()
         pose = opengl_from_cam(view.cam_from_world).copy()
@@ -72,9 +74,6 @@ def write_split(
 
 
 def _straight(picture: Picture) -> np.ndarray:
-    """Return straight colours and alpha (H, W, 4) in [0, 1]."""
-    rgb = picture.rgb_premultiplied
-    if picture.alpha is None:
-        return rgb.numpy()
-    alpha = picture.alpha[..., None]
-    return np.concatenate([(rgb / alpha.clamp_min(1e-6)).clamp(0, 1).numpy() * (alpha > 0).numpy(), alpha.numpy()], -1)
+    """Return straight colours, with alpha if there is one, (H, W, 3 or 4) uint8."""
+    parts = [picture.rgb_premultiplied] + ([] if picture.alpha is None else [picture.alpha[..., None]])
+    return straight_uint8(torch.cat(parts, dim=-1)).numpy()

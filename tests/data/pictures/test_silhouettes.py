@@ -11,7 +11,7 @@ import torch
 from tiny_captures import random_pixels, write_picture
 
 from dyngs.data.capture import Silhouette
-from dyngs.data.pictures.silhouettes import cut_out
+from dyngs.data.pictures.silhouettes import cut_out, silhouette_box
 from dyngs.errors import DyngsError
 
 
@@ -52,3 +52,11 @@ def test_silhouettes_in_hdf5(tmp_path: Path) -> None:
     assert cut_out(pixels, Silhouette(hdf5, "nonzero", 3))[..., 3].tolist() == [[0, 0, 0], [0, 0, 255]]
     with pytest.raises(DyngsError, match="'masks' must be a data set in an HDF5 file"):
         cut_out(pixels, Silhouette(hdf5, "nonzero", 5))
+
+
+def test_the_box_holds_all_that_is_shown() -> None:
+    alpha = torch.zeros(5, 7)
+    assert silhouette_box(alpha) is None
+    alpha[1, 2], alpha[3, 5] = 0.4, 0.9
+    assert silhouette_box(alpha) == (slice(1, 4), slice(2, 6))
+    assert silhouette_box(alpha, 0.5) == (slice(3, 4), slice(5, 6))

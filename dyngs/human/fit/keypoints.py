@@ -17,25 +17,15 @@ from dyngs.data.pictures.lens import undistorted_points
 from dyngs.errors import DyngsError, reading
 from dyngs.files.fields import numbers_of
 from dyngs.files.json_files import read_json_object
+from dyngs.human.template.joints import JOINT_NAMES
 
-NUM_JOINTS = 55
+_SEEN = ("eye", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+"""Joints that detectors mark where they are, on both sides. Nose and ears are no joints; necks and toes are marked
+elsewhere."""
 JOINTS = {
-    "left_eye": 23,
-    "right_eye": 24,
-    "left_shoulder": 16,
-    "right_shoulder": 17,
-    "left_elbow": 18,
-    "right_elbow": 19,
-    "left_wrist": 20,
-    "right_wrist": 21,
-    "left_hip": 1,
-    "right_hip": 2,
-    "left_knee": 4,
-    "right_knee": 5,
-    "left_ankle": 7,
-    "right_ankle": 8,
+    name: row for row, name in enumerate(JOINT_NAMES) if name.removeprefix("left_").removeprefix("right_") in _SEEN
 }
-"""Joints of SMPL-X that detectors mark. Nose and ears are no joints; necks and toes are marked elsewhere."""
+"""Names of these joints, and their rows in ``JOINT_NAMES``."""
 _COCO = (
     *("nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder", "left_elbow"),
     *("right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle"),
@@ -157,7 +147,7 @@ def _confidence(points: np.ndarray) -> float:
 
 def _placed(view: View, points: np.ndarray) -> Tensor:
     """Return the joints (55, 3) of the points of a format, undistorted."""
-    joints = torch.zeros(NUM_JOINTS, 3, dtype=torch.float64, device="cpu")
+    joints = torch.zeros(len(JOINT_NAMES), 3, dtype=torch.float64, device="cpu")
     for row, name in enumerate(_ORDERS[len(points)]):
         if name in JOINTS and points[row, 2] > 0:
             joints[JOINTS[name]] = torch.from_numpy(points[row])

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from dyngs.data.capture import Lens, View
-from dyngs.data.keypoints import JOINTS, read_keypoints
 from dyngs.data.pictures.lens import distort
 from dyngs.errors import DyngsError
+from dyngs.human.fit.keypoints import JOINTS, read_keypoints
 
 
 def view(name: str) -> View:
