@@ -43,9 +43,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Evaluate and print a table."""
     from rich.console import Console
 
+    from dyngs.config.io import load_resolved
     from dyngs.evaluate.report import evaluate_run, report_path
 
     if arguments.refine and arguments.split != "train":
+        load_resolved(arguments.run_dir)  # what is no run is refused before anything is announced
         print("refining poses on the tested pictures, beside the scores as given: this takes a while", file=sys.stderr)
     report = evaluate_run(
         arguments.run_dir,
