@@ -125,8 +125,8 @@ def run_cases(
 ) -> Iterator[tuple[int | None, Verdict]]:
     """Yield numbers and verdicts up to the first case that ends the worker process, or the time ``until``.
 
-    A case that ends the process, or hangs, is a failure; call again with the cases after it. If the process ends
-    between two cases, the number is None.
+    A case that ends the process, or hangs, is a failure; call again with the cases after it. If the process ends or
+    hangs between two cases, which is while the next is made, the number is None.
     """
     out, pipe = os.pipe()
     clear(folder)
@@ -150,8 +150,7 @@ def _verdicts(
         ready, _, _ = select.select([out], [], [], 10 * limits.seconds)
         if not ready:
             os.kill(worker, signal.SIGKILL)
-            if begun is not None:
-                yield begun, Verdict(Outcome.FAILED, "hangs", _tail(folder))
+            yield begun, Verdict(Outcome.FAILED, "hangs", _tail(folder))
             return
         data = os.read(out, 1 << 16)
         if not data:

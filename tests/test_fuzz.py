@@ -80,15 +80,16 @@ def test_what_harms_is_noticed(tmp_path: Path) -> None:
         "dies": "failed: ends the process by SIGSEGV",
         "fills": "failed: MemoryError outside dyngs",
         "swells": "failed: took much memory",
+        "never made": "None failed: hangs",
     }
 
 
 HARM = """
 import fuzz  # first: finds the dyngs that is meant
-import ctypes, json, math, os, shutil, subprocess
+import ctypes, json, math, os, shutil, subprocess, tempfile, time
 from pathlib import Path
 from dyngs.errors import DyngsError
-from fuzz.campaign import verdict_of
+from fuzz.campaign import run_cases, verdict_of
 from fuzz.case import Case
 from fuzz.readers import Reader
 from fuzz.worker import Limits
@@ -126,5 +127,15 @@ for name, read in harms.items():
     verdict = verdict_of(Reader({}, read), case, limits.get(name, patient))
     reason = "" if verdict.outcome == "refused" else verdict.reason
     found[name] = f"{verdict.outcome.value}: {reason}"
+
+def never_made():
+    spin(None)
+    yield 0, case
+
+# Counted as no case of any number, or the campaign would begin with the same one again.
+with tempfile.TemporaryDirectory() as folder:
+    reader, soon = Reader({}, harms["quiet"]), Limits(seconds=0.1)
+    [(number, verdict)] = run_cases(reader, never_made(), Path(folder), soon, time.monotonic() + 60)
+found["never made"] = f"{number} {verdict.outcome.value}: {verdict.reason}"
 print(json.dumps(found))
 """
