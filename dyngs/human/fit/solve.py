@@ -155,7 +155,8 @@ def run_stage(
         expected: of the poses.
         tick: called after every step.
     """
-    learned = Parameters(start.values(), start.rates, start.decay)  # without moments
+    # Copies, as updates are in place and ``start`` may be what is taken in the end; without moments.
+    learned = Parameters({name: x.clone() for name, x in start.values().items()}, start.rates, start.decay)
     order = spread_order(len(clip))
     for step in range(1, stage.steps + 1):
         first = (step - 1) * stage.frames

@@ -99,9 +99,8 @@ def test_frames_are_taken_from_all_over_the_clip() -> None:
 def test_only_what_a_stage_names_is_learned(surface: Surface) -> None:
     given, view = clip(), camera()
     alpha = torch.ones(1, SIZE, SIZE)
-    seen = ObservedFrame(view, alpha, alpha)
-    found = run_stage(
-        new_fit(given, surface), Stage(2, 1, ("betas",)), given, surface, lambda _: seen, near_given(given)
-    )
+    seen, start = ObservedFrame(view, alpha, alpha), new_fit(given, surface)
+    found = run_stage(start, Stage(2, 1, ("betas",)), given, surface, lambda _: seen, near_given(given))
+    assert not any(value.any() for value in start.values().values()), "what was learned before stays as it is"
     changed = {name for name, value in found.values().items() if value.any()}
     assert changed == {"betas"}
