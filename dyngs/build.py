@@ -303,7 +303,12 @@ def _first(
         case HumanModel():
             gaussians, subject = human_start(config, config.model, capture, pictures)
             colours = _colours(config, capture, gaussians, generator)
-            training = HumanTraining(config.model, subject.footage.frames, rates_of(config))
+            filmed = capture.splits["train"]
+            views = [
+                (camera, view.frame or 0)
+                for camera, view in zip(training_cameras(filmed, config.data), filmed, strict=True)
+            ]
+            training = HumanTraining(config.model, subject.footage.frames, rates_of(config), views)
             return _First(training.first_scene(gaussians, subject), training, colours)
         case StaticModel() | DynamicModel():
             degree = stored_sh_degree(config)

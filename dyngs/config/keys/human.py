@@ -49,6 +49,11 @@ class HumanModel(_OnTemplate):
         default=False,
         description="learn offsets at rest that are linear in the rotations of nearby joints (pose blend shapes)",
     )
+    fill_unseen: bool = Field(
+        default=True,
+        description="after the last step, fill what the pictures hardly show from the other side of the body and from "
+        "around it",
+    )
     offset_weight: float = Field(
         default=2e-4, ge=0, description="weight of the squared distances from the scaffold, cm^2"
     )

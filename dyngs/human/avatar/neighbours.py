@@ -8,6 +8,9 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError
 
+SAME_JOINTS = 0.5
+"""Least cosine between the skinning weights of points that belong to the same part of the body."""
+
 
 def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
     """Return the rows (Q, count) int64 of the nearest other points of each of ``points`` (Q, 3), nearest first.
@@ -30,3 +33,15 @@ def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
     own = found == np.arange(num_points)[:, None]
     own[~own.any(1), -1] = True  # more than ``count`` points coincide: drop the last one
     return torch.from_numpy(found[~own].reshape(num_points, count)).long().to(points.device)
+
+
+def linked_neighbours(points: Tensor, weights: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the rows (Q, count) of ``nearest_neighbours``, and whether both follow the same joints (Q, count) bool.
+
+    They do where the cosine between their skinning weights (Q, J) is above a half: arm and trunk do not, nor do two
+    fingers, however near they are at rest.
+    """
+    near = nearest_neighbours(points, count)
+    unit = torch.nn.functional.normalize(weights, dim=1)
+    alike = torch.stack([(unit * unit.index_select(0, column)).sum(1) for column in near.unbind(1)], dim=1)
+    return near, alike > SAME_JOINTS

@@ -5,23 +5,32 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
+from dyngs.camera import Cameras
 from dyngs.colour.network import Frame
 from dyngs.config import HumanModel
+from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.human.avatar.corrections import correction_penalties, new_corrections
 from dyngs.human.avatar.neighbours import nearest_neighbours
+from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.subject import Subject
+from dyngs.human.avatar.unseen import HARDLY, filled, sightings, trust_in
 from dyngs.scene import Moment, Scene
 from dyngs.state import Role, State, StateTensor
 from dyngs.static.rates import Rates
 
 NEIGHBOURS = 5
 CENTIMETRE = 0.01
+LOOKS = 100
+"""Number of training views, at most, in which it is counted how much they show of each Gaussian."""
+WORTH_TELLING = 0.01
+"""Least share of Gaussians that are hardly seen at which a line says so."""
 
 
 class HumanTraining:
@@ -31,12 +40,15 @@ class HumanTraining:
         options: of the model.
         frames: number of the frame of each row of the clip of training.
         rates: how learning rates fall.
+        views: camera and frame of the training views; none: what they do not show is not filled.
     """
 
     moves_by = ("pose", "model")
 
-    def __init__(self, options: HumanModel, frames: Sequence[int], rates: Rates) -> None:
-        self.options, self.rates = options, rates
+    def __init__(
+        self, options: HumanModel, frames: Sequence[int], rates: Rates, views: Sequence[tuple[Cameras, int]] = ()
+    ) -> None:
+        self.options, self.rates, self.views = options, rates, views
         self.refines_from = round(options.refine_from * rates.steps)
         self._rows = {frame: row for row, frame in enumerate(frames)}
         self._given_weights: Tensor | None = None
@@ -77,13 +89,9 @@ class HumanTraining:
             raise DyngsError(f"view {picture.name!r}: no body parameters for frame {picture.frame}")
         penalties = self._penalties(scene)
         row = min(row, len(scene.clip) - 1)  # who never moves has one row
+        gaussians, posing = self._in_frame(scene, row, step)
         if self._refines(step):
-            gaussians, posing = scene.in_frame(row)
             penalties |= correction_penalties(scene.learned, self.options)
-        else:
-            if self._given_weights is None:
-                self._given_weights = scene.given_weights()
-            gaussians, posing = scene.in_frame(row, self._given_weights)
         penalties |= self._between_neighbours(scene, gaussians, float(scene.clip.scale[row]), step)
         frame = Frame(scene.gaussians.means, posing.rotations[0])
         return Moment(gaussians, picture.time, frame, penalties)
@@ -99,8 +107,26 @@ class HumanTraining:
         return scene
 
     def grown(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
-        """Return None: the set of Gaussians is left to the strategy."""
-        return None
+        """Return the scene as it is, and after the last step new values for what the pictures hardly show."""
+        if step != self.rates.steps or not self.options.fill_unseen or not self.views or not len(scene):
+            return None
+        shown = [self.views[i] for i in evenly_spaced(len(self.views), LOOKS)]
+        last = len(scene.clip) - 1
+        with torch.no_grad():
+            drawn = (
+                (
+                    self._in_frame(scene, min(self._rows[frame], last), step)[0],
+                    camera.to(device=scene.skeleton.joints.device),
+                )
+                for camera, frame in shown
+            )
+            seen = sightings(drawn, scene.anchors.size, float(scene.clip.scale.mean()), scene.options)
+            trust = trust_in(seen * (len(self.views) / len(shown)))
+            middle = float(scene.skeleton.joints[0, 0])
+            changes = filled(scene.gaussians.detach(), scene.anchors, scene.given_weights(), middle, trust)
+        hardly = float((trust < HARDLY).float().mean())
+        line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
+        return scene, EditResult(None, changes, finding=line if hardly >= WORTH_TELLING else None)
 
     def variant(self, scene: Scene, step: int) -> None:
         """Return None: there is nothing to choose from."""
@@ -120,6 +146,14 @@ class HumanTraining:
 
     def state(self) -> State:
         return {} if self._near is None else {"near": StateTensor(self._near, Role.TRAINING)}
+
+    def _in_frame(self, scene: HumanScene, row: int, step: int) -> tuple[Gaussians, BodyPose]:
+        """Return the Gaussians in row ``row`` of the clip as ``step`` draws them, and the pose."""
+        if self._refines(step):
+            return scene.in_frame(row)
+        if self._given_weights is None:
+            self._given_weights = scene.given_weights()
+        return scene.in_frame(row, self._given_weights)
 
     def _refines(self, step: int) -> bool:
         return self.options.refine and step > self.refines_from

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from dyngs.errors import DyngsError
-from dyngs.human.avatar.neighbours import nearest_neighbours
+from dyngs.human.avatar.neighbours import linked_neighbours, nearest_neighbours
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.load import default_template
 
@@ -47,3 +47,12 @@ def test_neighbours_need_finite_points() -> None:
     points[4, 1] = math.nan
     with pytest.raises(DyngsError, match="not finite"):
         nearest_neighbours(points)
+
+
+def test_neighbours_that_follow_other_joints_are_not_linked() -> None:
+    points = torch.tensor([[0.0, 0, 0], [0.001, 0, 0], [0.01, 0, 0], [0.012, 0, 0]])
+    weights = torch.tensor([[1.0, 0, 0], [0.0, 1, 0], [0.8, 0.2, 0], [0.0, 0.9, 0.1]])
+    near, linked = linked_neighbours(points, weights, 3)
+    assert near[0].tolist() == [1, 2, 3]
+    assert linked[0].tolist() == [False, True, False]
+    assert [near[1][i].item() for i in range(3) if linked[1][i]] == [3]

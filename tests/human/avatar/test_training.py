@@ -181,3 +181,18 @@ def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> No
     assert rest.is_still
     spread = rest.at(None).means.amax(0) - rest.at(None).means.amin(0)
     assert float(spread[0]) > 1.5, "arms to the sides"
+
+
+def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_changes(capture: Path) -> None:
+    def after(step: int, fill: bool) -> tuple[dict[str, Tensor], str]:
+        trainer = assemble(tiny(capture, steps=4, fill_unseen=fill, scaffold_heights=(0.0,)))
+        reports = [trainer.step() for _ in range(step)]
+        found = {name: x.clone() for name, x in trainer.checkpoint().tensors.items()}
+        return found, reports[-1].finding or ""
+
+    assert same(after(3, True)[0], after(3, False)[0])
+    (filled, line), (plain, silence) = after(4, True), after(4, False)
+    assert "hardly seen" in line, "three cameras do not see all"
+    assert "hardly seen" not in silence
+    changed = {name for name in plain if not torch.equal(plain[name], filled[name])}
+    assert changed == {"gaussians.sh", "gaussians.means", "gaussians.logit_opacities"}
