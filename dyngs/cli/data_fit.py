@@ -17,10 +17,22 @@ def add_parser(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         description="Fit the free body template to the silhouettes of a person: one shape and skeleton, and the pose "
         "of every frame. OUT is a capture for `dyngs train human`.",
     )
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder of a capture with silhouettes")
+    parser.add_argument(
+        "capture",
+        type=Path,
+        metavar="CAPTURE",
+        help="folder of a capture; or a video, or a folder of pictures, of one camera that stands",
+    )
     parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
     parser.add_argument(
         "--keypoints", type=Path, metavar="PATH", help="key points: a folder of OpenPose files, or a COCO file"
+    )
+    parser.add_argument("--masks", type=Path, metavar="DIR", help="masks of the person (white), named as the pictures")
+    parser.add_argument(
+        "--background",
+        type=Path,
+        metavar="PATH",
+        help="a picture of the place without the person, or a folder of one for each camera: masks are made by it",
     )
     parser.add_argument("overrides", nargs="*", default=[], metavar="data.key=value", help="keys of data")
     parser.set_defaults(run=run_fit)
@@ -29,10 +41,12 @@ def add_parser(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 def run_fit(arguments: argparse.Namespace) -> int:
     """Fit a body and print how good the fit is, and the next command."""
     from dyngs.human.fit.fitted_capture import write_fitted_capture
+    from dyngs.human.fit.inputs import FitInputs
 
     options = data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
+    given = FitInputs(arguments.keypoints, arguments.masks, arguments.background)
     with ProgressBar() as report:
-        result = write_fitted_capture(options, arguments.out, report, arguments.keypoints)
+        result = write_fitted_capture(options, arguments.out, report, given)
     print(result.summary())
     print(f"next: dyngs train human data.root={result.root}")
     return 0

@@ -48,7 +48,7 @@ def times_by_name(root: Path, splits: Splits, per_second: float | None = None) -
             raise DyngsError(
                 f"{root}: data.times=order: folders hold {counts} pictures; end the names in the numbers of the frames"
             )
-        orders = [sorted(seen, key=lambda view: _natural(view.image_path.name)) for seen in folders.values()]
+        orders = [sorted(seen, key=lambda view: natural_order(view.image_path.name)) for seen in folders.values()]
         times = {view.name: float(place) for order in orders for place, view in enumerate(order)}
         line = f"times are the order of the names, {orders[0][0].name} first (data.times=order"
         line += f"{_in_seconds(times, per_second)})"
@@ -76,6 +76,6 @@ def _all_differ(numbers: Sequence[int | None]) -> bool:
     return None not in numbers and len(set(numbers)) == len(numbers)
 
 
-def _natural(name: str) -> list[tuple[int, int, str]]:
+def natural_order(name: str) -> list[tuple[int, int, str]]:
     """Return a key by which 9 sorts before 10."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in _NUMBERS.split(name) if part]

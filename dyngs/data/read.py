@@ -107,6 +107,12 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     return capture
 
 
+def is_capture(root: Path) -> bool:
+    """Whether a folder is recognised as a capture of any format."""
+    with reading(root, "choose another folder or change its permissions"):
+        return root.is_dir() and any(format.recognise(root) for format in FORMATS)
+
+
 def hold_out(views: tuple[View, ...], test_every: int) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """Split ``views`` into training and test views: indices 0, n, 2n, .. are for testing, none if n = 0."""
     if test_every == 0:

@@ -13,6 +13,7 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, reading
 from dyngs.files.cache import cache_folder
 from dyngs.human.fit.fitted_capture import write_fit
+from dyngs.human.fit.inputs import FitInputs
 
 KEYPOINTS = "keypoints"
 """Folder of a capture with key points of its pictures, as OpenPose writes them."""
@@ -59,7 +60,7 @@ def with_fitted_body(
     else:
         say(f"body:    fitted to the silhouettes first, as by `dyngs data fit`, into {folder}")
         points = data.root / KEYPOINTS
-        say(write_fit(data, folder, report, points if points.is_dir() else None).summary())
+        say(write_fit(data, folder, report, FitInputs(points if points.is_dir() else None)).summary())
     return data.model_copy(update={"body": folder})
 
 

@@ -18,6 +18,8 @@ from dyngs.data.fitted_body import numbered
 from dyngs.data.loader import PictureLoader
 from dyngs.errors import DyngsError
 from dyngs.human.fit.keypoints import Keypoints
+from dyngs.human.fit.lens_fit import LensFit, fit_lens
+from dyngs.human.fit.lens_fit import num_ticks as num_lens_ticks
 from dyngs.human.fit.observed import ObservedFrame, longest_box_side, observed_frame
 from dyngs.human.fit.pose_prior import near_given, usual
 from dyngs.human.fit.result import BodyFit, body_fit
@@ -45,6 +47,8 @@ FRAMES = 3
 """Frames drawn in each step."""
 SHAPE = ("log_scale", "betas", "padding", "offset", "shift")
 """What is the same in all frames."""
+_SHAPE_OF_ONE_CAMERA = tuple(name for name in SHAPE if name != "log_scale")
+"""The same where pictures do not tell a small person from a distant one."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,7 @@ class CaptureFit:
         tried: all candidates; the first one has the poses as given.
         held_out: views left out of the fit, on which the candidates were measured; 0: measured on those fitted to.
         from_silhouettes: no poses were given.
+        lens: the focal length of one standing camera that was guessed; None where cameras are known.
     """
 
     fit: BodyFit
@@ -102,6 +107,7 @@ class CaptureFit:
     tried: tuple[Candidate, ...]
     held_out: int
     from_silhouettes: bool
+    lens: LensFit | None = None
 
 
 @dataclass(frozen=True)
@@ -125,6 +131,8 @@ def fit_capture(
     report: ReportProgress,
     keypoints: Keypoints | None = None,
     effort: FitEffort = FitEffort(),
+    *,
+    guessed_lens: bool = False,
 ) -> CaptureFit:
     """Return the fit of ``body`` to the silhouettes of a capture's training views.
 
@@ -138,6 +146,7 @@ def fit_capture(
         report: of progress.
         keypoints: of the training views, see ``dyngs.human.fit.keypoints``; None without.
         effort: how much it may cost.
+        guessed_lens: the capture is one camera that stands at the origin, with a guessed focal length to be refined.
 
     Raises:
         DyngsError: no silhouettes, or nobody in them.
@@ -159,9 +168,13 @@ def fit_capture(
         tick = _ticker("first poses", report, num_ticks(len(motion.clip)))
         clip = first_poses(motion.clip.times, surface, seen.used.__getitem__, tick)
         motion = CapturedMotion(clip, motion.frames)
-        tried = _from_silhouettes(clip, surface, seen, report, effort)
-    chosen = simplest_of_the_best(tried)
-    return CaptureFit(body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, not given)
+        tried = _from_silhouettes(clip, surface, seen, report, effort, with_size=not guessed_lens)
+    lens = None
+    if guessed_lens:
+        candidate, lens = _with_lens(tried[-1], motion.clip, surface, seen, report, effort)
+        tried = (*tried, candidate)
+    chosen = tried[-1] if guessed_lens else simplest_of_the_best(tried)
+    return CaptureFit(body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, not given, lens)
 
 
 def simplest_of_the_best(tried: Sequence[Candidate]) -> Candidate:
@@ -267,18 +280,31 @@ def _from_given(
 
 
 def _from_silhouettes(
-    clip: MotionClip, surface: Surface, seen: _Seen, report: ReportProgress, effort: FitEffort
+    clip: MotionClip, surface: Surface, seen: _Seen, report: ReportProgress, effort: FitEffort, *, with_size: bool
 ) -> tuple[Candidate, ...]:
-    """Return the poses as they were found first, and shape and poses fitted together."""
+    """Return the poses as they were found first, and shape and poses fitted together, size too if ``with_size``."""
     start, expected = new_fit(clip, surface), usual(clip)
     tried = [_measured("poses found frame by frame", start, clip, surface, seen)]
-    stage = Stage(effort.steps_for(clip), FRAMES, (*SHAPE, "poses", "trans"))
+    shape = SHAPE if with_size else _SHAPE_OF_ONE_CAMERA
+    stage = Stage(effort.steps_for(clip), FRAMES, (*shape, "poses", "trans"))
     tick = _ticker("shape", report, 2 * stage.steps)
     found = start
     for look in (seen.halved, seen.used.__getitem__):
         found = run_stage(found, stage, clip, surface, look, expected, tick)
     tried.append(_measured("one shape, and poses of every frame", found, clip, surface, seen))
     return tuple(tried)
+
+
+def _with_lens(
+    start: Candidate, clip: MotionClip, surface: Surface, seen: _Seen, report: ReportProgress, effort: FitEffort
+) -> tuple[Candidate, LensFit]:
+    """Return the fit with the focal length of one camera refined, where that pays, and what was found about it."""
+    steps, look = effort.steps_for(clip), seen.used.__getitem__
+    tick = _ticker("focal length", report, num_lens_ticks(steps))
+    args = (start.learned, _SHAPE_OF_ONE_CAMERA, clip, surface, look, usual(clip), steps, tick)
+    found, lens = fit_lens(*args)
+    name = f"the focal length {'refined' if lens.taken else 'as guessed'}"
+    return _measured(name, found, clip, surface, seen), lens
 
 
 def _ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]:

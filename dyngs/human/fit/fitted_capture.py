@@ -18,13 +18,13 @@ from dyngs.data.capture import Capture, Split
 from dyngs.data.fitted_body import numbered
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import PictureLoader
-from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.files.temporary import temporary_folder_beside
 from dyngs.files.write import write_image, write_text
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, fit_capture
 from dyngs.human.fit.clips import FittedClip, fitted_clips
+from dyngs.human.fit.inputs import NOTHING_ELSE, FitInputs, has_guessed_lens, read_person, with_lens
 from dyngs.human.fit.keypoints import read_keypoints
 from dyngs.human.fit.overlays import FITTED, GIVEN, overlay, side_by_side
 from dyngs.human.fit.surface import surface_of
@@ -34,6 +34,7 @@ from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.human.template.load import default_template
 
 REPORT_NAME, OVERLAYS_NAME = "fit_report.json", "fit_overlays.png"
+_MASKS = ".masks"
 _SHOWN, _COLUMNS, _SHOWN_SIDE, _SHOWN_RESOLUTION = 8, 4, 400, 72
 """Overlays, how many in a row, their longest side in pixels, and the texels per side of the body drawn over them."""
 
@@ -51,43 +52,46 @@ class FittedCapture:
         where = f"{found.held_out} views left out of the fit" if found.held_out else "the views fitted to"
         worst = int(np.nanargmin(found.chosen.per_frame))
         tried = ", ".join(f"{candidate.iou:.3f} with {candidate.name}" for candidate in found.tried)
+        lens = "" if found.lens is None else f"\n{found.lens.summary()}"
         return (
             f"{frames} frames; overlap of silhouettes (IoU) on {where}: {tried}\n"
             f"taken: {found.chosen.name}; worst frame {found.motion.frames[worst]} with "
-            f"{found.chosen.per_frame[worst]:.3f}; look at {self.root / OVERLAYS_NAME}"
+            f"{found.chosen.per_frame[worst]:.3f}; look at {self.root / OVERLAYS_NAME}{lens}"
         )
 
 
 def write_fitted_capture(
-    options: DataConfig, out: Path, report: ReportProgress, keypoints: Path | None = None
+    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = NOTHING_ELSE
 ) -> FittedCapture:
     """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
 
     Files: ``transforms_SPLIT.json``, ``images/``, ``body_train.npz``, ``body_pose.npz`` for another clip whose poses
-    were given by the same means, ``fit_report.json``, and ``fit_overlays.png`` to look at. ``keypoints`` names a folder
-    or file of key points, see ``read_keypoints``.
+    were given by the same means, ``fit_report.json``, and ``fit_overlays.png`` to look at. ``given`` is what is
+    known beside the capture, which may be a plain clip as well: see ``read_person``.
 
     Raises:
         DyngsError: see ``fit_capture``; ``out`` is not empty.
     """
-    return _fitted(options, out, report, keypoints, with_pictures=True)
+    return _fitted(options, out, report, given, with_pictures=True)
 
 
-def write_fit(options: DataConfig, out: Path, report: ReportProgress, keypoints: Path | None = None) -> FittedCapture:
+def write_fit(options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = NOTHING_ELSE) -> FittedCapture:
     """As ``write_fitted_capture``, but without pictures and cameras: for ``data.body``."""
-    return _fitted(options, out, report, keypoints, with_pictures=False)
+    return _fitted(options, out, report, given, with_pictures=False)
 
 
 def _fitted(
-    options: DataConfig, out: Path, report: ReportProgress, keypoints: Path | None, *, with_pictures: bool
+    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs, *, with_pictures: bool
 ) -> FittedCapture:
     require_new_folder(out)
-    capture, body = read_capture(options), default_template()
-    capture = capture.replace(splits=numbered(capture.splits))
-    points = {} if keypoints is None else read_keypoints(keypoints, capture.splits["train"])
-    found = fit_capture(capture, options, body, report, points)
-    folder = temporary_folder_beside(out)
+    body, folder = default_template(), temporary_folder_beside(out)
+    masks = folder / _MASKS
     try:
+        capture = read_person(options, given, masks)
+        capture = capture.replace(splits=numbered(capture.splits))
+        points = {} if given.keypoints is None else read_keypoints(given.keypoints, capture.splits["train"])
+        found = fit_capture(capture, options, body, report, points, guessed_lens=has_guessed_lens(capture))
+        capture = with_lens(capture, found.lens)
         clips = fitted_clips(capture, body, found)
         if with_pictures:
             _write_pictures(folder, capture, options, clips)
@@ -96,6 +100,7 @@ def _fitted(
         _write_bodies(folder, capture, clips, found.fit.betas)
         write_image(folder / OVERLAYS_NAME, _overlays(capture, options, body, found))
         write_text(folder / REPORT_NAME, json.dumps(_report(found), indent=1) + "\n")
+        shutil.rmtree(masks, ignore_errors=True)
         folder.replace(out)  # also where ``out`` is an empty folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -136,7 +141,8 @@ def _report(found: CaptureFit) -> dict[str, object]:
     """Return the report as JSON values."""
     fit, chosen = found.fit, found.chosen
     turns = np.degrees(fit.shared.turns.norm(dim=1).double().numpy())
-    return {
+    lens: dict[str, object] = {} if found.lens is None else {"lens": {**vars(found.lens)}}
+    return lens | {
         "frames": len(found.motion.clip),
         "taken": chosen.name,
         "iou": {candidate.name: round(candidate.iou, 4) for candidate in found.tried},

@@ -26,6 +26,7 @@ from dyngs.parameters import Parameters
 LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e-3, "padding": 1e-3} | {
     "offset": 3e-3,
     "shift": 3e-3,
+    "log_focal": 1e-2,
 }
 """Learning rates at the first step; those of places per metre of the person's unit."""
 LR_DECAY = 0.1
@@ -38,6 +39,8 @@ TURN_WEIGHT, POSE_WEIGHT, STEP_WEIGHT = 3e-2, 1e-3, 1e-3
 steps where these are much smaller: renders of new poses then lose 1 to 3 dB, while the silhouettes look as good."""
 KEYPOINT, KEYPOINT_WEIGHT = 0.02, 0.1
 """Expected error of a key point, as a share of the square's side, and the weight of their robust mean."""
+FOCAL, FOCAL_WEIGHT = 0.35, 1e-3
+"""Expected error of a guessed focal length, as a logarithm, and the weight of its square."""
 PADDING, PADDING_WEIGHT = 0.01, 2e-3
 """Metres between skin and silhouette that cost as much as one unit of shape, and the weight of their mean square."""
 
@@ -83,6 +86,30 @@ def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
     }
     unit = float(clip.scale.mean())
     return Parameters(zeros, LR | {name: LR[name] * unit for name in ("trans", "shift")}, LR_DECAY)
+
+
+def with_lens(learned: Parameters, distance: float) -> Parameters:
+    """Return the same with a focal length to be learned: of one camera that stands at the origin of the world.
+
+    Adds ``log_focal`` (1,), the natural logarithm of the factor on the given focal length, and ``distance`` (1,), which
+    is never learned: the camera steps back as its focal length grows, so that what is at this distance stays as large.
+    """
+    blank = learned["log_scale"].detach()
+    values = {"log_focal": torch.zeros_like(blank), "distance": torch.full_like(blank, distance)}
+    rates = {"log_focal": LR["log_focal"], "distance": 0.0}
+    return Parameters(learned.values() | values, learned.rates | rates, learned.decay)
+
+
+def refined(cameras: Cameras, learned: Parameters) -> Cameras:
+    """Return the cameras with the focal length that was learned; as they are where none is."""
+    if "log_focal" not in learned:
+        return cameras
+    factor, blank = learned["log_focal"].exp(), torch.ones_like(learned["log_focal"])
+    zoom = torch.cat([factor, factor, blank])
+    along = torch.zeros_like(cameras.cam_from_world[0])
+    along[2, 3] = 1.0
+    poses = cameras.cam_from_world + (factor - 1) * learned["distance"] * along
+    return Cameras(poses, zoom[:, None] * cameras.intrinsics, cameras.width, cameras.height)
 
 
 def frame_pose_of(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
@@ -132,6 +159,8 @@ def prior(learned: Parameters, expected: PosePrior) -> Tensor:
     if len(learned["poses"]) > 1:
         jumps = learned["poses"][1:] - learned["poses"][:-1]
         total = total + STEP_WEIGHT * (jumps / STEP).square().mean()
+    if "log_focal" in learned:
+        total = total + FOCAL_WEIGHT * (learned["log_focal"] / FOCAL).square().mean()
     return total + PADDING_WEIGHT * (learned["padding"] / PADDING).square().mean()
 
 
@@ -165,11 +194,7 @@ def run_stage(
         for row in sorted(rows):
             seen = observed(row)
             if seen is not None:
-                drawn = drawn_frame(learned, clip, surface, row, seen.cameras)
-                loss = loss + silhouette_error(drawn, seen) / len(rows)
-                if seen.joints is not None:
-                    places = posed_joints(learned, clip, surface, row)
-                    loss = loss + KEYPOINT_WEIGHT * keypoint_error(places, seen.joints, seen.cameras) / len(rows)
+                loss = loss + frame_error(learned, clip, surface, row, seen) / len(rows)
         loss.backward()
         _forget_others(learned, stage.learned)
         learned.step(step, step / stage.steps)
@@ -177,10 +202,19 @@ def run_stage(
     return learned
 
 
+def frame_error(learned: Parameters, clip: MotionClip, surface: Surface, row: int, seen: ObservedFrame) -> Tensor:
+    """Return the error of frame ``row``: of its silhouettes, and of its joints where they are marked."""
+    error = silhouette_error(drawn_frame(learned, clip, surface, row, seen.cameras), seen)
+    if seen.joints is not None:
+        places, cameras = posed_joints(learned, clip, surface, row), refined(seen.cameras, learned)
+        error = error + KEYPOINT_WEIGHT * keypoint_error(places, seen.joints, cameras)
+    return error
+
+
 def drawn_frame(learned: Parameters, clip: MotionClip, surface: Surface, row: int, cameras: Cameras) -> Tensor:
     """Return the silhouettes (V, H, W) of frame ``row`` for V cameras."""
     discs = surface.in_pose(learned["betas"], learned["padding"], frame_pose_of(learned, clip, row))
-    return drawn_silhouettes(discs, cameras)
+    return drawn_silhouettes(discs, refined(cameras, learned))
 
 
 def spread_order(count: int) -> list[int]:

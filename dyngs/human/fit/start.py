@@ -18,7 +18,7 @@ from dyngs.camera import Cameras
 from dyngs.data.pictures.silhouettes import silhouette_box
 from dyngs.human.fit.observed import ObservedFrame
 from dyngs.human.fit.pose_prior import NUM_TURNED, usual, usual_pose
-from dyngs.human.fit.solve import Observations, Stage, drawn_frame, new_fit, run_stage, silhouette_error
+from dyngs.human.fit.solve import Observations, Stage, frame_error, new_fit, run_stage
 from dyngs.human.fit.surface import Surface
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
@@ -145,7 +145,7 @@ def _followed(
     rows: range | list[int],
     tick: Callable[[], None],
 ) -> tuple[MotionClip, float]:
-    """Return the clip with the poses of ``rows`` found one after the other, and the mean error of their silhouettes."""
+    """Return the clip with the poses of ``rows`` found one after the other, and the mean error of what is seen."""
     poses, trans, errors = clip.poses.clone(), clip.trans.clone(), []
     for row in rows:
         seen = observed(row)
@@ -189,7 +189,7 @@ def _found_from(
         stage = Stage(STEPS, 1, ("poses", "trans"))
         learned = run_stage(learned, stage, one, surface, lambda _, at=shown: at, usual(one))
     with torch.no_grad():
-        error = float(silhouette_error(drawn_frame(learned, one, surface, 0, seen.cameras), seen))
+        error = float(frame_error(learned, one, surface, 0, seen))
     own = Rotation.from_rotvec(learned["poses"][0].detach().numpy())
     given = Rotation.from_rotvec(pose[:NUM_TURNED].numpy())
     found = pose.clone()
