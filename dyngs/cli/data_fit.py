@@ -8,6 +8,8 @@ from pathlib import Path
 from dyngs.cli.arguments import data_section
 from dyngs.cli.progress_bar import ProgressBar
 
+_GIVEN = ("keypoints", "masks", "background", "joints", "body")
+
 
 def add_parser(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``fit`` to the commands of ``dyngs data``."""
@@ -34,6 +36,13 @@ def add_parser(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         metavar="PATH",
         help="a picture of the place without the person, or a folder of one for each camera: masks are made by it",
     )
+    parser.add_argument(
+        "--joints",
+        type=Path,
+        metavar="PATH",
+        help="a fit of another program: 3D joints (.npz, .json), a folder of SAM 3D Body, or posed vertices",
+    )
+    parser.add_argument("--body", type=Path, metavar="FILE", help="body file (SMPL, ...) that posed vertices belong to")
     parser.add_argument("overrides", nargs="*", default=[], metavar="data.key=value", help="keys of data")
     parser.set_defaults(run=run_fit)
 
@@ -44,7 +53,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
     from dyngs.human.fit.inputs import FitInputs
 
     options = data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
-    given = FitInputs(arguments.keypoints, arguments.masks, arguments.background)
+    given = FitInputs(**{name: getattr(arguments, name) for name in _GIVEN})
     with ProgressBar() as report:
         result = write_fitted_capture(options, arguments.out, report, given)
     print(result.summary())

@@ -99,7 +99,7 @@ def person_mask(background: Background, picture: np.ndarray) -> np.ndarray:
     closed = ndimage.binary_closing(padded, _disc(radius))[2 * radius : -2 * radius, 2 * radius : -2 * radius]
     opened = ndimage.binary_opening(ndimage.binary_fill_holes(closed), _disc(1))
     rim = opened & np.logical_not(ndimage.binary_erosion(opened, iterations=EDGE, border_value=1))
-    opened &= ~(rim & (away < HALF * ndimage.maximum_filter(away, 2 * EDGE + 1)))
+    opened = opened & np.logical_not(rim & (away < HALF * ndimage.maximum_filter(away, 2 * EDGE + 1)))
     labels = np.empty(opened.shape, np.int32)
     if not ndimage.label(opened, output=labels):
         return opened

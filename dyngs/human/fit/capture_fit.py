@@ -5,8 +5,8 @@ Local letters: F frames, V views.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.fitted_body import numbered
 from dyngs.data.loader import PictureLoader
 from dyngs.errors import DyngsError
+from dyngs.human.fit.joints3d import Joints3D
 from dyngs.human.fit.keypoints import Keypoints
 from dyngs.human.fit.lens_fit import LensFit, fit_lens
 from dyngs.human.fit.lens_fit import num_ticks as num_lens_ticks
@@ -118,6 +119,13 @@ class _Seen:
     judged: dict[int, ObservedFrame | None]
     held_out: int
 
+    def with_places(self, places: Mapping[int, Tensor]) -> _Seen:
+        """Return the same with joints given in 3D, by row."""
+        used = {
+            row: None if frame is None else replace(frame, places=places.get(row)) for row, frame in self.used.items()
+        }
+        return replace(self, used=used, judged=used if self.judged is self.used else self.judged)
+
     def halved(self, row: int) -> ObservedFrame | None:
         """Return the frame of a row at half the size."""
         found = self.used[row]
@@ -133,6 +141,7 @@ def fit_capture(
     effort: FitEffort = FitEffort(),
     *,
     guessed_lens: bool = False,
+    joints: Joints3D | None = None,
 ) -> CaptureFit:
     """Return the fit of ``body`` to the silhouettes of a capture's training views.
 
@@ -146,6 +155,7 @@ def fit_capture(
         report: of progress.
         keypoints: of the training views, see ``dyngs.human.fit.keypoints``; None without.
         effort: how much it may cost.
+        joints: in 3D, of frames of the capture, see ``dyngs.human.fit.joints3d``; None without.
         guessed_lens: the capture is one camera that stands at the origin, with a guessed focal length to be refined.
 
     Raises:
@@ -162,6 +172,7 @@ def fit_capture(
         else captured_motion(capture.root, capture.body["train"], views, body.joints)
     )
     seen, surface = _look(capture, motion, options, effort, keypoints or {}), surface_of(body, RESOLUTION)
+    seen = seen if joints is None else seen.with_places({motion.rows[x]: joints[x] for x in motion.rows if x in joints})
     if given:
         tried = _from_given(motion.clip, surface, seen, report, effort)
     else:

@@ -24,7 +24,7 @@ from dyngs.files.write import write_image, write_text
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, fit_capture
 from dyngs.human.fit.clips import FittedClip, fitted_clips
-from dyngs.human.fit.inputs import NOTHING_ELSE, FitInputs, has_guessed_lens, read_person, with_lens
+from dyngs.human.fit.inputs import NOTHING_ELSE, FitInputs, has_guessed_lens, joints_of, read_person, with_lens
 from dyngs.human.fit.keypoints import read_keypoints
 from dyngs.human.fit.overlays import FITTED, GIVEN, overlay, side_by_side
 from dyngs.human.fit.surface import surface_of
@@ -90,7 +90,8 @@ def _fitted(
         capture = read_person(options, given, masks)
         capture = capture.replace(splits=numbered(capture.splits))
         points = {} if given.keypoints is None else read_keypoints(given.keypoints, capture.splits["train"])
-        found = fit_capture(capture, options, body, report, points, guessed_lens=has_guessed_lens(capture))
+        lens, joints = has_guessed_lens(capture), joints_of(capture, given)
+        found = fit_capture(capture, options, body, report, points, guessed_lens=lens, joints=joints)
         capture = with_lens(capture, found.lens)
         clips = fitted_clips(capture, body, found)
         if with_pictures:

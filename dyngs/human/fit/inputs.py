@@ -13,7 +13,10 @@ from dyngs.data.prepare.background_masks import with_background_masks
 from dyngs.data.prepare.standing_camera import FORMAT, is_plain_clip, read_standing_camera, silhouettes_of, zoomed
 from dyngs.data.read import is_capture, read_capture
 from dyngs.errors import DyngsError
+from dyngs.human.fit.joints3d import Joints3D, read_joints
 from dyngs.human.fit.lens_fit import LensFit
+from dyngs.human.template.body_reader import read_body
+from dyngs.human.template.load import default_template
 
 _LOOKED_AT, _PRESENT = 128, 0.2
 """Longest side of the pictures in which somebody is looked for, and the least share of the usual area that counts."""
@@ -27,11 +30,15 @@ class FitInputs:
         keypoints: folder or file of 2D key points.
         masks: folder of masks, white = the person.
         background: picture of the place without the person, or a folder of one for each camera.
+        joints: file or folder of 3D joints or posed vertices, see ``read_joints``.
+        body: body file whose vertices these are; None: the free template.
     """
 
     keypoints: Path | None = None
     masks: Path | None = None
     background: Path | None = None
+    joints: Path | None = None
+    body: Path | None = None
 
 
 NOTHING_ELSE = FitInputs()
@@ -68,6 +75,17 @@ def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable
             raise DyngsError(f"{source}: no silhouettes, and the camera moves; add masks of the person")
         capture = with_background_masks(capture, work, given.background, say)
     return _without_empty_frames(capture, options, say) if has_guessed_lens(capture) else capture
+
+
+def joints_of(capture: Capture, given: FitInputs) -> Joints3D | None:
+    """Return the 3D joints of the frames of a capture, None without any.
+
+    Raises:
+        DyngsError: see ``read_joints``.
+    """
+    if given.joints is None:
+        return None
+    return read_joints(given.joints, capture, default_template() if given.body is None else read_body(given.body))
 
 
 def with_lens(capture: Capture, lens: LensFit | None) -> Capture:

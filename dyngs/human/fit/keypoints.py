@@ -17,6 +17,7 @@ from dyngs.data.pictures.lens import undistorted_points
 from dyngs.errors import DyngsError, reading
 from dyngs.files.fields import numbers_of
 from dyngs.files.json_files import read_json_object
+from dyngs.human.fit.joint_orders import BODY_25, COCO, COCO_18
 from dyngs.human.template.joints import JOINT_NAMES
 
 _SEEN = ("eye", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
@@ -26,21 +27,7 @@ JOINTS = {
     name: row for row, name in enumerate(JOINT_NAMES) if name.removeprefix("left_").removeprefix("right_") in _SEEN
 }
 """Names of these joints, and their rows in ``JOINT_NAMES``."""
-_COCO = (
-    *("nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder", "left_elbow"),
-    *("right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle"),
-    "right_ankle",
-)
-_BODY_25 = (
-    *("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist"),
-    *("pelvis", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle", "right_eye"),
-    "left_eye",
-)
-_COCO_18 = (
-    *("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist"),
-    *("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle", "right_eye", "left_eye"),
-)
-_ORDERS = {17: _COCO, 133: _COCO, 25: _BODY_25, 18: _COCO_18}
+_ORDERS = {17: COCO, 133: COCO, 25: BODY_25, 18: COCO_18}
 """Number of key points of a format to the names of the first ones, as published."""
 
 Keypoints = dict[str, Tensor]
@@ -58,7 +45,7 @@ def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
     Raises:
         DyngsError: a file that is neither, or no key points for any view.
     """
-    stems = _by_stem(views)
+    stems = by_stem(views)
     rows = _openpose(path, stems) if path.is_dir() else _coco(path, stems)
     if not rows:
         raise DyngsError(
@@ -69,7 +56,7 @@ def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
     return {name: _placed(by_name[name], joints) for name, joints in rows.items()}
 
 
-def _by_stem(views: Sequence[View]) -> dict[str, str]:
+def by_stem(views: Sequence[View]) -> dict[str, str]:
     """Return picture name without folder and suffix to name of the view, and with the folder, too."""
     found: dict[str, str] = {}
     twice: set[str] = set()

@@ -31,12 +31,14 @@ class ObservedFrame:
         known: (V, S, S) float32, 1 inside the picture that the square was cut out of and where its mask counts, else 0.
         joints: (V, 55, 3) column and row in the square, as shares of its side, and confidence of joints that were
             marked as key points; None without any.
+        places: (55, 4) places in the world and confidence of joints that are given in 3D; None without any.
     """
 
     cameras: Cameras
     alpha: Tensor
     known: Tensor
     joints: Tensor | None = None
+    places: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.alpha)
@@ -47,7 +49,7 @@ class ObservedFrame:
         scale = self.cameras.intrinsics.new_tensor([1 / factor, 1 / factor, 1.0])
         cameras = Cameras(self.cameras.cam_from_world, scale[:, None] * self.cameras.intrinsics, size, size)
         known = (_resized(self.known, size) > 0.999).float()
-        return ObservedFrame(cameras, _resized(self.alpha, size), known, self.joints)
+        return ObservedFrame(cameras, _resized(self.alpha, size), known, self.joints, self.places)
 
 
 def longest_box_side(pictures: Iterable[Picture]) -> int:

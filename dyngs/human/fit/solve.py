@@ -39,6 +39,8 @@ TURN_WEIGHT, POSE_WEIGHT, STEP_WEIGHT = 3e-2, 1e-3, 1e-3
 steps where these are much smaller: renders of new poses then lose 1 to 3 dB, while the silhouettes look as good."""
 KEYPOINT, KEYPOINT_WEIGHT = 0.02, 0.1
 """Expected error of a key point, as a share of the square's side, and the weight of their robust mean."""
+PLACE, PLACE_WEIGHT = 0.03, 0.1
+"""Expected error of a joint given in 3D, metres of the person, and the weight of their robust mean."""
 FOCAL, FOCAL_WEIGHT = 0.35, 1e-3
 """Expected error of a guessed focal length, as a logarithm, and the weight of its square."""
 PADDING, PADDING_WEIGHT = 0.01, 2e-3
@@ -149,6 +151,17 @@ def keypoint_error(joints: Tensor, marked: Tensor, cameras: Cameras) -> Tensor:
     return (weights * ((1 + away).sqrt() - 1)).sum() / weights.sum().clamp_min(1.0)
 
 
+def place_error(joints: Tensor, given: Tensor, unit: Tensor) -> Tensor:
+    """Return the mean robust distance of joints (J, 3) from places (55, 4), see ``ObservedFrame``, as for key points.
+
+    ``unit`` is the length of a metre of the person in the world.
+    """
+    count = min(len(joints), len(given))
+    away = (joints[:count] - given[:count, :3]).square().sum(-1) / (PLACE * unit) ** 2
+    weights = given[:count, 3]
+    return (weights * ((1 + away).sqrt() - 1)).sum() / weights.sum().clamp_min(1.0)
+
+
 def prior(learned: Parameters, expected: PosePrior) -> Tensor:
     """Return the penalty of shapes, turns and poses that are far from those given, or that jump."""
     body, bones = learned["betas"].square().tensor_split([-NUM_BONE_SHAPES])
@@ -208,6 +221,9 @@ def frame_error(learned: Parameters, clip: MotionClip, surface: Surface, row: in
     if seen.joints is not None:
         places, cameras = posed_joints(learned, clip, surface, row), refined(seen.cameras, learned)
         error = error + KEYPOINT_WEIGHT * keypoint_error(places, seen.joints, cameras)
+    if seen.places is not None:
+        unit = clip.scale[row] * learned["log_scale"][0].detach().exp()
+        error = error + PLACE_WEIGHT * place_error(posed_joints(learned, clip, surface, row), seen.places, unit)
     return error
 
 

@@ -10,14 +10,18 @@ from dyngs.human.fit.observed import ObservedFrame
 from dyngs.human.fit.pose_prior import near_given
 from dyngs.human.fit.solve import (
     KEYPOINT,
+    PLACE,
     Stage,
     drawn_frame,
     keypoint_error,
     new_fit,
+    place_error,
     posed_joints,
+    refined,
     run_stage,
     silhouette_error,
     spread_order,
+    with_lens,
 )
 from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.clip import MotionClip
@@ -104,3 +108,24 @@ def test_only_what_a_stage_names_is_learned(surface: Surface) -> None:
     assert not any(value.any() for value in start.values().values()), "what was learned before stays as it is"
     changed = {name for name, value in found.values().items() if value.any()}
     assert changed == {"betas"}
+
+
+def test_joints_given_in_3d_are_robust_distances() -> None:
+    joints, given = torch.zeros(55, 3), torch.zeros(55, 4)
+    assert float(place_error(joints, given, torch.ones(()))) == 0
+    given[4] = torch.tensor([3 * PLACE, 4 * PLACE, 0.0, 0.5])
+    given[5] = torch.tensor([0.0, 0.0, 0.0, 0.5])
+    assert float(place_error(joints, given, torch.ones(()))) == pytest.approx(0.5 * (26**0.5 - 1))
+    assert float(place_error(joints, given, torch.tensor(5.0))) == pytest.approx(0.5 * (2**0.5 - 1))
+
+
+def test_a_longer_lens_from_further_away_shows_the_same_size(surface: Surface) -> None:
+    learned = with_lens(new_fit(clip(), surface), 4.0)
+    with torch.no_grad():
+        learned["log_focal"].add_(0.5)
+    poses = torch.eye(4)[None]
+    shown = refined(Cameras(poses, torch.tensor([[[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]]), 64, 64), learned)
+    factor = torch.tensor(0.5).exp()
+    assert torch.allclose(shown.intrinsics[0, 0, 0], 100 * factor)
+    assert torch.allclose(100 * factor / (4.0 + shown.cam_from_world[0, 2, 3]), torch.tensor(100 / 4.0))
+    assert refined(shown, new_fit(clip(), surface)) is shown
