@@ -57,6 +57,7 @@ def bare_scene(
     colours: Callable[[Tensor], Tensor] = bands,
     resolution: int = RESOLUTION,
     pose_offsets: bool = False,
+    light: bool = False,
 ) -> HumanScene:
     """Opaque discs on the skin; the joints are moved, the pose turned and the size changed by what was learned."""
     body, texels = template(), atlas(resolution)
@@ -67,7 +68,8 @@ def bare_scene(
     )
     clip = random_clip() if clip is None else clip
     skeleton = Skeleton(body.joints, body.parents)
-    learned = new_corrections(HumanModel(pose_offsets=pose_offsets), clip, skeleton, anchors)
+    options = HumanModel(pose_offsets=pose_offsets, light=light)
+    learned = new_corrections(options, clip, skeleton, anchors, texels.normals)
     make = torch.Generator().manual_seed(7)
     values = {name: x.detach().clone() for name, x in learned.values().items()}
     values["joints"] = 0.01 * torch.randn(55, 3, generator=make)

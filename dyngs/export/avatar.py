@@ -22,6 +22,7 @@ from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import new_corrections
+from dyngs.human.avatar.light import TERMS
 from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.avatar.validation import require_body, require_shapes
@@ -92,6 +93,8 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
         tensors |= {"shapes.directions": scene.shapes.directions.half(), "shapes.faces": scene.shapes.faces.int()}
     if scene.pose_dirs is not None:
         tensors["pose_dirs"] = scene.pose_dirs
+    if scene.light is not None:
+        tensors |= {"light": scene.light.factors, "normals": scene.light.normals}
     header = {**asdict(run.info), "near": model.near, "eps2d": model.eps2d, "template": asdict(_template_ref(model))}
     write_tensors(path, _KIND, {name: x.detach().contiguous() for name, x in tensors.items()}, header)
     return path
@@ -157,6 +160,8 @@ def _check(tensors: Mapping[str, Tensor]) -> None:
     shapes |= {"fit.log_scale": (1,), "reference.trans": (3,), "reference.scale": (1,)}
     if "pose_dirs" in tensors:
         shapes["pose_dirs"] = (n, 27)
+    if "light" in tensors:
+        shapes |= {"light": (TERMS, 3), "normals": (n, 3)}
     if not n:
         raise ValueError("there are no Gaussians")
     for name, shape in shapes.items():
@@ -199,8 +204,8 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
         "log_scale": tensors["fit.log_scale"],
         "weights": torch.zeros_like(anchors.weights),
     }
-    values |= {name: tensors[name] for name in ("pose_dirs",) if name in tensors}
-    options = HumanModel(pose_offsets="pose_dirs" in tensors)
+    values |= {name: tensors[name] for name in ("pose_dirs", "light", "normals") if name in tensors}
+    options = HumanModel(pose_offsets="pose_dirs" in tensors, light="light" in tensors)
     return HumanScene(
         gaussians=Gaussians(**part("gaussians.")),
         anchors=anchors,

@@ -49,7 +49,7 @@ def trained(capture: Path, folder: Path, **model: object) -> Path:
 
 @pytest.fixture(scope="module")
 def run_dir(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trained(capture, tmp_path_factory.mktemp("run"), pose_offsets=True)
+    return trained(capture, tmp_path_factory.mktemp("run"), pose_offsets=True, light=True)
 
 
 @pytest.fixture
@@ -74,6 +74,8 @@ def test_the_file_plays_as_the_run(run_dir: Path, file: Path, motion: Path) -> N
     assert isinstance(read.scene, HumanScene)
     assert isinstance(run.scene, HumanScene)
     assert read.scene.pose_dirs is not None
+    assert read.scene.light is not None
+    assert read.scene.light.factors.any()
     assert asdict(read.info) == asdict(run.info)
     assert torch.equal(read.scene.anchors.uv, run.scene.anchors.uv)
     assert write_avatar(run, file.with_name("again.safetensors")).read_bytes() == file.read_bytes()

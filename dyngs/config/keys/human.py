@@ -49,6 +49,10 @@ class HumanModel(_OnTemplate):
         default=False,
         description="learn offsets at rest that are linear in the rotations of nearby joints (pose blend shapes)",
     )
+    light: bool = Field(
+        default=False,
+        description="learn light that is fixed in the world: colours depend on where the surface faces",
+    )
     fill_unseen: bool = Field(
         default=True,
         description="after the last step, fill what the pictures hardly show from the other side of the body and from "

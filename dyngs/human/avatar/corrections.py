@@ -14,9 +14,11 @@ from torch import Tensor
 
 from dyngs.config import HumanModel
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
+from dyngs.human.avatar.light import TERMS, Light
 from dyngs.human.avatar.posing import BodyPose, Skeleton
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.human.template.joints import mirrored_joints
 from dyngs.parameters import Parameters
 from dyngs.state import Role, fields_moved_to
 
@@ -24,16 +26,18 @@ LR = {
     "poses": 1e-3,  # of single frames, rad
     "trans": 5e-4,  # of single frames, m
     "turns": 1e-3,  # of all frames, rad
-    "joints": 5e-4,  # at rest, m
+    "joints": 5e-3,  # at rest, m
     "log_scale": 2e-4,
     "weights": 5e-3,  # logarithms
     "pose_dirs": 1e-4,  # m per unit of a rotation matrix
+    "light": 5e-3,  # share of the colour
+    "normals": 1e-3,
 }
 """Learning rates."""
 LR_DECAY = 0.1
 """Last over first learning rate."""
-POSE_WEIGHT, WEIGHTS_WEIGHT = 1e-4, 1e-3
-"""Of the squared corrections of poses and joints, and of skinning weights, in the loss."""
+POSE_WEIGHT, WEIGHTS_WEIGHT, LIGHT_WEIGHT = 1e-4, 1e-3, 1e-3
+"""Of the squared corrections of poses and joints, of skinning weights, and of the light, in the loss."""
 POSE_CM = 0.05
 """Rotation of a joint, rad, that is penalized as much as a centimetre."""
 
@@ -55,12 +59,17 @@ class SharedCorrection:
         return fields_moved_to(self, device)
 
 
-def new_corrections(options: HumanModel, clip: MotionClip, skeleton: Skeleton, anchors: Anchors) -> Parameters:
+def new_corrections(
+    options: HumanModel, clip: MotionClip, skeleton: Skeleton, anchors: Anchors, normals: Tensor | None = None
+) -> Parameters:
     """Return the corrections to learn, all zero, of a clip of F frames, a skeleton and skinning weights.
+
+    With ``options.light`` also the light, none, and the ``normals`` (N, 3) that it falls on.
 
     Tensors: ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before the given ones; ``trans`` (F, 3);
     ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K);
-    optionally ``pose_dirs`` (N, 27), see ``dyngs.human.avatar.posing.learned_offsets``.
+    optionally ``pose_dirs`` (N, 27), see ``dyngs.human.avatar.posing.learned_offsets``, ``light`` (8, 3) and
+    ``normals`` (N, 3), see ``dyngs.human.avatar.light``.
     """
     unit = float(clip.scale.mean())
     zeros = {
@@ -73,7 +82,11 @@ def new_corrections(options: HumanModel, clip: MotionClip, skeleton: Skeleton, a
     }
     if options.pose_offsets:
         zeros["pose_dirs"] = anchors.weights.new_zeros(len(anchors), 27)
-    roles = {name: Role.PER_GAUSSIAN if name in ("weights", "pose_dirs") else Role.SHARED for name in zeros}
+    if options.light:
+        zeros["light"] = anchors.weights.new_zeros(TERMS, 3)
+        zeros["normals"] = torch.zeros_like(anchors.points) if normals is None else normals
+    own = ("weights", "pose_dirs", "normals")
+    roles = {name: Role.PER_GAUSSIAN if name in own else Role.SHARED for name in zeros}
     return Parameters(zeros, LR | {"trans": LR["trans"] * unit}, LR_DECAY, roles)
 
 
@@ -83,6 +96,8 @@ def correction_penalties(learned: Parameters, options: HumanModel) -> dict[str, 
     terms = {"pose": POSE_WEIGHT * (turns + (100 * learned["joints"]).square().mean())}
     if "pose_dirs" in learned and options.offset_weight > 0:
         terms["pose offsets"] = options.offset_weight * (100 * learned["pose_dirs"]).square().sum(1).mean()
+    if "light" in learned:
+        terms["light"] = LIGHT_WEIGHT * learned["light"].square().sum()
     terms["skinning weights"] = WEIGHTS_WEIGHT * learned["weights"].square().mean()
     return terms
 
@@ -119,6 +134,22 @@ def corrected_clip(
 def corrected_skeleton(learned: Parameters, skeleton: Skeleton) -> Skeleton:
     """Return the skeleton with its corrected joints."""
     return Skeleton(skeleton.joints + learned["joints"], skeleton.parents)
+
+
+def share_sides(learned: Parameters) -> None:
+    """Give the joints at rest the mean gradient of both sides of the body, so that they stay mirror images.
+
+    People are nearly symmetric, rarely move both sides alike, and a motion shows only the joints that it bends.
+    """
+    gradient = learned["joints"].grad
+    if gradient is not None:
+        other = gradient[list(mirrored_joints(len(gradient)))] * gradient.new_tensor([-1.0, 1.0, 1.0])
+        gradient.add_(other).div_(2)
+
+
+def learned_light(learned: Parameters) -> Light | None:
+    """Return the light, None if none is learned."""
+    return Light(learned["normals"], learned["light"]) if "light" in learned else None
 
 
 def corrected_weights(learned: Parameters, anchors: Anchors, num_joints: int) -> Tensor:

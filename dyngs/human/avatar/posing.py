@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
+from dyngs.human.avatar.light import Light
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.covariance import transform_covariance
 from dyngs.human.pose.nearest_rotation import nearest_rotations
@@ -86,7 +87,12 @@ class BodyPose:
 
 
 def pose_gaussians(
-    gaussians: Gaussians, weights: Tensor, skeleton: Skeleton, posing: BodyPose, offsets: Tensor | None = None
+    gaussians: Gaussians,
+    weights: Tensor,
+    skeleton: Skeleton,
+    posing: BodyPose,
+    offsets: Tensor | None = None,
+    light: Light | None = None,
 ) -> Gaussians:
     """Return the N Gaussians in a pose, in the world; differentiable in all arguments.
 
@@ -99,17 +105,19 @@ def pose_gaussians(
         skeleton: of J joints.
         posing: the pose.
         offsets: (N, 3) m, added to the means at rest; None: no offsets.
+        light: that falls on them; None: even light.
     """
     transforms = blend_transforms(weights, joint_transforms(skeleton.joints, skeleton.parents, posing.rotations))
     linear = transforms[..., :3]
     means = gaussians.means if offsets is None else gaussians.means + offsets
     quats, log_scales = transform_covariance(linear, gaussians.quats, gaussians.log_scales)
+    sh = gaussians.sh if gaussians.sh.shape[1] == 1 else rotate_sh(gaussians.sh, nearest_rotations(linear))
     return Gaussians(
         means=posing.scale * apply_transforms(transforms, means) + posing.trans,
         quats=quats,
         log_scales=log_scales + posing.scale.log(),
         logit_opacities=gaussians.logit_opacities,
-        sh=gaussians.sh if gaussians.sh.shape[1] == 1 else rotate_sh(gaussians.sh, nearest_rotations(linear)),
+        sh=sh if light is None else light.on(sh, linear),
     )
 
 

@@ -18,8 +18,10 @@ from dyngs.human.avatar.corrections import (
     corrected_pose,
     corrected_skeleton,
     corrected_weights,
+    learned_light,
     new_corrections,
 )
+from dyngs.human.avatar.light import Light
 from dyngs.human.avatar.posing import (
     BodyPose,
     PoseBlendShapes,
@@ -123,6 +125,12 @@ class HumanScene(Scene):
         return self.learned["pose_dirs"].detach() if "pose_dirs" in self.learned else None
 
     @property
+    def light(self) -> Light | None:
+        """The learned light, or None."""
+        found = learned_light(self.learned)
+        return None if found is None else Light(found.normals.detach(), found.factors.detach())
+
+    @property
     def fit(self) -> SharedCorrection:
         """The correction of all poses."""
         return SharedCorrection(self.learned["turns"].detach(), float(self.learned["log_scale"].detach()))
@@ -157,7 +165,7 @@ class HumanScene(Scene):
     def in_pose(self, posing: BodyPose, time: float) -> Moment:
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable in the pose."""
         offsets = rest_offsets(self.anchors, self.weights, posing, self.shapes, self.pose_dirs)
-        gaussians = pose_gaussians(self.gaussians, self.weights, self.learned_skeleton, posing, offsets)
+        gaussians = pose_gaussians(self.gaussians, self.weights, self.learned_skeleton, posing, offsets, self.light)
         return Moment(gaussians, time, Frame(self.gaussians.means, posing.rotations[0]))
 
     def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
@@ -167,15 +175,15 @@ class HumanScene(Scene):
             row: of the clip.
             given_weights: (N, J) of ``skinning_weights``; then nothing that was learned about the body is applied.
         """
-        skeleton, pose_dirs = self.skeleton, None
+        skeleton, pose_dirs, light = self.skeleton, None, None
         if given_weights is None:
             posing, skeleton = corrected_pose(self.learned, self.clip, row), corrected_skeleton(self.learned, skeleton)
             weights = corrected_weights(self.learned, self.anchors, len(skeleton.joints))
-            pose_dirs = self.learned.get("pose_dirs")
+            pose_dirs, light = self.learned.get("pose_dirs"), learned_light(self.learned)
         else:
             posing, weights = frame_pose(self.clip, row), given_weights
         offsets = rest_offsets(self.anchors, weights, posing, self.shapes, pose_dirs)
-        return pose_gaussians(self.gaussians, weights, skeleton, posing, offsets), posing
+        return pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light), posing
 
     def given_weights(self) -> Tensor:
         """Return (N, J) skinning weights of the template."""

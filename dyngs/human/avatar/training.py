@@ -15,18 +15,21 @@ from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.human.avatar.corrections import correction_penalties, new_corrections
+from dyngs.human.avatar.corrections import correction_penalties, new_corrections, share_sides
+from dyngs.human.avatar.light import difference_of_sides, rest_normals
 from dyngs.human.avatar.neighbours import nearest_neighbours
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.subject import Subject
-from dyngs.human.avatar.unseen import HARDLY, filled, sightings, trust_in
+from dyngs.human.avatar.unseen import HARDLY, filled, mirror_images, sightings, trust_in
 from dyngs.scene import Moment, Scene
 from dyngs.state import Role, State, StateTensor
 from dyngs.static.rates import Rates
 
 NEIGHBOURS = 5
 CENTIMETRE = 0.01
+SIDES_WEIGHT = 0.1
+"""Of the squared difference between colours of both sides, where light is learned, in the loss."""
 LOOKS = 100
 """Number of training views, at most, in which it is counted how much they show of each Gaussian."""
 WORTH_TELLING = 0.01
@@ -53,11 +56,13 @@ class HumanTraining:
         self._rows = {frame: row for row, frame in enumerate(frames)}
         self._given_weights: Tensor | None = None
         self._near: Tensor | None = None
+        self._images: tuple[Tensor, Tensor] | None = None
 
     def first_scene(self, gaussians: Gaussians, subject: Subject) -> HumanScene:
         """Return the scene of the first Gaussians: nothing is learned yet."""
         clip = subject.footage.clip
-        learned = new_corrections(self.options, clip, subject.skeleton, subject.anchors)
+        normals = rest_normals(gaussians) if self.options.light else None
+        learned = new_corrections(self.options, clip, subject.skeleton, subject.anchors, normals)
         return HumanScene(
             gaussians=gaussians,
             anchors=subject.anchors,
@@ -92,6 +97,8 @@ class HumanTraining:
         gaussians, posing = self._in_frame(scene, row, step)
         if self._refines(step):
             penalties |= correction_penalties(scene.learned, self.options)
+            if scene.light is not None:
+                penalties["sides"] = SIDES_WEIGHT * difference_of_sides(scene.gaussians, *self._images_in(scene))
         penalties |= self._between_neighbours(scene, gaussians, float(scene.clip.scale[row]), step)
         frame = Frame(scene.gaussians.means, posing.rotations[0])
         return Moment(gaussians, picture.time, frame, penalties)
@@ -101,6 +108,7 @@ class HumanTraining:
         if not self._refines(step):
             return 0
         progress = self.rates.progress(step, since=self.refines_from)
+        share_sides(scene.learned)
         return scene.learned.step(step - self.refines_from, progress)
 
     def after_step(self, scene: HumanScene, step: int, edited: bool) -> HumanScene:
@@ -137,11 +145,11 @@ class HumanTraining:
 
     def follow(self, edit: TopologyEdit) -> None:
         """Find out anew who the neighbours are, and what they weigh."""
-        self._given_weights = self._near = None
+        self._given_weights = self._near = self._images = None
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> HumanScene:
         scene = HumanScene.restored(self.options, gaussians, tensors)
-        self._near, self._given_weights = tensors.get("near"), None
+        self._near, self._given_weights, self._images = tensors.get("near"), None, None
         return replace(scene, colour=like.colour, options=like.options, background=like.background)
 
     def state(self) -> State:
@@ -154,6 +162,12 @@ class HumanTraining:
         if self._given_weights is None:
             self._given_weights = scene.given_weights()
         return scene.in_frame(row, self._given_weights)
+
+    def _images_in(self, scene: HumanScene) -> tuple[Tensor, Tensor]:
+        """Return the mirror images of the Gaussians, see ``mirror_images``."""
+        if self._images is None:
+            self._images = mirror_images(scene.anchors, float(scene.skeleton.joints[0, 0]))
+        return self._images
 
     def _refines(self, step: int) -> bool:
         return self.options.refine and step > self.refines_from

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.light import TERMS
 from dyngs.human.pose.skinning import check_tree
 from dyngs.human.template.joints import SMPLX_ROWS
 from dyngs.tensor_checks import require_indices, require_moments, require_positive, require_tensor
@@ -45,6 +46,9 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
     require_tensor("learned.weights", state["learned.weights"], tuple(state["anchors.weights"].shape))
     if "learned.pose_dirs" in state:
         require_tensor("learned.pose_dirs", state["learned.pose_dirs"], (n, 27))
+    if "learned.light" in state:
+        require_tensor("learned.light", state["learned.light"], (TERMS, 3))
+        require_tensor("learned.normals", state["learned.normals"], (n, 3))
     if "shapes.directions" in state:
         require_indices("anchors.face", state["anchors.face"], (n,), len(state["shapes.faces"]))
     if "near" in state:

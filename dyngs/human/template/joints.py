@@ -19,6 +19,17 @@ SMPLX_ROWS = {55: tuple(range(55)), 52: (*range(22), *range(25, 55)), 24: tuple(
 SMPL's last two joints, the hands, have no counterpart.
 """
 
+
+def mirrored_joints(count: int) -> tuple[int, ...]:
+    """Return the row of the same joint on the other side, for each joint of a body with so many of them."""
+    names = [JOINT_NAMES[row] for row in SMPLX_ROWS[count]]
+    names += ["left_hand", "right_hand"][: count - len(names)]
+    swapped = {"left": "right", "right": "left"}
+    parts = (name.partition("_") for name in names)
+    other = [f"{swapped[side]}_{rest}" if side in swapped else side + bar + rest for side, bar, rest in parts]
+    return tuple(names.index(name) for name in other)
+
+
 JOINT_PARENTS = (
     *(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 15, 15, 15),
     *(20, 25, 26, 20, 28, 29, 20, 31, 32, 20, 34, 35, 20, 37, 38),

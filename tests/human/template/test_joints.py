@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dyngs.human.template.joints import JOINT_NAMES
+import pytest
+
+from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS, mirrored_joints
 
 
 def test_the_joints_are_those_of_smplx() -> None:
@@ -10,3 +12,20 @@ def test_the_joints_are_those_of_smplx() -> None:
     known |= {25: "left_index1", 36: "left_ring3", 39: "left_thumb3", 40: "right_index1", 54: "right_thumb3"}
     assert len(set(JOINT_NAMES)) == 55
     assert {i: JOINT_NAMES[i] for i in known} == known
+
+
+@pytest.mark.parametrize("count", [24, 52, 55])
+def test_the_other_side_of_every_joint(count: int) -> None:
+    mirrored = mirrored_joints(count)
+    assert sorted(mirrored) == list(range(count))
+    assert [mirrored[row] for row in mirrored] == list(range(count))
+    for row, rank in enumerate(SMPLX_ROWS[count]):
+        name, other = JOINT_NAMES[rank], mirrored[row]
+        if other != row:
+            assert {name, JOINT_NAMES[SMPLX_ROWS[count][other]]} == {
+                f"left_{name[name.index('_') + 1 :]}",
+                f"right_{name[name.index('_') + 1 :]}",
+            }
+        else:
+            assert "left" not in name
+            assert "right" not in name
