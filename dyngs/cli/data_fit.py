@@ -8,7 +8,7 @@ from pathlib import Path
 from dyngs.cli.arguments import data_section
 from dyngs.cli.progress_bar import ProgressBar
 
-_GIVEN = ("keypoints", "masks", "background", "joints", "body")
+_GIVEN = ("keypoints", "masks", "background", "joints", "body", "person")
 
 
 def add_parser(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -43,6 +43,12 @@ def add_parser(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         help="a fit of another program: 3D joints (.npz, .json), a folder of SAM 3D Body, or posed vertices",
     )
     parser.add_argument("--body", type=Path, metavar="FILE", help="body file (SMPL, ...) that posed vertices belong to")
+    parser.add_argument(
+        "--person",
+        type=Path,
+        metavar="PATH",
+        help="a fitted capture of the same person, or the run of their avatar: the shape is kept, poses are found",
+    )
     parser.add_argument("overrides", nargs="*", default=[], metavar="data.key=value", help="keys of data")
     parser.set_defaults(run=run_fit)
 

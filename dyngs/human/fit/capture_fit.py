@@ -48,8 +48,6 @@ FRAMES = 3
 """Frames drawn in each step."""
 SHAPE = ("log_scale", "betas", "padding", "offset", "shift")
 """What is the same in all frames."""
-_SHAPE_OF_ONE_CAMERA = tuple(name for name in SHAPE if name != "log_scale")
-"""The same where pictures do not tell a small person from a distant one."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +67,30 @@ class FitEffort:
     def steps_for(self, clip: MotionClip) -> int:
         """Return the number of steps that draws every frame often enough."""
         return max(self.steps, -(-self.visits * len(clip) // FRAMES))
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known beside pictures and given poses.
+
+    Attributes:
+        joints: in 3D, of frames of the capture, see ``dyngs.human.fit.joints3d``; None without.
+        guessed_lens: the capture is one camera that stands at the origin, with a guessed focal length to be refined.
+        shape: the body has the shape of the person already.
+    """
+
+    joints: Joints3D | None = None
+    guessed_lens: bool = False
+    shape: bool = False
+
+    @property
+    def learned(self) -> tuple[str, ...]:
+        """Names of what is learned for all frames; one camera does not tell a small person from a distant one."""
+        fixed = ("log_scale",) * self.guessed_lens + ("betas",) * self.shape
+        return tuple(name for name in SHAPE if name not in fixed)
+
+
+NOTHING_KNOWN = Known()
 
 
 @dataclass(frozen=True)
@@ -139,9 +161,7 @@ def fit_capture(
     report: ReportProgress,
     keypoints: Keypoints | None = None,
     effort: FitEffort = FitEffort(),
-    *,
-    guessed_lens: bool = False,
-    joints: Joints3D | None = None,
+    known: Known = NOTHING_KNOWN,
 ) -> CaptureFit:
     """Return the fit of ``body`` to the silhouettes of a capture's training views.
 
@@ -155,8 +175,7 @@ def fit_capture(
         report: of progress.
         keypoints: of the training views, see ``dyngs.human.fit.keypoints``; None without.
         effort: how much it may cost.
-        joints: in 3D, of frames of the capture, see ``dyngs.human.fit.joints3d``; None without.
-        guessed_lens: the capture is one camera that stands at the origin, with a guessed focal length to be refined.
+        known: what else is known.
 
     Raises:
         DyngsError: no silhouettes, or nobody in them.
@@ -172,19 +191,20 @@ def fit_capture(
         else captured_motion(capture.root, capture.body["train"], views, body.joints)
     )
     seen, surface = _look(capture, motion, options, effort, keypoints or {}), surface_of(body, RESOLUTION)
+    joints = known.joints
     seen = seen if joints is None else seen.with_places({motion.rows[x]: joints[x] for x in motion.rows if x in joints})
     if given:
-        tried = _from_given(motion.clip, surface, seen, report, effort)
+        tried = _from_given(motion.clip, surface, seen, known.learned, report, effort)
     else:
         tick = _ticker("first poses", report, num_ticks(len(motion.clip)))
         clip = first_poses(motion.clip.times, surface, seen.used.__getitem__, tick)
         motion = CapturedMotion(clip, motion.frames)
-        tried = _from_silhouettes(clip, surface, seen, report, effort, with_size=not guessed_lens)
+        tried = _from_silhouettes(clip, surface, seen, known.learned, report, effort)
     lens = None
-    if guessed_lens:
-        candidate, lens = _with_lens(tried[-1], motion.clip, surface, seen, report, effort)
+    if known.guessed_lens:
+        candidate, lens = _with_lens(tried[-1], motion.clip, surface, seen, known.learned, report, effort)
         tried = (*tried, candidate)
-    chosen = tried[-1] if guessed_lens else simplest_of_the_best(tried)
+    chosen = tried[-1] if known.guessed_lens else simplest_of_the_best(tried)
     return CaptureFit(body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, not given, lens)
 
 
@@ -268,7 +288,12 @@ def _marked(views: Sequence[View], pictures: PictureLoader, shown: Sequence[int]
 
 
 def _from_given(
-    clip: MotionClip, surface: Surface, seen: _Seen, report: ReportProgress, effort: FitEffort
+    clip: MotionClip,
+    surface: Surface,
+    seen: _Seen,
+    shared: tuple[str, ...],
+    report: ReportProgress,
+    effort: FitEffort,
 ) -> tuple[Candidate, ...]:
     """Return the poses as given, with a fitted shape, and with fitted poses."""
     start, expected = new_fit(clip, surface), near_given(clip)
@@ -278,12 +303,12 @@ def _from_given(
     tried = [_measured("the poses as given", dressed, clip, surface, seen)]
     shape = start
     for look in (seen.halved, seen.used.__getitem__):
-        shape = run_stage(shape, Stage(effort.steps, FRAMES, SHAPE), clip, surface, look, expected, tick)
+        shape = run_stage(shape, Stage(effort.steps, FRAMES, shared), clip, surface, look, expected, tick)
     tried.append(_measured("one shape", shape, clip, surface, seen))
-    stage = Stage(effort.steps, FRAMES, (*SHAPE, "turns"))
+    stage = Stage(effort.steps, FRAMES, (*shared, "turns"))
     turns = run_stage(shape, stage, clip, surface, seen.used.__getitem__, expected, tick)
     tried.append(_measured("turns that are the same in all frames as well", turns, clip, surface, seen))
-    stage = Stage(effort.steps_for(clip), FRAMES, (*SHAPE, "turns", "poses", "trans"))
+    stage = Stage(effort.steps_for(clip), FRAMES, (*shared, "turns", "poses", "trans"))
     tick = _ticker("poses", report, stage.steps)
     poses = run_stage(turns, stage, clip, surface, seen.used.__getitem__, expected, tick)
     tried.append(_measured("turns of every frame as well", poses, clip, surface, seen))
@@ -291,12 +316,16 @@ def _from_given(
 
 
 def _from_silhouettes(
-    clip: MotionClip, surface: Surface, seen: _Seen, report: ReportProgress, effort: FitEffort, *, with_size: bool
+    clip: MotionClip,
+    surface: Surface,
+    seen: _Seen,
+    shape: tuple[str, ...],
+    report: ReportProgress,
+    effort: FitEffort,
 ) -> tuple[Candidate, ...]:
-    """Return the poses as they were found first, and shape and poses fitted together, size too if ``with_size``."""
+    """Return the poses as they were found first, and shape and poses fitted together."""
     start, expected = new_fit(clip, surface), usual(clip)
     tried = [_measured("poses found frame by frame", start, clip, surface, seen)]
-    shape = SHAPE if with_size else _SHAPE_OF_ONE_CAMERA
     stage = Stage(effort.steps_for(clip), FRAMES, (*shape, "poses", "trans"))
     tick = _ticker("shape", report, 2 * stage.steps)
     found = start
@@ -307,12 +336,18 @@ def _from_silhouettes(
 
 
 def _with_lens(
-    start: Candidate, clip: MotionClip, surface: Surface, seen: _Seen, report: ReportProgress, effort: FitEffort
+    start: Candidate,
+    clip: MotionClip,
+    surface: Surface,
+    seen: _Seen,
+    shape: tuple[str, ...],
+    report: ReportProgress,
+    effort: FitEffort,
 ) -> tuple[Candidate, LensFit]:
     """Return the fit with the focal length of one camera refined, where that pays, and what was found about it."""
     steps, look = effort.steps_for(clip), seen.used.__getitem__
     tick = _ticker("focal length", report, num_lens_ticks(steps))
-    args = (start.learned, _SHAPE_OF_ONE_CAMERA, clip, surface, look, usual(clip), steps, tick)
+    args = (start.learned, shape, clip, surface, look, usual(clip), steps, tick)
     found, lens = fit_lens(*args)
     name = f"the focal length {'refined' if lens.taken else 'as guessed'}"
     return _measured(name, found, clip, surface, seen), lens

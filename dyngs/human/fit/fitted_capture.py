@@ -22,10 +22,11 @@ from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.files.temporary import temporary_folder_beside
 from dyngs.files.write import write_image, write_text
 from dyngs.human.avatar.posing import frame_pose
-from dyngs.human.fit.capture_fit import CaptureFit, fit_capture
+from dyngs.human.fit.capture_fit import CaptureFit, Known, fit_capture
 from dyngs.human.fit.clips import FittedClip, fitted_clips
 from dyngs.human.fit.inputs import NOTHING_ELSE, FitInputs, has_guessed_lens, joints_of, read_person, with_lens
 from dyngs.human.fit.keypoints import read_keypoints
+from dyngs.human.fit.known_person import known_shape, shape_of, with_shape
 from dyngs.human.fit.overlays import FITTED, GIVEN, overlay, side_by_side
 from dyngs.human.fit.surface import surface_of
 from dyngs.human.fit.written import write_body, write_split
@@ -84,16 +85,20 @@ def _fitted(
     options: DataConfig, out: Path, report: ReportProgress, given: FitInputs, *, with_pictures: bool
 ) -> FittedCapture:
     require_new_folder(out)
+    person = None if given.person is None else known_shape(given.person)
     body, folder = default_template(), temporary_folder_beside(out)
     masks = folder / _MASKS
     try:
         capture = read_person(options, given, masks)
         capture = capture.replace(splits=numbered(capture.splits))
         points = {} if given.keypoints is None else read_keypoints(given.keypoints, capture.splits["train"])
-        lens, joints = has_guessed_lens(capture), joints_of(capture, given)
-        found = fit_capture(capture, options, body, report, points, guessed_lens=lens, joints=joints)
+        known = Known(joints_of(capture, given), has_guessed_lens(capture), person is not None)
+        shaped = body if person is None else with_shape(body, person)
+        found = fit_capture(capture, options, shaped, report, points, known=known)
+        if person is not None:
+            found = replace(found, fit=replace(found.fit, betas=shape_of(body, person)))
         capture = with_lens(capture, found.lens)
-        clips = fitted_clips(capture, body, found)
+        clips = fitted_clips(capture, shaped, found)
         if with_pictures:
             _write_pictures(folder, capture, options, clips)
             for split, clip in clips.items():

@@ -32,6 +32,7 @@ class FitInputs:
         background: picture of the place without the person, or a folder of one for each camera.
         joints: file or folder of 3D joints or posed vertices, see ``read_joints``.
         body: body file whose vertices these are; None: the free template.
+        person: capture or run of the same person, whose shape is kept.
     """
 
     keypoints: Path | None = None
@@ -39,6 +40,7 @@ class FitInputs:
     background: Path | None = None
     joints: Path | None = None
     body: Path | None = None
+    person: Path | None = None
 
 
 NOTHING_ELSE = FitInputs()

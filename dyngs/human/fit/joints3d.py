@@ -58,10 +58,10 @@ def read_joints(path: Path, capture: Capture, body: BodyTemplate) -> Joints3D:
     """Return the 3D joints of the frames of training.
 
     ``.npz``: ``joints`` (F, K, 3 or 4: with confidence), or ``vertices`` (F, N, 3) of ``body``; ``frames`` (F,)
-    numbers, else 0, 1, ...; ``order`` and ``space`` as text. ``.json``: an object of ``order``, ``space`` and ``joints``,
-    which maps pictures or frame numbers to K lists of 3 or 4 numbers. A folder: files of SAM 3D Body, ``PICTURE.npz`` with
-    ``pred_keypoints_3d`` (70, 3) and ``pred_cam_t`` (3,). ``.pkl``: ``frame_data.pkl`` of Alldieck et al. (2018), whose
-    vertices are those of SMPL.
+    numbers, else 0, 1, ...; ``order`` and ``space`` as text. ``.json``: an object of ``order``, ``space`` and
+    ``joints``, which maps pictures or frame numbers to K lists of 3 or 4 numbers. A folder: files of SAM 3D Body,
+    ``PICTURE.npz`` with ``pred_keypoints_3d`` (70, 3) and ``pred_cam_t`` (3,). ``.pkl``: ``frame_data.pkl`` of Alldieck
+    et al. (2018), whose vertices are those of SMPL.
 
     Args:
         path: file or folder.

@@ -106,12 +106,14 @@ def refined(cameras: Cameras, learned: Parameters) -> Cameras:
     """Return the cameras with the focal length that was learned; as they are where none is."""
     if "log_focal" not in learned:
         return cameras
-    factor, blank = learned["log_focal"].exp(), torch.ones_like(learned["log_focal"])
-    zoom = torch.cat([factor, factor, blank])
+    factor = learned["log_focal"].exp()
+    focal = torch.zeros_like(cameras.intrinsics[0])
+    focal[0, 0] = focal[1, 1] = 1.0
+    intrinsics = cameras.intrinsics + (factor - 1) * focal * cameras.intrinsics
     along = torch.zeros_like(cameras.cam_from_world[0])
     along[2, 3] = 1.0
     poses = cameras.cam_from_world + (factor - 1) * learned["distance"] * along
-    return Cameras(poses, zoom[:, None] * cameras.intrinsics, cameras.width, cameras.height)
+    return Cameras(poses, intrinsics, cameras.width, cameras.height)
 
 
 def frame_pose_of(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:

@@ -32,9 +32,7 @@ def worst_iou(found: np.ndarray, true: np.ndarray) -> float:
     return float(((found & true).sum((1, 2)) / (found | true).sum((1, 2))).min())
 
 
-@pytest.mark.parametrize(
-    ("noise", "shade", "least"), [(0.0, 1.0, 0.9), (2.0, 1.0, 0.9), (5.0, 1.0, 0.85), (2.0, 0.7, 0.85)]
-)
+@pytest.mark.parametrize(("noise", "shade", "least"), [(2.0, 1.0, 0.9), (5.0, 1.0, 0.85), (2.0, 0.7, 0.85)])
 def test_who_walks_by_is_cut_out(noise: float, shade: float, least: float) -> None:
     pictures, true = clip(16.0, noise, shade)
     background = background_of(pictures)

@@ -114,7 +114,7 @@ def test_frame_data_of_semantic_human_texture_stitching(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_refused(tmp_path: Path, fields: dict[str, np.ndarray], said: str) -> None:
-    np.savez(tmp_path / "a.npz", **fields)
+    np.savez(tmp_path / "a.npz", **fields)  # pyright: ignore[reportArgumentType]
     with pytest.raises(DyngsError, match=said):
         read_joints(tmp_path / "a.npz", capture(), default_template())
 

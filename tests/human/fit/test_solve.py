@@ -128,4 +128,5 @@ def test_a_longer_lens_from_further_away_shows_the_same_size(surface: Surface) -
     factor = torch.tensor(0.5).exp()
     assert torch.allclose(shown.intrinsics[0, 0, 0], 100 * factor)
     assert torch.allclose(100 * factor / (4.0 + shown.cam_from_world[0, 2, 3]), torch.tensor(100 / 4.0))
+    assert shown.intrinsics[0, :2, 2].tolist() == [32, 32]
     assert refined(shown, new_fit(clip(), surface)) is shown

@@ -1,0 +1,43 @@
+"""A guessed focal length: found where perspective shows it."""
+
+import torch
+
+from dyngs.camera import Cameras
+from dyngs.human.fit.lens_fit import fit_lens, num_ticks
+from dyngs.human.fit.observed import ObservedFrame
+from dyngs.human.fit.pose_prior import near_given
+from dyngs.human.fit.solve import drawn_frame, new_fit, with_lens
+from dyngs.human.fit.surface import surface_of
+from dyngs.human.motion.clip import MotionClip
+from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.template.load import default_template
+
+SIZE, FRAMES, STEPS, DISTANCE = 48, 4, 16, 2.2
+
+
+def test_a_wrong_guess_is_corrected() -> None:
+    surface = surface_of(default_template(), 24)
+    intrinsics = torch.tensor([[0.9 * SIZE, 0, SIZE / 2], [0, 0.9 * SIZE, SIZE / 2], [0, 0, 1]])
+    camera = Cameras(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None], intrinsics[None], SIZE, SIZE)
+    poses = torch.zeros(FRAMES, 55, 3)
+    poses[:, 0, 1] = torch.arange(FRAMES) * 0.7
+    poses[:, JOINT_NAMES.index("left_shoulder"), 1] = -1.2
+    trans = torch.tensor([0.0, 0.0, -DISTANCE]).repeat(FRAMES, 1)
+    times = torch.linspace(0, 1, FRAMES, dtype=torch.float64)
+    clip = MotionClip(times, poses, trans, torch.ones(FRAMES))
+    true = with_lens(new_fit(clip, surface), DISTANCE)
+    with torch.no_grad():
+        true["log_focal"].add_(-0.3)
+        known = torch.ones(1, SIZE, SIZE)
+        seen = [ObservedFrame(camera, drawn_frame(true, clip, surface, row, camera), known) for row in range(FRAMES)]
+    ticks: list[int] = []
+    start = new_fit(clip, surface)
+    args = (start, (), clip, surface, seen.__getitem__, near_given(clip), STEPS, lambda: ticks.append(1))
+    found, lens = fit_lens(*args)
+    assert lens.taken
+    assert lens.error[1] < 0.8 * lens.error[0]
+    assert 0.6 < lens.factor < 0.93
+    assert float(found["log_focal"].detach().exp()) == lens.factor
+    assert len(ticks) == num_ticks(STEPS)
+    assert "taken" in lens.summary()
+    assert float(start["poses"].detach().abs().max()) == 0
