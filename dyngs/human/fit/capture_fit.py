@@ -134,14 +134,14 @@ class CaptureFit:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class Seen:
     """What is looked at, by row of the clip: frames to fit to, and frames to judge by."""
 
     used: dict[int, ObservedFrame | None]
     judged: dict[int, ObservedFrame | None]
     held_out: int
 
-    def with_places(self, places: Mapping[int, Tensor]) -> _Seen:
+    def with_places(self, places: Mapping[int, Tensor]) -> Seen:
         """Return the same with joints given in 3D, by row."""
         used = {
             row: None if frame is None else replace(frame, places=places.get(row)) for row, frame in self.used.items()
@@ -190,13 +190,13 @@ def fit_capture(
         if capture.body is None
         else captured_motion(capture.root, capture.body["train"], views, body.joints)
     )
-    seen, surface = _look(capture, motion, options, effort, keypoints or {}), surface_of(body, RESOLUTION)
+    seen, surface = look_at(capture, motion, options, effort, keypoints or {}), surface_of(body, RESOLUTION)
     joints = known.joints
     seen = seen if joints is None else seen.with_places({motion.rows[x]: joints[x] for x in motion.rows if x in joints})
     if given:
         tried = _from_given(motion.clip, surface, seen, known.learned, report, effort)
     else:
-        tick = _ticker("first poses", report, num_ticks(len(motion.clip)))
+        tick = ticker("first poses", report, num_ticks(len(motion.clip)))
         clip = first_poses(motion.clip.times, surface, seen.used.__getitem__, tick)
         motion = CapturedMotion(clip, motion.frames)
         tried = _from_silhouettes(clip, surface, seen, known.learned, report, effort)
@@ -250,9 +250,9 @@ def _unposed(views: Sequence[View], joints: Tensor) -> CapturedMotion:
     return CapturedMotion(clip, frames)
 
 
-def _look(
+def look_at(
     capture: Capture, motion: CapturedMotion, options: DataConfig, effort: FitEffort, keypoints: Keypoints
-) -> _Seen:
+) -> Seen:
     """Return the squares around the person in all frames.
 
     Raises:
@@ -272,7 +272,7 @@ def _look(
         return {row: observed_frame([pictures[i] for i in own], side, size, marked) for row, own in rows.items()}
 
     held_out, seen = sum(map(len, left_out.values())), frames(used)
-    return _Seen(seen, frames(left_out) if held_out else seen, held_out)
+    return Seen(seen, frames(left_out) if held_out else seen, held_out)
 
 
 def _marked(views: Sequence[View], pictures: PictureLoader, shown: Sequence[int], points: Keypoints) -> Keypoints:
@@ -290,48 +290,48 @@ def _marked(views: Sequence[View], pictures: PictureLoader, shown: Sequence[int]
 def _from_given(
     clip: MotionClip,
     surface: Surface,
-    seen: _Seen,
+    seen: Seen,
     shared: tuple[str, ...],
     report: ReportProgress,
     effort: FitEffort,
 ) -> tuple[Candidate, ...]:
     """Return the poses as given, with a fitted shape, and with fitted poses."""
     start, expected = new_fit(clip, surface), near_given(clip)
-    tick = _ticker("shape", report, 4 * effort.steps)
+    tick = ticker("shape", report, 4 * effort.steps)
     stage = Stage(effort.steps, FRAMES, ("padding",))  # clothes and hair are no sign of wrong poses
     dressed = run_stage(start, stage, clip, surface, seen.halved, expected, tick)
-    tried = [_measured("the poses as given", dressed, clip, surface, seen)]
+    tried = [measured("the poses as given", dressed, clip, surface, seen)]
     shape = start
     for look in (seen.halved, seen.used.__getitem__):
         shape = run_stage(shape, Stage(effort.steps, FRAMES, shared), clip, surface, look, expected, tick)
-    tried.append(_measured("one shape", shape, clip, surface, seen))
+    tried.append(measured("one shape", shape, clip, surface, seen))
     stage = Stage(effort.steps, FRAMES, (*shared, "turns"))
     turns = run_stage(shape, stage, clip, surface, seen.used.__getitem__, expected, tick)
-    tried.append(_measured("turns that are the same in all frames as well", turns, clip, surface, seen))
+    tried.append(measured("turns that are the same in all frames as well", turns, clip, surface, seen))
     stage = Stage(effort.steps_for(clip), FRAMES, (*shared, "turns", "poses", "trans"))
-    tick = _ticker("poses", report, stage.steps)
+    tick = ticker("poses", report, stage.steps)
     poses = run_stage(turns, stage, clip, surface, seen.used.__getitem__, expected, tick)
-    tried.append(_measured("turns of every frame as well", poses, clip, surface, seen))
+    tried.append(measured("turns of every frame as well", poses, clip, surface, seen))
     return tuple(tried)
 
 
 def _from_silhouettes(
     clip: MotionClip,
     surface: Surface,
-    seen: _Seen,
+    seen: Seen,
     shape: tuple[str, ...],
     report: ReportProgress,
     effort: FitEffort,
 ) -> tuple[Candidate, ...]:
     """Return the poses as they were found first, and shape and poses fitted together."""
     start, expected = new_fit(clip, surface), usual(clip)
-    tried = [_measured("poses found frame by frame", start, clip, surface, seen)]
+    tried = [measured("poses found frame by frame", start, clip, surface, seen)]
     stage = Stage(effort.steps_for(clip), FRAMES, (*shape, "poses", "trans"))
-    tick = _ticker("shape", report, 2 * stage.steps)
+    tick = ticker("shape", report, 2 * stage.steps)
     found = start
     for look in (seen.halved, seen.used.__getitem__):
         found = run_stage(found, stage, clip, surface, look, expected, tick)
-    tried.append(_measured("one shape, and poses of every frame", found, clip, surface, seen))
+    tried.append(measured("one shape, and poses of every frame", found, clip, surface, seen))
     return tuple(tried)
 
 
@@ -339,21 +339,21 @@ def _with_lens(
     start: Candidate,
     clip: MotionClip,
     surface: Surface,
-    seen: _Seen,
+    seen: Seen,
     shape: tuple[str, ...],
     report: ReportProgress,
     effort: FitEffort,
 ) -> tuple[Candidate, LensFit]:
     """Return the fit with the focal length of one camera refined, where that pays, and what was found about it."""
     steps, look = effort.steps_for(clip), seen.used.__getitem__
-    tick = _ticker("focal length", report, num_lens_ticks(steps))
+    tick = ticker("focal length", report, num_lens_ticks(steps))
     args = (start.learned, shape, clip, surface, look, usual(clip), steps, tick)
     found, lens = fit_lens(*args)
     name = f"the focal length {'refined' if lens.taken else 'as guessed'}"
-    return _measured(name, found, clip, surface, seen), lens
+    return measured(name, found, clip, surface, seen), lens
 
 
-def _ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]:
+def ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]:
     """Return a function that reports one more step of ``total``."""
     done = 0
 
@@ -366,7 +366,7 @@ def _ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]
 
 
 @torch.no_grad()
-def _measured(name: str, learned: Parameters, clip: MotionClip, surface: Surface, seen: _Seen) -> Candidate:
+def measured(name: str, learned: Parameters, clip: MotionClip, surface: Surface, seen: Seen) -> Candidate:
     """Return the candidate with its IoU in the frames that judge."""
     found = []
     for row, frame in seen.judged.items():

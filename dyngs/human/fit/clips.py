@@ -11,6 +11,7 @@ import torch
 
 from dyngs.data.capture import Capture, Split
 from dyngs.human.fit.capture_fit import CaptureFit
+from dyngs.human.fit.new_clip import NewClip
 from dyngs.human.motion.captured import CapturedMotion, captured_motion
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.body import BodyTemplate
@@ -29,7 +30,9 @@ class FittedClip:
         return {frame: row for row, frame in enumerate(self.frames)}
 
 
-def fitted_clips(capture: Capture, body: BodyTemplate, found: CaptureFit) -> dict[Split, FittedClip]:
+def fitted_clips(
+    capture: Capture, body: BodyTemplate, found: CaptureFit, new_poses: NewClip | None
+) -> dict[Split, FittedClip]:
     """Return the clip of training, with the frames of val and test, and that of ``pose``, if the capture has one.
 
     Frames that were not fitted have what holds for all frames applied to their given poses; without given poses they
@@ -39,12 +42,12 @@ def fitted_clips(capture: Capture, body: BodyTemplate, found: CaptureFit) -> dic
         capture: all views with frame numbers.
         body: the template.
         found: the fit of the views of training.
+        new_poses: the clip of ``pose``, None without.
     """
     clips: dict[Split, FittedClip] = {"train": _of_training(capture, body, found)}
-    new_poses = capture.splits.get("pose", ())
-    if new_poses and capture.body is not None:
-        motion = captured_motion(capture.root, capture.body["pose"], new_poses, body.joints)
-        clips["pose"] = FittedClip(found.fit.applied(_expanded(motion)), motion.frames)
+    if new_poses is not None:
+        fit = replace(found.fit, shift=new_poses.shift)
+        clips["pose"] = FittedClip(fit.applied(_expanded(new_poses.motion)), new_poses.motion.frames)
     return clips
 
 

@@ -27,6 +27,7 @@ from dyngs.human.fit.clips import FittedClip, fitted_clips
 from dyngs.human.fit.inputs import NOTHING_ELSE, FitInputs, has_guessed_lens, joints_of, read_person, with_lens
 from dyngs.human.fit.keypoints import read_keypoints
 from dyngs.human.fit.known_person import known_shape, shape_of, with_shape
+from dyngs.human.fit.new_clip import NewClip, placed_clip
 from dyngs.human.fit.overlays import FITTED, GIVEN, overlay, side_by_side
 from dyngs.human.fit.surface import surface_of
 from dyngs.human.fit.written import write_body, write_split
@@ -46,6 +47,7 @@ class FittedCapture:
 
     root: Path
     found: CaptureFit
+    new_poses: NewClip | None = None
 
     def summary(self) -> str:
         """Return lines for people: how good the fit is."""
@@ -54,10 +56,11 @@ class FittedCapture:
         worst = int(np.nanargmin(found.chosen.per_frame))
         tried = ", ".join(f"{candidate.iou:.3f} with {candidate.name}" for candidate in found.tried)
         lens = "" if found.lens is None else f"\n{found.lens.summary()}"
+        other = "" if self.new_poses is None else f"\n{self.new_poses.summary()}"
         return (
             f"{frames} frames; overlap of silhouettes (IoU) on {where}: {tried}\n"
             f"taken: {found.chosen.name}; worst frame {found.motion.frames[worst]} with "
-            f"{found.chosen.per_frame[worst]:.3f}; look at {self.root / OVERLAYS_NAME}{lens}"
+            f"{found.chosen.per_frame[worst]:.3f}; look at {self.root / OVERLAYS_NAME}{lens}{other}"
         )
 
 
@@ -98,19 +101,20 @@ def _fitted(
         if person is not None:
             found = replace(found, fit=replace(found.fit, betas=shape_of(body, person)))
         capture = with_lens(capture, found.lens)
-        clips = fitted_clips(capture, shaped, found)
+        new_poses = placed_clip(capture, options, shaped, found, report)
+        clips = fitted_clips(capture, shaped, found, new_poses)
         if with_pictures:
             _write_pictures(folder, capture, options, clips)
             for split, clip in clips.items():
                 clips[split] = replace(clip, frames=tuple(range(len(clip.frames))))
         _write_bodies(folder, capture, clips, found.fit.betas)
         write_image(folder / OVERLAYS_NAME, _overlays(capture, options, body, found))
-        write_text(folder / REPORT_NAME, json.dumps(_report(found), indent=1) + "\n")
+        write_text(folder / REPORT_NAME, json.dumps(_report(found, new_poses), indent=1) + "\n")
         shutil.rmtree(masks, ignore_errors=True)
         folder.replace(out)  # also where ``out`` is an empty folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    return FittedCapture(out, found)
+    return FittedCapture(out, found, new_poses)
 
 
 def _write_bodies(out: Path, capture: Capture, clips: Mapping[Split, FittedClip], betas: Tensor) -> None:
@@ -143,7 +147,7 @@ def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: 
     return side_by_side(sheets, _COLUMNS)
 
 
-def _report(found: CaptureFit) -> dict[str, object]:
+def _report(found: CaptureFit, new_poses: NewClip | None) -> dict[str, object]:
     """Return the report as JSON values."""
     fit, chosen = found.fit, found.chosen
     turns = np.degrees(fit.shared.turns.norm(dim=1).double().numpy())
@@ -153,6 +157,7 @@ def _report(found: CaptureFit) -> dict[str, object]:
         "taken": chosen.name,
         "iou": {candidate.name: round(candidate.iou, 4) for candidate in found.tried},
         "views_left_out": found.held_out,
+        "new_poses": None if new_poses is None else {"iou": new_poses.iou, "iou_moved": new_poses.iou_moved},
         "iou_per_frame": {
             str(frame): round(iou, 4)
             for frame, iou in zip(found.motion.frames, chosen.per_frame, strict=False)

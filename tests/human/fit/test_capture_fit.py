@@ -113,7 +113,7 @@ def test_without_given_poses_every_frame_has_its_own(
     assert fit.motion.frames == (0, 1, 2, 3)
     poses = fit.fit.fitted(fit.motion.clip).poses
     assert len({tuple(pose.flatten().tolist()) for pose in poses}) == 4
-    clips = fitted_clips(capture, default_template(), fit)
+    clips = fitted_clips(capture, default_template(), fit, None)
     assert clips["train"].frames == (0, 1, 2, 3)
     assert torch.equal(clips["train"].clip.poses, poses)
 
