@@ -45,6 +45,10 @@ class HumanModel(_OnTemplate):
         default=True, description="learn corrections of poses, skeleton and skinning weights with the Gaussians"
     )
     refine_from: Fraction = Field(default=0.1, description="share of the run after which these are learned")
+    refine_frames_from: Fraction = Field(
+        default=0.25,
+        description="share of the run after which poses of single frames are, too: what all frames share comes first",
+    )
     pose_offsets: bool = Field(
         default=False,
         description="learn offsets at rest that are linear in the rotations of nearby joints (pose blend shapes)",

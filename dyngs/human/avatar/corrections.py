@@ -34,6 +34,8 @@ LR = {
     "normals": 1e-3,
 }
 """Learning rates."""
+OF_FRAMES = ("poses", "trans")
+"""What is learned of single frames."""
 LR_DECAY = 0.1
 """Last over first learning rate."""
 POSE_WEIGHT, WEIGHTS_WEIGHT, LIGHT_WEIGHT = 1e-4, 1e-3, 1e-3

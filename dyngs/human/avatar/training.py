@@ -15,7 +15,7 @@ from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.human.avatar.corrections import correction_penalties, new_corrections, share_sides
+from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
 from dyngs.human.avatar.light import difference_of_sides, rest_normals
 from dyngs.human.avatar.neighbours import nearest_neighbours
 from dyngs.human.avatar.posing import BodyPose
@@ -53,6 +53,7 @@ class HumanTraining:
     ) -> None:
         self.options, self.rates, self.views = options, rates, views
         self.refines_from = round(options.refine_from * rates.steps)
+        self.frames_from = round(options.refine_frames_from * rates.steps)
         self._rows = {frame: row for row, frame in enumerate(frames)}
         self._given_weights: Tensor | None = None
         self._near: Tensor | None = None
@@ -109,6 +110,9 @@ class HumanTraining:
             return 0
         progress = self.rates.progress(step, since=self.refines_from)
         share_sides(scene.learned)
+        if step <= self.frames_from:
+            for name in OF_FRAMES:
+                scene.learned[name].grad = None
         return scene.learned.step(step - self.refines_from, progress)
 
     def after_step(self, scene: HumanScene, step: int, edited: bool) -> HumanScene:

@@ -17,6 +17,7 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians import TopologyEdit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.human.template.joints import mirrored_joints
 from dyngs.output.animation import in_rest_pose, with_motion
 from dyngs.runs.checkpoint import load_run, save_checkpoint
 from dyngs.training.trainer import Trainer
@@ -123,6 +124,23 @@ def test_anchors_and_weights_follow_the_set(capture: Path) -> None:
     assert torch.equal(edited.anchors.points, points[source])
     assert torch.equal(edited.learned["weights"].detach(), weights[source])
     assert len(edited.state()["model.anchors.size"].tensor) == 4
+
+
+def test_what_all_frames_share_is_learned_before_poses_of_single_ones(capture: Path) -> None:
+    trainer = assemble(tiny(capture, steps=10, refine_from=0.1, refine_frames_from=0.5))
+    early = tensors_after(trainer, 5)
+    names = [f"model.learned.{name}" for name in ("turns", "joints", "poses", "trans")]
+    assert [bool(early[name].any()) for name in names] == [True, True, False, False]
+    late = tensors_after(trainer, 2)
+    assert all(late[name].any() for name in names)
+    other = late["model.learned.joints"][list(mirrored_joints(55))] * torch.tensor([-1.0, 1, 1])
+    torch.testing.assert_close(late["model.learned.joints"], other)
+
+
+def test_colours_of_both_sides_and_light_are_learned(capture: Path) -> None:
+    found = tensors_after(assemble(tiny(capture, light=True, steps=10)), 10)
+    assert found["model.learned.light"].any()
+    assert "model.learned.light" not in tensors_after(assemble(tiny(capture)), 3)
 
 
 def test_without_refinement_nothing_is_learned_about_the_fit(capture: Path) -> None:
