@@ -367,6 +367,8 @@ def human_start(
         raise DyngsError(f"{capture.root}: has no body parameters, which model.kind=human needs; see docs/human.md")
     if sh_degree > 1:
         raise DyngsError(f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1")
+    if model.light and config.colour.kind != "sh":
+        raise DyngsError("model.light=true does not go with colour.kind=network, which learns light itself; drop one")
     given, body = capture.body["train"], load_template(model)
     vertices, joints = rest_shape(body, given)
     texels = atlas_texels(body, model.resolution, vertices)

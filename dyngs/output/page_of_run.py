@@ -14,6 +14,7 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options
 from dyngs.export.html.page import Staging, WrittenPage, write_page
+from dyngs.human.avatar.light import LEFT_OUT
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.placement import up_direction as up_of_clip
 from dyngs.output.aim import look_at_point, up_direction
@@ -68,6 +69,9 @@ def write_run_page(
         seconds = len(run.scene.times) / animated.fps
     staging, notes = _staging(run, title, seconds, options.up)
     written = write_page(run.scene, render_options(run.config.model), replace(staging, time=options.time), path)
+    person = avatar_of(run.scene)
+    if person is not None and person.light is not None:
+        notes += (LEFT_OUT,)
     curves = written.header.get("curves", {})
     if curves.get("error"):
         fit = f"{curves['points']} control points for each of {curves['count']:,}, off by {curves['error']:.2g}"

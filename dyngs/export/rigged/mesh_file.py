@@ -18,6 +18,7 @@ from dyngs.export.rigged.surface import fitted_surface
 from dyngs.export.rigged.texture import bake_texels, fill_unseen, texture_image
 from dyngs.files.glb import INDICES, VERTICES, GlbDocument
 from dyngs.files.write import atomic_file
+from dyngs.human.avatar.light import LEFT_OUT
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate
@@ -102,6 +103,8 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
         )
     if scene.shapes is not None or scene.pose_dirs is not None:
         notes.append("offsets that depend on the pose are left out: glTF's skins have none")
+    if scene.light is not None:
+        notes.append(LEFT_OUT)
     return MeshFile(path, tuple(notes))
 
 

@@ -17,6 +17,8 @@ from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.ops.quaternions import rotation_matrices
 
+LEFT_OUT = "the learned light is left out: colours are those in even light"
+"""Message of files that cannot hold it."""
 TERMS = 8
 """Number of harmonics of degree 1 and 2; degree 0 is the colour itself."""
 

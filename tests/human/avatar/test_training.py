@@ -11,7 +11,16 @@ from torch import Tensor
 
 from dyngs.api.train import train
 from dyngs.build import assemble, restored_scene
-from dyngs.config import Config, DataConfig, DefaultStrategy, HumanModel, OptimConfig, RunConfig, TrainConfig
+from dyngs.config import (
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    HumanModel,
+    NetworkColour,
+    OptimConfig,
+    RunConfig,
+    TrainConfig,
+)
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians import TopologyEdit
@@ -141,6 +150,12 @@ def test_colours_of_both_sides_and_light_are_learned(capture: Path) -> None:
     found = tensors_after(assemble(tiny(capture, light=True, steps=10)), 10)
     assert found["model.learned.light"].any()
     assert "model.learned.light" not in tensors_after(assemble(tiny(capture)), 3)
+
+
+def test_light_does_not_go_with_a_network_of_colours(capture: Path) -> None:
+    config = tiny(capture, light=True)
+    with pytest.raises(DyngsError, match="drop one"):
+        assemble(config.model_copy(update={"colour": NetworkColour()}))
 
 
 def test_without_refinement_nothing_is_learned_about_the_fit(capture: Path) -> None:
