@@ -51,6 +51,7 @@ from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import texel_gaussians
+from dyngs.human.avatar.light import rest_normals
 from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.subject import Subject, first_look
@@ -309,7 +310,9 @@ def _first(
                 for camera, view in zip(training_cameras(filmed, config.data), filmed, strict=True)
             ]
             training = HumanTraining(config.model, subject.footage.frames, rates_of(config), views)
-            return _First(training.first_scene(gaussians, subject), training, colours)
+            lit = config.model.light and config.model.refine and colours.network is None
+            normals = rest_normals(gaussians) if lit else None
+            return _First(training.first_scene(gaussians, subject, normals), training, colours)
         case StaticModel() | DynamicModel():
             degree = stored_sh_degree(config)
             gaussians = initial_gaussians(surroundings(capture), config.init, start, degree, generator)
@@ -367,8 +370,6 @@ def human_start(
         raise DyngsError(f"{capture.root}: has no body parameters, which model.kind=human needs; see docs/human.md")
     if sh_degree > 1:
         raise DyngsError(f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1")
-    if model.light and config.colour.kind != "sh":
-        raise DyngsError("model.light=true does not go with colour.kind=network, which learns light itself; drop one")
     given, body = capture.body["train"], load_template(model)
     vertices, joints = rest_shape(body, given)
     texels = atlas_texels(body, model.resolution, vertices)

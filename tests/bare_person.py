@@ -68,8 +68,8 @@ def bare_scene(
     )
     clip = random_clip() if clip is None else clip
     skeleton = Skeleton(body.joints, body.parents)
-    options = HumanModel(pose_offsets=pose_offsets, light=light)
-    learned = new_corrections(options, clip, skeleton, anchors, texels.normals)
+    options = HumanModel(pose_offsets=pose_offsets)
+    learned = new_corrections(options, clip, skeleton, anchors, texels.normals if light else None)
     make = torch.Generator().manual_seed(7)
     values = {name: x.detach().clone() for name, x in learned.values().items()}
     values["joints"] = 0.01 * torch.randn(55, 3, generator=make)

@@ -205,13 +205,13 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
         "weights": torch.zeros_like(anchors.weights),
     }
     values |= {name: tensors[name] for name in ("pose_dirs", "light", "normals") if name in tensors}
-    options = HumanModel(pose_offsets="pose_dirs" in tensors, light="light" in tensors)
+    options = HumanModel(pose_offsets="pose_dirs" in tensors)
     return HumanScene(
         gaussians=Gaussians(**part("gaussians.")),
         anchors=anchors,
         skeleton=skeleton,
         clip=reference,
-        learned=new_corrections(options, reference, skeleton, anchors).restored(values),
+        learned=new_corrections(options, reference, skeleton, anchors, tensors.get("normals")).restored(values),
         shapes=PoseBlendShapes(shapes["directions"].float(), shapes["faces"].long()) if shapes else None,
     )
 

@@ -54,8 +54,9 @@ class HumanModel(_OnTemplate):
         description="learn offsets at rest that are linear in the rotations of nearby joints (pose blend shapes)",
     )
     light: bool = Field(
-        default=False,
-        description="learn light that is fixed in the world: colours depend on where the surface faces",
+        default=True,
+        description="learn light that is fixed in the world: colours depend on where the surface faces (with "
+        "colour.kind=sh, model.refine=true)",
     )
     fill_unseen: bool = Field(
         default=True,

@@ -66,7 +66,7 @@ def new_corrections(
 ) -> Parameters:
     """Return the corrections to learn, all zero, of a clip of F frames, a skeleton and skinning weights.
 
-    With ``options.light`` also the light, none, and the ``normals`` (N, 3) that it falls on.
+    With ``normals`` (N, 3), also the light that falls on them.
 
     Tensors: ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before the given ones; ``trans`` (F, 3);
     ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K);
@@ -84,9 +84,8 @@ def new_corrections(
     }
     if options.pose_offsets:
         zeros["pose_dirs"] = anchors.weights.new_zeros(len(anchors), 27)
-    if options.light:
-        zeros["light"] = anchors.weights.new_zeros(TERMS, 3)
-        zeros["normals"] = torch.zeros_like(anchors.points) if normals is None else normals
+    if normals is not None:
+        zeros |= {"light": normals.new_zeros(TERMS, 3), "normals": normals}
     own = ("weights", "pose_dirs", "normals")
     roles = {name: Role.PER_GAUSSIAN if name in own else Role.SHARED for name in zeros}
     return Parameters(zeros, LR | {"trans": LR["trans"] * unit}, LR_DECAY, roles)

@@ -73,7 +73,8 @@ class HumanScene(Scene):
         anchors = Anchors(**{field.name: tensors[f"anchors.{field.name}"] for field in fields(Anchors)})
         clip = MotionClip(*(tensors[f"clip.{name}"] for name in ("times", "poses", "trans", "scale")))
         skeleton = Skeleton(tensors["joints"], tuple(tensors["parents"].tolist()))
-        learned = new_corrections(options, clip, skeleton, anchors).restored(part_of(tensors, "learned"))
+        own = part_of(tensors, "learned")
+        learned = new_corrections(options, clip, skeleton, anchors, own.get("normals")).restored(own)
         return HumanScene(
             gaussians=gaussians,
             anchors=anchors,

@@ -16,7 +16,7 @@ from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
-from dyngs.human.avatar.light import difference_of_sides, rest_normals
+from dyngs.human.avatar.light import difference_of_sides
 from dyngs.human.avatar.neighbours import nearest_neighbours
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
@@ -59,10 +59,9 @@ class HumanTraining:
         self._near: Tensor | None = None
         self._images: tuple[Tensor, Tensor] | None = None
 
-    def first_scene(self, gaussians: Gaussians, subject: Subject) -> HumanScene:
-        """Return the scene of the first Gaussians: nothing is learned yet."""
+    def first_scene(self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None) -> HumanScene:
+        """Return the scene of the first Gaussians: nothing is learned yet; light only with their ``normals`` (N, 3)."""
         clip = subject.footage.clip
-        normals = rest_normals(gaussians) if self.options.light else None
         learned = new_corrections(self.options, clip, subject.skeleton, subject.anchors, normals)
         return HumanScene(
             gaussians=gaussians,
