@@ -8,8 +8,10 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError
 
-SAME_JOINTS = 0.5
+_SAME_JOINTS = 0.5
 """Least cosine between the skinning weights of points that belong to the same part of the body."""
+_LOOKED_AT = 4
+"""Points that are looked at, over the number of neighbours that are wanted."""
 
 
 def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
@@ -35,13 +37,19 @@ def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
     return torch.from_numpy(found[~own].reshape(num_points, count)).long().to(points.device)
 
 
-def linked_neighbours(points: Tensor, weights: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the rows (Q, count) of ``nearest_neighbours``, and whether both follow the same joints (Q, count) bool.
+def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor:
+    """Return the rows (Q, count) int64 of the nearest other points that follow the same joints, nearest first.
 
     They do where the cosine between their skinning weights (Q, J) is above a half: arm and trunk do not, nor do two
-    fingers, however near they are at rest.
+    fingers, however near they are at rest. Looks at four times ``count`` points around each; where fewer than ``count``
+    of these do, the point itself is in their place. At most Q - 1 columns.
     """
-    near = nearest_neighbours(points, count)
+    near = nearest_neighbours(points, _LOOKED_AT * count)
     unit = torch.nn.functional.normalize(weights, dim=1)
-    alike = torch.stack([(unit * unit.index_select(0, column)).sum(1) for column in near.unbind(1)], dim=1)
-    return near, alike > SAME_JOINTS
+    alike = [(unit * unit.index_select(0, column)).sum(1) > _SAME_JOINTS for column in near.unbind(1)]
+    if not alike:
+        return near
+    others = ~torch.stack(alike, dim=1)
+    own = torch.arange(len(points), device=near.device)[:, None]
+    order = others.int().sort(dim=1, stable=True).indices[:, :count]
+    return torch.where(others, own, near).gather(1, order)

@@ -17,7 +17,7 @@ from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
 from dyngs.human.avatar.light import difference_of_sides
-from dyngs.human.avatar.neighbours import nearest_neighbours
+from dyngs.human.avatar.neighbours import linked_neighbours
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.subject import Subject
@@ -195,7 +195,7 @@ class HumanTraining:
         if options.rigidity == 0 and options.smoothness == 0:
             return {}
         if self._near is None:
-            self._near = nearest_neighbours(means, NEIGHBOURS)
+            self._near = linked_neighbours(scene.anchors.points, scene.given_weights(), NEIGHBOURS)
         if not self._near.shape[1]:
             return {}
         near = self._near[:, step % self._near.shape[1]]

@@ -118,11 +118,11 @@ def smoothed(values: Tensor, trust: Tensor, anchors: Anchors, weights: Tensor) -
     from scipy.sparse import csr_array
 
     count, given = len(values), values.detach().double().cpu().numpy()
-    near, linked = linked_neighbours(anchors.points, weights, _NEIGHBOURS)
+    near = linked_neighbours(anchors.points, weights, _NEIGHBOURS)  # a link to itself changes nothing
     if not near.shape[1]:
         return values
     steps = (anchors.points[near] - anchors.points[:, None]).norm(dim=-1) / anchors.size[:, None]
-    strength = (linked / (1 + steps.square())).double().cpu().numpy()
+    strength = (1 / (1 + steps.square())).double().cpu().numpy()
     rows = np.repeat(np.arange(count), near.shape[1])
     links = csr_array((strength.ravel(), (rows, near.cpu().numpy().ravel())), (count, count))
     links = links.maximum(links.T)
