@@ -50,14 +50,13 @@ from dyngs.deform.still_error import StillErrors, cameras_in_place, still_errors
 from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.anchors import texel_gaussians
+from dyngs.human.avatar.fine_limbs import pixel_size, surface_gaussians, surface_texels
 from dyngs.human.avatar.light import rest_normals
 from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.subject import Subject, first_look
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.motion.captured import captured_motion
-from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.load import load_template, rest_shape
 from dyngs.rendering import RenderOptions, Shader
 from dyngs.scene import Scene, SceneTraining, render_options
@@ -305,10 +304,8 @@ def _first(
             gaussians, subject = human_start(config, config.model, capture, pictures)
             colours = _colours(config, capture, gaussians, generator)
             filmed = capture.splits["train"]
-            views = [
-                (camera, view.frame or 0)
-                for camera, view in zip(training_cameras(filmed, config.data), filmed, strict=True)
-            ]
+            cameras = training_cameras(filmed, config.data)
+            views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
             training = HumanTraining(config.model, subject.footage.frames, rates_of(config), views)
             lit = config.model.light and config.model.refine and colours.network is None
             normals = rest_normals(gaussians) if lit else None
@@ -372,12 +369,13 @@ def human_start(
         raise DyngsError(f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1")
     given, body = capture.body["train"], load_template(model)
     vertices, joints = rest_shape(body, given)
-    texels = atlas_texels(body, model.resolution, vertices)
-    gaussians, anchors = texel_gaussians(texels, sorted(set(model.scaffold_heights)), sh_degree)
     filmed = captured_motion(capture.root, given, capture.splits["train"], joints)
+    cameras = training_cameras(capture.splits["train"], config.data) if model.fine_limbs else []
+    parts = surface_texels(body, model.resolution, vertices, pixel_size(cameras, filmed.clip, joints[0]))
+    gaussians, anchors, normals = surface_gaussians(parts, sorted(set(model.scaffold_heights)), sh_degree)
     subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body))
     shown = (pictures[i] for i in evenly_spaced(len(pictures), FIRST_VIEWS))
-    return first_look(gaussians, texels, subject, shown, model.min_silhouette_share)
+    return first_look(gaussians, normals, subject, shown, model.min_silhouette_share)
 
 
 def _training_views(

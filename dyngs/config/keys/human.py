@@ -58,6 +58,10 @@ class HumanModel(_OnTemplate):
         description="learn light that is fixed in the world: colours depend on where the surface faces (with "
         "colour.kind=sh, model.refine=true)",
     )
+    fine_limbs: bool = Field(
+        default=True,
+        description="four texels instead of one on hands and feet, if one is wider than two pixels of the pictures",
+    )
     fill_unseen: bool = Field(
         default=True,
         description="after the last step, fill what the pictures hardly show from the other side of the body and from "

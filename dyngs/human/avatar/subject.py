@@ -14,7 +14,6 @@ from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.observations import SurfacePoints, observe_points
 from dyngs.human.avatar.posing import BodyPose, PoseBlendShapes, Skeleton, frame_pose, rest_offsets
 from dyngs.human.motion.captured import CapturedMotion
-from dyngs.human.template.atlas import Texels
 
 
 @dataclass(frozen=True)
@@ -31,22 +30,21 @@ class Subject:
 
 
 def first_look(
-    gaussians: Gaussians, texels: Texels, subject: Subject, pictures: Iterable[Picture], carve: float
+    gaussians: Gaussians, normals: Tensor, subject: Subject, pictures: Iterable[Picture], carve: float
 ) -> tuple[Gaussians, Subject]:
     """Return the first Gaussians that lie inside the silhouettes, in the colours of the pictures.
 
     Gaussians above the lowest scaffold are kept if they lie inside the silhouette of a share ``carve`` of the pictures.
 
     Args:
-        gaussians: P times the number of scaffolds, as ``texel_gaussians`` orders them.
-        texels: P.
+        gaussians: N, on the scaffolds.
+        normals: (N, 3) of the surface below them at rest.
         subject: whose anchors are those of ``gaussians``.
         pictures: some of those to train on.
     """
     clip, anchors, skeleton = subject.footage.clip, subject.anchors, subject.skeleton
     rows = subject.footage.rows
     shown = ((picture, frame_pose(clip, rows[picture.frame or 0])) for picture in pictures)
-    normals = texels.normals.repeat(len(anchors) // max(len(texels), 1), 1)
     weights = skinning_weights(anchors, len(skeleton.joints))
 
     def offsets(posing: BodyPose) -> Tensor | None:
@@ -55,7 +53,6 @@ def first_look(
     found = observe_points(SurfacePoints(anchors.points, normals, weights, offsets), skeleton, shown)
     sh = gaussians.sh.clone()
     sh[:, 0] = (found.rgb - 0.5) / SH_C0
-    kept = found.inside >= carve
-    kept[: len(texels)] = True
+    kept = (found.inside >= carve) | (anchors.height == anchors.height.amin())
     gaussians = gaussians.replace(sh=sh).select(kept)
     return gaussians, replace(subject, anchors=anchors.select(kept))

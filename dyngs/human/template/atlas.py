@@ -6,7 +6,7 @@ Local letters: T triangles, U vertices of the atlas, P texels, Q points of scaff
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -46,6 +46,11 @@ class Texels:
 
     def __len__(self) -> int:
         return len(self.index)
+
+    def select(self, index: Tensor) -> Texels:
+        """Return the texels at ``index`` (long, ascending, or bool)."""
+        rows = {field.name: getattr(self, field.name)[index] for field in fields(self) if field.name != "resolution"}
+        return Texels(resolution=self.resolution, **rows)
 
     @property
     def normals(self) -> Tensor:
