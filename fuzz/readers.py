@@ -28,6 +28,7 @@ from fuzz.seeds import (
 )
 
 if TYPE_CHECKING:
+    from dyngs.data.capture import Capture
     from dyngs.human.template.body import BodyTemplate
     from dyngs.rendering import Rendering
     from dyngs.scene import Scene
@@ -185,6 +186,31 @@ def read_a_motion(root: Path) -> object:
     return motion, motion_clip(motion).at(0.3)
 
 
+def read_given_joints(root: Path) -> object:
+    """Read 3D joints, for two pictures of a capture."""
+    from dyngs.human.fit.joints3d import read_joints
+
+    return read_joints(only(root), two_pictures(root), small_body(24))
+
+
+def read_2d_key_points(root: Path) -> object:
+    """Read key points of two pictures."""
+    from dyngs.human.fit.keypoints import read_keypoints
+
+    return read_keypoints(only(root), two_pictures(root).splits["train"])
+
+
+def two_pictures(root: Path) -> Capture:
+    """Return a capture of two views, whose pictures do not exist."""
+    import numpy as np
+
+    from dyngs.data.capture import Capture, View
+
+    intrinsics = np.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]])
+    views = [View(f"p{i}", root / f"p{i}.png", np.eye(4), intrinsics, 16, 12, frame=i) for i in range(2)]
+    return Capture(root, "x", {"train": tuple(views)})
+
+
 def read_splats(root: Path) -> object:
     """Read a file of Gaussians, render it, and write it as another one."""
     from dyngs.splats.formats import known_format, read_splats, write_splats
@@ -333,6 +359,13 @@ _PACKED = ("compressed-ply", "spz", "splat", "sog", "glb")
 _RUNS: dict[str, Seed] = {
     kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "control_nodes", "trajectory")
 }
+_JOINTS: dict[str, Seed] = {
+    "npz": files.write_joints_npz,
+    "json": files.write_joints_json,
+    "vertices": files.write_vertices_npz,
+    "frame_data": files.write_frame_data,
+    "sam_3d_body": files.write_sam_3d_body,
+}
 _PICTURES: dict[str, Seed] = {"png": files.write_png, "png16": files.write_png16, "jpeg": files.write_jpeg}
 _PICTURES |= {"exr": files.write_exr, "tiff": files.write_tiff}
 _BODIES: dict[str, Seed] = {
@@ -351,6 +384,8 @@ READERS: dict[str, Reader] = {
     "video": Reader({"mp4": files.write_mp4}, read_a_video),
     "pickles": Reader({"new": files.write_fits, "old": files.write_old_fits}, read_a_pickle),
     "bodies": Reader(_BODIES, read_a_body),
+    "joints": Reader(_JOINTS, read_given_joints),
+    "keypoints": Reader({"openpose": files.write_openpose, "coco": files.write_coco}, read_2d_key_points),
     "amass": Reader({"smplh": files.write_smplh_motion, "own": files.write_own_motion}, read_a_motion),
     "bvh": Reader({"walk": files.write_walk_bvh}, read_a_motion),
     "gltf": Reader({"linear": files.write_walk_glb, "cubic": files.write_cubic_glb}, read_a_motion),

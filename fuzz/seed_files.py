@@ -51,6 +51,57 @@ def write_jpeg(root: Path) -> None:
     write_picture(root / "a.jpg", random_pixels(9, 17, 3))
 
 
+def write_joints_npz(root: Path) -> None:
+    """Write 3D joints with their frames, order and space."""
+    arrays = {"joints": random_places(2, 17, 4), "frames": np.arange(2), "order": "coco17", "space": "world"}
+    np.savez(root / "a.npz", **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def write_joints_json(root: Path) -> None:
+    """Write 3D joints by the names of pictures."""
+    joints = {f"p{i}": row.tolist() for i, row in enumerate(random_places(2, 25, 3))}
+    (root / "a.json").write_text(json.dumps({"order": "openpose25", "space": "camera", "joints": joints}))
+
+
+def write_vertices_npz(root: Path) -> None:
+    """Write posed vertices."""
+    np.savez(root / "a.npz", vertices=tiny_body(24).vertices.numpy()[None].repeat(2, 0))
+
+
+def write_frame_data(root: Path) -> None:
+    """Write posed vertices as semantic_human_texture_stitching has them."""
+    vertices = tiny_body(24).vertices.numpy()[None].repeat(2, 0)
+    (root / "a.pkl").write_bytes(pickle.dumps({"vertices": vertices, "camera_f": np.ones(2), "width": 8}, 2))
+
+
+def write_sam_3d_body(root: Path) -> None:
+    """Write the 3D key points of a picture as SAM 3D Body has them."""
+    (root / "a").mkdir()
+    fields = {"pred_keypoints_3d": random_places(1, 70, 3)[0], "pred_cam_t": np.array([0.0, 0.1, 4.0])}
+    np.savez(root / "a" / "p0.npz", **fields)  # pyright: ignore[reportArgumentType]
+
+
+def write_openpose(root: Path) -> None:
+    """Write 2D key points of a picture as OpenPose does."""
+    (root / "a").mkdir()
+    points = random_places(1, 25, 3)[0].ravel().tolist()
+    (root / "a" / "p0_keypoints.json").write_text(json.dumps({"people": [{"pose_keypoints_2d": points}]}))
+
+
+def write_coco(root: Path) -> None:
+    """Write 2D key points of a picture as COCO has them."""
+    points = np.abs(random_places(1, 17, 3)[0]).ravel().tolist()
+    fields = {"images": [{"id": 1, "file_name": "p0.png"}], "annotations": [{"image_id": 1, "keypoints": points}]}
+    (root / "a.json").write_text(json.dumps(fields))
+
+
+def random_places(*shape: int) -> np.ndarray:
+    """Return places within two metres, the last of each row positive."""
+    places = np.random.default_rng(0).uniform(-2, 2, shape)
+    places[..., -1] = np.abs(places[..., -1])
+    return places
+
+
 def write_depth_npz(root: Path) -> None:
     """Write a depth map as an array in an archive."""
     np.savez(root / "a.npz", depth=np.full((4, 6), 2.0, np.float32))

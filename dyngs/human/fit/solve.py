@@ -26,7 +26,7 @@ from dyngs.parameters import Parameters
 LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e-3, "padding": 1e-3} | {
     "offset": 3e-3,
     "shift": 3e-3,
-    "log_focal": 1e-2,
+    "log_focal": 3e-2,
 }
 """Learning rates at the first step; those of places per metre of the person's unit."""
 LR_DECAY = 0.1

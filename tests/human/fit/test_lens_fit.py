@@ -12,11 +12,11 @@ from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.human.template.load import default_template
 
-SIZE, FRAMES, STEPS, DISTANCE = 48, 4, 16, 2.2
+SIZE, FRAMES, STEPS, DISTANCE = 32, 4, 12, 2.2
 
 
 def test_a_wrong_guess_is_corrected() -> None:
-    surface = surface_of(default_template(), 24)
+    surface = surface_of(default_template(), 16)
     intrinsics = torch.tensor([[0.9 * SIZE, 0, SIZE / 2], [0, 0.9 * SIZE, SIZE / 2], [0, 0, 1]])
     camera = Cameras(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None], intrinsics[None], SIZE, SIZE)
     poses = torch.zeros(FRAMES, 55, 3)
