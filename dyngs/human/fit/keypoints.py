@@ -27,6 +27,8 @@ JOINTS = {
     name: row for row, name in enumerate(JOINT_NAMES) if name.removeprefix("left_").removeprefix("right_") in _SEEN
 }
 """Names of these joints, and their rows in ``JOINT_NAMES``."""
+_FARTHEST = 1e6
+"""Key points further away, px, are taken for mistakes."""
 _ORDERS = {17: COCO, 133: COCO, 25: BODY_25, 18: COCO_18}
 """Number of key points of a format to the names of the first ones, as published."""
 
@@ -107,7 +109,8 @@ def _coco(file: Path, stems: Mapping[str, str]) -> dict[str, np.ndarray]:
             names[image["id"]] = name
     found: dict[str, np.ndarray] = {}
     for person in annotations:
-        name = names.get(person.get("image_id")) if isinstance(person, dict) else None
+        number = person.get("image_id") if isinstance(person, dict) else None
+        name = names.get(number) if isinstance(number, (int, str)) else None
         if name is not None and person.get("keypoints"):
             points = _points(file, "keypoints", person["keypoints"])
             points[:, 2] = np.minimum(points[:, 2], 2) / (2 if points[:, 2].max() > 1 else 1)
@@ -139,5 +142,5 @@ def _placed(view: View, points: np.ndarray) -> Tensor:
         if name in JOINTS and points[row, 2] > 0:
             joints[JOINTS[name]] = torch.from_numpy(points[row])
     places = undistorted_points(view.lens, view.intrinsics, joints[:, :2])
-    confidence = joints[:, 2:] * torch.isfinite(places).all(1, keepdim=True)
-    return torch.cat([torch.nan_to_num(places), confidence.clamp(0, 1)], dim=1).float()
+    near = (places.abs() < _FARTHEST).all(1, keepdim=True)  # false for NaN
+    return torch.cat([torch.where(near, places, 0.0), joints[:, 2:].clamp(0, 1) * near], dim=1).float()
