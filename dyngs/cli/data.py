@@ -121,6 +121,14 @@ def _add_synth(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="random seed of cameras, for human of the clothes (default 0)"
     )
+    parser.add_argument(
+        "--varied", action="store_true", help="for human: the seed is also that of body shape, light and clip"
+    )
+    parser.add_argument(
+        "--usual-clothes",
+        action="store_true",
+        help="for human: left mostly as right, back as front, bare hands, instead of clothes that differ everywhere",
+    )
     parser.set_defaults(run=run_synth)
 
 
@@ -269,17 +277,20 @@ def run_synth(arguments: argparse.Namespace) -> int:
         raise DyngsError("--size and --views must be at least 1, --seed at least 0")
     if arguments.cameras is not None and (scene not in ("room", "human") or arguments.cameras < 1):
         raise DyngsError("--cameras must be at least 1, and is for the scenes room and human only")
+    if (arguments.varied or arguments.usual_clothes) and scene != "human":
+        raise DyngsError("--varied and --usual-clothes are for the scene human only")
     cameras = 8 if arguments.cameras is None else arguments.cameras
     synthetic.require_new_folder(out)
     if scene == "human":
-        from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+        from dyngs.human.synthetic.capture import HumanOptions, varied, write_human_capture
 
-        write_human_capture(out, HumanOptions(size=size, num_frames=views, num_cameras=cameras, seed=seed))
+        options = HumanOptions(size, views, num_cameras=cameras, seed=seed, usual_clothes=arguments.usual_clothes)
+        write_human_capture(out, varied(options, seed) if arguments.varied else options)
     elif scene == "still":
         synthetic.write_still_capture(out, synthetic.StillOptions(size=size, num_train=views, seed=seed))
     else:
-        options = synthetic.DynamicOptions(size=size, num_times=views, num_cameras=cameras, seed=seed)
-        synthetic.write_dynamic_capture(scene, out, options)
+        moving = synthetic.DynamicOptions(size=size, num_times=views, num_cameras=cameras, seed=seed)
+        synthetic.write_dynamic_capture(scene, out, moving)
     preset = {"still": "static", "human": "human"}.get(scene, "dynamic")
     print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={out}")
     return 0

@@ -152,6 +152,16 @@ def test_a_person_is_refused_in_one_line(words: str, part: str, tmp_path: Path, 
     assert not (tmp_path / "new").exists()
 
 
+def test_a_varied_person_has_a_shape_of_its_own(tmp_path: Path, capsys: PrintedOutput) -> None:
+    words = ["--size", "8", "--views", "1", "--cameras", "2", "--seed", "4", "--varied", "--usual-clothes"]
+    assert main(["data", "synth", "human", str(tmp_path / "new"), *words]) == 0
+    capture = read_capture(DataConfig(root=tmp_path / "new"))  # type: ignore[call-arg]
+    assert capture.body is not None
+    assert np.abs(capture.body["train"].betas).max() > 0
+    capsys.readouterr()
+    assert "human only" in error_line(capsys, "data", "synth", "still", str(tmp_path / "other"), "--varied")
+
+
 def test_the_scene_is_listed() -> None:
     assert "human" in data.SYNTHETIC_SCENES
 

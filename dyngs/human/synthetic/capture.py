@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.data.synthetic.captures import require_new_folder
@@ -23,6 +22,7 @@ from dyngs.errors import DyngsError
 from dyngs.files.write import write_image, write_text
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
+from dyngs.human.synthetic.clips import random_clip, squat, walk
 from dyngs.human.synthetic.clothes import (
     dress_body,
     paint_texture,
@@ -31,17 +31,27 @@ from dyngs.human.synthetic.clothes import (
     texture_coordinates,
 )
 from dyngs.human.template.body import BodyTemplate, apply_shape, posed_vertices
-from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.human.template.load import default_template
 from dyngs.human.template.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
 
-_FPS = 12.0
 _RADIUS = 3.5
 """Radius of the ring of cameras, m."""
 _TARGET = np.array([0.0, 0.95, 0.0])
 """The point that all cameras look at, m."""
-_TO_LIGHT = np.array([0.35, 0.75, 0.56])
-_AMBIENT, _DIFFUSE = 0.6, 0.45
+
+
+@dataclass(frozen=True)
+class Light:
+    """A distant lamp and light from all sides.
+
+    Attributes:
+        towards: (3,) direction to the lamp, of any length.
+        ambient, diffuse: sRGB factors by channel, (3,) or one; ambient + diffuse where the surface faces the lamp.
+    """
+
+    towards: tuple[float, float, float] = (0.35, 0.75, 0.56)
+    ambient: tuple[float, ...] = (0.6,)
+    diffuse: tuple[float, ...] = (0.45,)
 
 
 @dataclass(frozen=True)
@@ -57,6 +67,9 @@ class HumanOptions:
         seed: of the outfit, see ``dyngs.human.synthetic.clothes.random_outfit``; the same seed gives the same bytes.
         samples: per side of a pixel.
         body_seed: of the person's body shape; None: the template's own.
+        light_seed: of the direction, strength and tint of the light; None: always the same.
+        clip_seed: of the clips, see ``dyngs.human.synthetic.clips.random_clip``; None: a walk, then a squat.
+        usual_clothes: left mostly as right, back as front and bare hands, instead of clothes that differ everywhere.
     """
 
     size: int = 128
@@ -67,6 +80,14 @@ class HumanOptions:
     seed: int = 0
     samples: int = 2
     body_seed: int | None = None
+    light_seed: int | None = None
+    clip_seed: int | None = None
+    usual_clothes: bool = False
+
+
+def varied(options: HumanOptions, seed: int) -> HumanOptions:
+    """Return options of another person for each seed: outfit, body shape, light and clips."""
+    return replace(options, seed=seed, body_seed=seed, light_seed=seed, clip_seed=seed)
 
 
 @dataclass(frozen=True)
@@ -105,13 +126,13 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
         raise DyngsError("a synthetic person needs num_new, num_test and seed of at least 0")
     require_new_folder(out)
     body, betas = _person(options.body_seed)
-    outfit = random_outfit(options.seed)
+    outfit = random_outfit(options.seed, options.usual_clothes)
     clothed, texture = dress_body(body, outfit), paint_texture(body, outfit)
     train = dict(enumerate(_ring(options.num_cameras)))
     test = {len(train) + i: pose for i, pose in enumerate(_ring_between(options.num_test, options.num_cameras))}
-    clips = {"train": walk(body, options.num_frames)}
+    clips = {"train": _clip(body, options.num_frames, options.clip_seed, 0)}
     if options.num_new and test:
-        clips["pose"] = squat(body, options.num_new)
+        clips["pose"] = _clip(body, options.num_new, options.clip_seed, 1)
     for name, clip in clips.items():
         motion = replace(clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas)
         meshes = list(_posed_meshes(clothed, motion, texture))
@@ -132,51 +153,41 @@ def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
     return replace(body, vertices=vertices, joints=joints), betas
 
 
-def walk(body: BodyTemplate, num_frames: int) -> Motion:
-    """Return three swings of legs and arms in place while the body turns by 50 degrees; soles at y = 0."""
-    time = np.linspace(0.0, 1.0, num_frames)
-    swing, lift = np.sin(3 * np.pi * time), 0.3 - 0.3 * np.cos(3 * np.pi * time)
-    rotations = {
-        "pelvis": _axis_angle(y=np.radians(50.0) * (time - 0.5)),
-        "spine2": _axis_angle(y=0.2 * swing),
-        "head": _axis_angle(y=0.5 * np.sin(2 * np.pi * time)),
-    }
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        rotations |= {
-            f"{side}_hip": _axis_angle(x=-0.5 * sign * swing),
-            f"{side}_knee": _axis_angle(x=0.2 + 0.6 * np.maximum(-sign * swing, 0.0) + 0.3 * lift),
-            f"{side}_shoulder": _axis_angle(x=0.6 * sign * swing, z=-sign * 1.15),
-            f"{side}_elbow": _axis_angle(y=-sign * (0.3 + lift)),
-        }
-    return _grounded_motion(body, rotations, num_frames)
+def random_light(seed: int | None) -> Light:
+    """Return the light of ``seed``, from any side and above, of which three quarters to all reach a white surface that
+    faces it; None: ``Light()``."""
+    if seed is None:
+        return Light()
+    make = np.random.default_rng([seed, 3])
+    azimuth, height = make.uniform(-np.pi, np.pi), make.uniform(0.0, 1.2)
+    diffuse = make.uniform(0.2, 0.6)
+    ambient = make.uniform(0.75, 1.05) - diffuse
+    tint = 1.0 + make.uniform(-0.06, 0.06) * np.array([1.0, 0.0, -1.0])
+    red, green, blue = (float(diffuse * part) for part in tint)
+    return Light((float(np.sin(azimuth)), float(height), float(np.cos(azimuth))), (float(ambient),), (red, green, blue))
 
 
-def squat(body: BodyTemplate, num_frames: int) -> Motion:
-    """Return a motion from standing into a squat while the arms rise sideways; soles at y = 0."""
-    depth = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, num_frames))
-    rotations = {"spine1": _axis_angle(x=0.35 * depth), "head": _axis_angle(x=-0.3 * depth, z=0.2 * depth)}
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        rotations |= {
-            f"{side}_hip": _axis_angle(x=-1.3 * depth, z=0.15 * sign * depth),
-            f"{side}_knee": _axis_angle(x=1.9 * depth),
-            f"{side}_ankle": _axis_angle(x=-0.6 * depth),
-            f"{side}_shoulder": _axis_angle(z=sign * (-1.2 + 2.1 * depth)),
-            f"{side}_elbow": _axis_angle(y=-0.4 * sign * depth),
-        }
-    return _grounded_motion(body, rotations, num_frames)
+def _clip(body: BodyTemplate, num_frames: int, seed: int | None, which: int) -> Motion:
+    """Return the clip of the split train (``which`` 0) or of ``pose`` (1)."""
+    if seed is not None:
+        return random_clip(body, num_frames, 2 * seed + which)
+    return squat(body, num_frames) if which else walk(body, num_frames)
 
 
-def render_mesh(mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int) -> np.ndarray:
+def render_mesh(
+    mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int, light: Light = Light()
+) -> np.ndarray:
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1], of ``samples`` x ``samples`` per pixel.
 
-    Lambertian: the texture's value times 0.6 + 0.45 max(n . l, 0) with smooth normals n, at most 1; no shadows. Alpha
-    is the share of samples that hit the mesh, whose colours are averaged.
+    Lambertian: the texture's value times ambient + diffuse max(n . l, 0) with smooth normals n, at most 1; no shadows.
+    Alpha is the share of samples that hit the mesh, whose colours are averaged.
 
     Args:
         mesh: visible from both sides.
         world_from_cam: (4, 4) OpenGL pose; square pixels, centred, ``CAMERA_ANGLE_X`` across.
         size: width and height in pixels.
         samples: per side of a pixel.
+        light: on the mesh.
 
     Raises:
         ValueError: the mesh reaches behind the camera.
@@ -192,7 +203,7 @@ def render_mesh(mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples:
     for k in range(samples * samples):
         sample = np.array([(k % samples + 0.5) / samples, (k // samples + 0.5) / samples, 0.0])
         fragments = rasterize((image - sample)[mesh.faces], size, size)
-        sums[fragments.index, :3] += _shaded(mesh, normals, fragments)
+        sums[fragments.index, :3] += _shaded(mesh, normals, fragments, light)
         sums[fragments.index, 3] += 1.0
     rgb = sums[:, :3] / np.maximum(sums[:, 3:], 1.0)
     return np.concatenate([rgb, sums[:, 3:] / samples**2], axis=1).reshape(size, size, 4)
@@ -204,11 +215,11 @@ def _write_split(
     """Write the pictures of one split and its JSON; nothing without cameras."""
     if not cameras:
         return
-    frames = []
+    frames, light = [], random_light(options.light_seed)
     for i, mesh in enumerate(meshes):
         for camera, pose in cameras.items():
             name = f"images/{split}/f{i:03d}_c{camera:02d}.png"
-            write_image(out / name, render_mesh(mesh, pose, options.size, options.samples))
+            write_image(out / name, render_mesh(mesh, pose, options.size, options.samples, light))
             entry: dict[str, object] = {"file_path": name, "frame": i, "camera": camera}
             frames.append(entry | {"time": i / max(len(meshes) - 1, 1), "transform_matrix": pose.tolist()})
     size, focal = options.size, _focal(options.size)
@@ -223,29 +234,6 @@ def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> It
     for pose, trans, scale in zip(*(x.double() for x in (motion.poses, motion.trans, motion.scale)), strict=True):
         vertices = posed_vertices(exact, pose[None], trans[None], scale=scale[None])[0].cpu().numpy()
         yield PosedMesh(vertices, faces, uv, uv_faces, texture)
-
-
-def _grounded_motion(body: BodyTemplate, rotations: dict[str, np.ndarray], num_frames: int) -> Motion:
-    """Return the motion of joints rotated by axis-angle (F, 3) or (3,), the lowest vertex always at y = 0."""
-    device = body.vertices.device
-    poses = torch.zeros(num_frames, len(JOINT_NAMES), 3, device=device)
-    for name, rotation in rotations.items():
-        poses[:, JOINT_NAMES.index(name)] = torch.from_numpy(rotation).to(poses)
-    trans = torch.zeros(num_frames, 3, device=device)
-    exact = body.to(dtype=torch.float64)
-    for frame, pose in enumerate(poses.double()):
-        trans[frame, 1] = (
-            -posed_vertices(exact, pose[None], torch.zeros(1, 3, dtype=torch.float64, device=device))[0, :, 1]
-            .min()
-            .float()
-        )
-    return Motion(poses, trans, torch.zeros(10, device=device), _FPS, torch.ones(num_frames, device=device))
-
-
-def _axis_angle(x: np.ndarray | float = 0.0, y: np.ndarray | float = 0.0, z: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return axis-angle vectors (F, 3) of rotations about the fixed axes z, then y, then x by angles (F,), rad."""
-    angles = np.stack(np.broadcast_arrays(np.atleast_1d(z), y, x), axis=-1)
-    return Rotation.from_euler("zyx", angles).as_rotvec()
 
 
 def _ring(count: int) -> np.ndarray:
@@ -275,12 +263,13 @@ def _focal(size: int) -> float:
     return float(0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X))
 
 
-def _shaded(mesh: PosedMesh, normals: np.ndarray, fragments: Fragments) -> np.ndarray:
+def _shaded(mesh: PosedMesh, normals: np.ndarray, fragments: Fragments, light: Light) -> np.ndarray:
     """Return the sRGB values (H, 3) of the fragments."""
     uv = interpolate(fragments.barycentric, mesh.uv[mesh.uv_faces[fragments.faces]])
     normal = normalized(interpolate(fragments.barycentric, normals[mesh.faces[fragments.faces]]))
-    light = _AMBIENT + _DIFFUSE * np.maximum(normal @ normalized(_TO_LIGHT), 0.0)
-    return np.minimum(_sampled(mesh.texture, uv) * light[:, None], 1.0)
+    facing = np.maximum(normal @ normalized(np.array(light.towards)), 0.0)
+    received = np.array(light.ambient) + np.array(light.diffuse) * facing[:, None]
+    return np.minimum(_sampled(mesh.texture, uv) * received, 1.0)
 
 
 def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:

@@ -59,10 +59,15 @@ class Outfit:
     size: float = 1.0
 
 
-def random_outfit(seed: int) -> Outfit:
+def random_outfit(seed: int, is_usual: bool = False) -> Outfit:
     """Return the outfit of ``seed``. 0 is the bare template, painted; others have clothes with offsets of up to 4 cm,
-    differ in cut and pattern, and are 0.88 to 1.04 times as tall."""
+    differ in cut and pattern, and are 0.88 to 1.04 times as tall.
+
+    ``is_usual``: left mostly as right, back as front, bare hands; else all of these differ, to show what is mixed up.
+    """
     palette = _palette(seed)
+    if is_usual:
+        palette = _usual(palette, np.random.default_rng([seed, 4]))
     if seed == 0:
         return Outfit(palette)
     make = np.random.default_rng([seed, 1])
@@ -178,6 +183,21 @@ def _palette(seed: int) -> dict[str, np.ndarray]:
     return colors | {"skin": skin * np.array([1.0, 0.8, 0.68]), "hair": hair * np.array([1.0, 0.75, 0.5])}
 
 
+def _usual(palette: dict[str, np.ndarray], make: np.random.Generator) -> dict[str, np.ndarray]:
+    """Return the palette of clothes that a person would wear: half of the shirts are of one colour, colours are less
+    saturated and of any lightness, and one shirt in five has another back."""
+    names = ("shirt", "stripe", "back", "left_leg", "left_shoe")
+    muted = {name: make.uniform(0.25, 1.1) * (palette[name] + make.uniform(0.0, 1.5) * 0.5) / 1.5 for name in names}
+    muted = {name: color.clip(0.03, 0.97) for name, color in muted.items()}
+    if make.uniform() < 0.5:
+        muted["stripe"] = muted["shirt"]
+    if make.uniform() < 0.8:
+        muted["back"] = muted["shirt"]
+    sides = {f"right_{part}": muted[f"left_{part}"] for part in ("leg", "shoe")}
+    muted["cuff"] = muted["stripe"]
+    return palette | muted | sides | {f"{side}_hand": palette["skin"] for side in ("left", "right")}
+
+
 def _painted(points: np.ndarray, part: np.ndarray, eye: np.ndarray, outfit: Outfit) -> np.ndarray:
     """Return the colours (P, 3) of ``points`` (P, 3) in T-pose, m, by ``part`` (P,); ``eye`` (3,) is the left eye."""
     x, y, z = points.T
@@ -201,7 +221,9 @@ def _painted(points: np.ndarray, part: np.ndarray, eye: np.ndarray, outfit: Outf
     trousers = checks[:, None] * either("leg")
     ahead, behind = (x, y) if outfit.upright else (y, x)
     torso = np.where(is_front[:, None], striped(ahead, 0.05, shirt, stripe), striped(behind, 0.06, back, stripe))
-    sleeves = np.where(is_left[:, None], striped(side, 0.05, shirt, stripe), striped(side, 0.08, back, white))
+    sleeves = np.where(
+        is_left[:, None], striped(side, 0.05, shirt, stripe), striped(side, 0.08, back, palette.get("cuff", white))
+    )
     is_sleeve = (part == "arm") | ((part == "forearm") & outfit.long_sleeves)
     is_leg = is_leg & (outfit.long_legs | (y > _BELOW_KNEE))
     for where, colors in (

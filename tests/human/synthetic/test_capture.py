@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import combinations
@@ -29,11 +28,12 @@ from dyngs.human.motion.read import read_motion
 from dyngs.human.synthetic.capture import (
     HumanOptions,
     PosedMesh,
+    random_light,
     render_mesh,
-    squat,
-    walk,
+    varied,
     write_human_capture,
 )
+from dyngs.human.synthetic.clips import squat, walk
 from dyngs.human.synthetic.clothes import dress_body, paint_texture, random_outfit
 from dyngs.human.template.body import BodyTemplate, posed_vertices
 from dyngs.human.template.joints import JOINT_NAMES
@@ -215,38 +215,6 @@ def test_what_is_behind_the_camera_is_refused() -> None:
         render_mesh(mesh_of(body().vertices.double().numpy(), texture()), front_camera(0.0, 0.0), 8, 1)
 
 
-# --- motion -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("clip", [walk, squat])
-def test_the_person_stands_on_the_floor_within_sight(clip: Callable[[BodyTemplate, int], Motion]) -> None:
-    """In every frame the lowest vertex is at y = 0, and all are inside a cylinder that the cameras see."""
-    motion = clip(body(), 5)
-    for frame in range(5):
-        x, y, z = posed(motion, frame).T
-        assert abs(y.min()) < 1e-6
-        assert y.max() < 2.0
-        assert np.hypot(x, z).max() < 1.0
-    assert motion.poses.diff(dim=0).abs().amax((1, 2)).min() > 0.05, "no frame like the one before"
-
-
-def test_the_clips_are_what_their_names_say() -> None:
-    """Feet pass each other in a walk; in a squat the pelvis goes down and the hands go up."""
-
-    def vertex(joint: str) -> int:
-        return int(torch.linalg.vector_norm(body().vertices - body().joints[JOINT_NAMES.index(joint)], dim=-1).argmin())
-
-    left, right, wrist = (vertex(name) for name in ("left_ankle", "right_ankle", "left_wrist"))
-    steps = [posed(walk(body(), 7), frame)[[left, right]] for frame in (1, 3)]
-    ahead = [feet[0, 2] - feet[1, 2] for feet in steps]
-    assert ahead[0] > 0.3
-    assert ahead[1] < -0.3
-    motion = squat(body(), 3)
-    first, last = posed(motion, 0)[wrist], posed(motion, 2)[wrist]
-    assert motion.trans[2, 1] < motion.trans[0, 1] - 0.2
-    assert last[1] > first[1] + 0.2
-
-
 # --- files ------------------------------------------------------------------------------------------------------------
 
 
@@ -289,6 +257,31 @@ def test_another_seed_is_another_person_of_another_size(root: Path, tmp_path: Pa
             assert expected.min() - 0.5 <= found.min() + 0.5 <= expected.min() + 2  # pixels: centres are sampled
             assert expected.max() - 2 <= found.max() + 0.5 <= expected.max() + 0.5
     assert (pixels(root / "images/train/f000_c00.png") != pixels(other / "images/train/f000_c00.png")).any()
+
+
+def test_varied_people_differ_in_body_light_and_clip(root: Path, tmp_path: Path) -> None:
+    """Each by its own; body parameters are in the template's own shape space, and are exact."""
+    plain = files(root)
+    for name in ("light_seed", "clip_seed"):
+        some = files(write_human_capture(tmp_path / name, replace(TINY, num_new=0, num_test=0, **{name: 3})))
+        assert some["images/train/f000_c00.png"] != plain["images/train/f000_c00.png"]
+        assert (some["body_train.npz"] != plain["body_train.npz"]) == (name == "clip_seed")
+    person = write_human_capture(tmp_path / "varied", varied(TINY, 3))
+    given = captured(person).body
+    assert given is not None
+    assert given["train"].shape_space == "anny"
+    with np.load(person / "body_pose.npz") as pose, np.load(person / "body_train.npz") as train:
+        assert np.abs(pose["poses"] - train["poses"]).max() > 0.1
+        np.testing.assert_array_equal(pose["betas"], train["betas"])
+
+
+def test_light_comes_from_above_and_not_too_bright() -> None:
+    for seed in range(5):
+        light = random_light(seed)
+        assert light.towards[1] >= 0
+        assert light == random_light(seed)
+        assert light != random_light(seed + 1)
+        assert all(0.6 < light.ambient[0] + channel < 1.15 for channel in light.diffuse)
 
 
 def test_the_layout_is_read_as_a_person(root: Path) -> None:

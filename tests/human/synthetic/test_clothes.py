@@ -103,3 +103,13 @@ def test_clothes_stand_away_from_the_skin_by_up_to_four_centimetres(seed: int) -
 def test_a_seed_always_means_the_same() -> None:
     a, b, other = random_outfit(7), random_outfit(7), random_outfit(8)
     assert (a.pitch, a.shirt, a.size) == (b.pitch, b.shirt, b.size) != (other.pitch, other.shirt, other.size)
+
+
+def test_usual_clothes_are_alike_on_both_sides() -> None:
+    for seed in (1, 2, 3):
+        palette, other = random_outfit(seed, True).palette, random_outfit(seed).palette
+        for part in ("leg", "shoe", "hand"):
+            assert np.array_equal(palette[f"left_{part}"], palette[f"right_{part}"])
+            assert not np.array_equal(other[f"left_{part}"], other[f"right_{part}"])
+        assert np.array_equal(palette["left_hand"], palette["skin"])
+        assert all(0 <= color.min() <= color.max() <= 1 for color in palette.values())
