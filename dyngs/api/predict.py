@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +13,9 @@ from dyngs.build import assemble
 from dyngs.config import Config, DataConfig, HumanPredictorModel
 from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
 from dyngs.config.kinds import network_of, person_of
+from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.errors import DyngsError
+from dyngs.human.fit.before_training import with_fitted_body
 from dyngs.human.prediction.person import CapturedPerson, named_views, spread_views
 from dyngs.human.prediction.predict import PredictedAvatar, predict_gaussians
 from dyngs.human.template.load import load_template
@@ -20,6 +23,7 @@ from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.runs.folder import new_folder, require_empty
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.rates import Rates
+from dyngs.training.adaptation import adapt_network
 from dyngs.training.prediction import filmed, human_options, load_network, new_network, scene_of
 
 _FAINT = 0.02
@@ -34,6 +38,7 @@ class Prediction:
         run_dir: the run folder.
         views: names of the pictures that were predicted from.
         num_gaussians: N.
+        seconds_steps: training the network on these pictures.
         seconds_maps: reading these pictures and bringing them to the atlas.
         seconds_network: the network and its Gaussians.
     """
@@ -41,39 +46,59 @@ class Prediction:
     run_dir: Path
     views: tuple[str, ...]
     num_gaussians: int
+    seconds_steps: float
     seconds_maps: float
     seconds_network: float
 
 
-def predict_person(network_run: Path, capture: Path, out: Path, views: int | tuple[str, ...]) -> Prediction:
+def predict_person(
+    network_run: Path,
+    capture: Path,
+    out: Path,
+    views: int | tuple[str, ...],
+    *,
+    steps: int = 20,
+    say: Callable[[str], None] = print,
+    report: ReportProgress = report_nothing,
+) -> Prediction:
     """Write the person of ``capture`` as a run folder ``out`` for all commands; ``dyngs train --resume`` refines it.
 
     Args:
         network_run: run folder of ``model.kind: human_predictor``.
-        capture: of a person, in any format that has body parameters and silhouettes.
+        capture: of a person, in any format that has silhouettes; without body parameters the free template is fitted
+            to these first, once, as by ``dyngs data fit``.
         out: a new run folder.
         views: how many of the training views to predict from, well spread; or their names.
+        steps: of training the network on these pictures before, see ``dyngs.training.adaptation``.
+        say: is told in a line that a body is fitted.
+        report: is told how far that fit and these steps have come.
 
     Raises:
         DyngsError: not such a run or capture, views that are not there, or an ``out`` that is not empty.
     """
+    if steps < 0:
+        raise DyngsError(f"cannot train for {steps} steps; give 0 or more")
     config, model = network_config(network_run)
     require_empty(out)  # before the work
     checkpoint = latest_checkpoint(network_run)
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
     data = config.data.model_copy(update={"root": capture.absolute()})
+    if model.body is None:
+        data = with_fitted_body(data, only_if_needed=True, say=say, report=report)
     person = filmed(data, model, load_template(human_options(model)))
     chosen = _chosen(person.sitter, views)
+    began = time.perf_counter()
+    adapt_network(network, person, chosen, mean, config, model, steps, report)
     start = time.perf_counter()
     maps = person.look(chosen)
     middle = time.perf_counter()
     with torch.no_grad():
         avatar = without_faint(predict_gaussians(person.sitter, maps, mean, network, model.min_silhouette_share))
     end = time.perf_counter()
-    write_run(out, avatar, data, model, end - start)
+    write_run(out, avatar, data, model, end - began)
     names = tuple(person.sitter.views[i].name for i in chosen)
-    return Prediction(out, names, len(avatar.gaussians), middle - start, end - middle)
+    return Prediction(out, names, len(avatar.gaussians), start - began, middle - start, end - middle)
 
 
 def network_config(run_dir: Path) -> tuple[Config, HumanPredictorModel]:

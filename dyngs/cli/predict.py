@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dyngs.cli.progress_bar import ProgressBar
+
 _EPILOG = """\
 examples:
   dyngs train configs/human_predictor.yaml data.root=PEOPLE run.dir=runs/net     PEOPLE holds a capture in each folder
@@ -20,13 +22,14 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = commands.add_parser(
         "predict",
         help="predict a person from a few pictures, without training",
-        description="Predict an avatar from a few training views of a capture. Writes a run folder (model.kind=human) "
-        "for all other commands.",
+        description="Predict an avatar from one or a few training views of a capture with silhouettes. Without body "
+        "parameters a body is fitted first, as by `dyngs data fit`. Writes a run folder (model.kind=human) for all "
+        "other commands.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("network", type=Path, metavar="NET_RUN", help="run folder of model.kind=human_predictor")
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="capture of a person, with body parameters")
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="capture of a person")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="new run folder")
     parser.add_argument(
         "--views",
@@ -34,6 +37,13 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         default=3,
         metavar="N|NAME,..",
         help="number or names of the views to predict from (default 3)",
+    )
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=20,
+        metavar="N",
+        help="first train the network on these pictures for so many steps (default 20)",
     )
     parser.set_defaults(run=run)
 
@@ -50,9 +60,14 @@ def run(arguments: argparse.Namespace) -> int:
     from dyngs.api.predict import predict_person
 
     out: Path = arguments.out
-    made = predict_person(arguments.network, arguments.capture, out, arguments.views)
-    seconds = made.seconds_maps + made.seconds_network
+    with ProgressBar() as report:
+        made = predict_person(
+            arguments.network, arguments.capture, out, arguments.views, steps=arguments.steps, report=report
+        )
+    seconds = made.seconds_steps + made.seconds_maps + made.seconds_network
     print(f"predicted: {made.num_gaussians:,} Gaussians from {', '.join(made.views)}")
-    print(f"time:      {seconds:.2f} s ({made.seconds_maps:.2f} s pictures, {made.seconds_network:.2f} s network)")
+    trained = f"{made.seconds_steps:.2f} s steps, " if arguments.steps else ""
+    parts = f"{trained}{made.seconds_maps:.2f} s pictures, {made.seconds_network:.2f} s network"
+    print(f"time:      {seconds:.2f} s ({parts})")
     print(f"written:   {out}\nnext:      dyngs eval {out}\n           dyngs train --resume {out}   refines it")
     return 0

@@ -98,7 +98,9 @@ def _with_poses(config: Config) -> Config:
     from dyngs.config.kinds import field_of, network_of, person_of
     from dyngs.data.prepare.unposed import is_unposed, with_poses
 
-    if network_of(config) is not None or person_of(config) is not None:
+    if network_of(config) is not None:
+        return config  # its folder holds a capture per person
+    if person_of(config) is not None:
         if is_unposed(config.data):
             raise DyngsError(
                 f"{config.data.root}: a person needs a capture with body parameters (docs/human.md); of photos or "

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig, HumanModel, HumanPredictorModel
+from dyngs.config.kinds import network_of
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, reading
@@ -21,6 +22,7 @@ from dyngs.human.prediction.texel_maps import TexelMaps, observe_texels, to_atla
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.load import load_template
 from dyngs.ops.loss import l1_ssim_loss
+from dyngs.rendering import Rendering
 from dyngs.scene import render_options
 from dyngs.static.rates import Rates
 from dyngs.tensor_checks import require_tensor
@@ -103,7 +105,7 @@ class NetworkTrainer:
         Raises:
             DyngsError: the loss is not finite.
         """
-        options, step = self.config.train, self.done + 1
+        step = self.done + 1
         person = self.people[self.sampler.next(self.generator, lambda _: True)]
         choice = self._draw(len(person.choices))
         targets = self._targets(person, person.choices[choice])
@@ -120,10 +122,7 @@ class NetworkTrainer:
         for picture in targets:
             rendering = scene.render(picture.cameras, moment, options=drawing, background=background)
             truth = picture.composite(background)
-            loss = l1_ssim_loss(rendering.rgb[0], truth, options.ssim_weight, picture.mask)
-            if options.alpha_weight and picture.alpha is not None:
-                loss = loss + options.alpha_weight * (rendering.alpha[0] - picture.alpha).abs().mean()
-            total = total + loss / len(targets)
+            total = total + picture_loss(rendering, picture, truth, self.config) / len(targets)
         if not math.isfinite(float(total.detach())):
             raise DyngsError(f"step {step}, {person.sitter.name}: the loss is {float(total.detach())}; lower model.lr")
         self._update(total, step)
@@ -181,6 +180,19 @@ class NetworkTrainer:
 
     def _draw(self, count: int) -> int:
         return int(torch.randint(count, (1,), generator=self.generator, device="cpu"))
+
+
+def picture_loss(rendering: Rendering, picture: Picture, truth: Tensor, config: Config) -> Tensor:
+    """Return the loss of a rendering of one view against ``truth`` (H, W, 3), the picture on the same background."""
+    options, model = config.train, network_of(config)
+    loss = l1_ssim_loss(rendering.rgb[0], truth, options.ssim_weight, picture.mask)
+    if model is not None and model.squared_weight:
+        difference = rendering.rgb[0] - truth
+        known = difference if picture.mask is None else difference * picture.mask[..., None]
+        loss = loss + model.squared_weight * known.square().mean()
+    if options.alpha_weight and picture.alpha is not None:
+        loss = loss + options.alpha_weight * (rendering.alpha[0] - picture.alpha).abs().mean()
+    return loss
 
 
 def assemble_network(config: Config, model: HumanPredictorModel) -> NetworkTrainer:
@@ -300,9 +312,14 @@ def rate_at(model: HumanPredictorModel, step: int, steps: int) -> float:
 
 
 def _choices(sitter: CapturedPerson, model: HumanPredictorModel, generator: torch.Generator) -> list[list[int]]:
-    """Return views to predict from, of a random moment each: one at random, the others chosen to see much."""
+    """Return views to predict from, of a random moment each: one at random, the others chosen to see much.
+
+    Every other choice has fewer than ``model.source_views``, in turn each number from ``model.fewest_views``.
+    """
     firsts = torch.randint(len(sitter.views), (model.source_sets,), generator=generator, device="cpu").tolist()
-    return [spread_views(sitter, model.source_views, first) for first in firsts]
+    fewer = list(range(model.fewest_views, model.source_views)) or [model.source_views]
+    counts = [fewer[i // 2 % len(fewer)] if i % 2 else model.source_views for i in range(len(firsts))]
+    return [spread_views(sitter, count, first) for count, first in zip(counts, firsts, strict=True)]
 
 
 def scene_of(model: HumanModel, avatar: PredictedAvatar, rates: Rates) -> tuple[HumanScene, HumanTraining]:

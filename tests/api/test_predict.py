@@ -11,7 +11,7 @@ from tiny_people import NET, TINY, people
 
 from dyngs.api.predict import Prediction, network_config, predict_person
 from dyngs.api.train import train
-from dyngs.config import Config
+from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
@@ -35,7 +35,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     values = {"data": {"root": folder / "people"}, "model": NET, "train": {"steps": 2}, "run": {"dir": folder / "net"}}
     network = train(Config.model_validate(values))
     capture = people(folder / "others", (5,)) / "p5"
-    return Made(network, capture, predict_person(network, capture, folder / "run", 3))
+    return Made(network, capture, predict_person(network, capture, folder / "run", 3, steps=1))
 
 
 def test_a_prediction_is_a_run_of_a_person(made: Made) -> None:
@@ -53,14 +53,14 @@ def test_a_prediction_is_a_run_of_a_person(made: Made) -> None:
 
 
 def test_the_same_pictures_give_the_same_bytes(made: Made, tmp_path: Path) -> None:
-    again = predict_person(made.network, made.capture, tmp_path / "again", tuple(made.prediction.views))
+    again = predict_person(made.network, made.capture, tmp_path / "again", tuple(made.prediction.views), steps=1)
     assert again.views == made.prediction.views
     first, second = (load_run(run.run_dir).scene.gaussians.tensors().values() for run in (made.prediction, again))
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
 def test_a_prediction_can_be_refined(made: Made, tmp_path: Path) -> None:
-    out = predict_person(made.network, made.capture, tmp_path / "run", 2).run_dir
+    out = predict_person(made.network, made.capture, tmp_path / "run", 2, steps=0).run_dir
     config = load_resolved(out)
     short = config.model_copy(update={"train": config.train.model_copy(update={"steps": 3})})
     save_config(short, out / "config.yaml")
@@ -85,14 +85,28 @@ def test_mistakes_are_told(made: Made, tmp_path: Path) -> None:
             predict_person(made.network, made.capture, tmp_path / "out", count)
     with pytest.raises(DyngsError, match="no such folder"):
         predict_person(made.network, tmp_path / "nowhere", tmp_path / "out", 3)
-    (made.capture / "body_train.npz").rename(made.capture / "kept.npz")
-    (made.capture / "body_pose.npz").rename(made.capture / "kept_pose.npz")
+    with pytest.raises(DyngsError, match="-1 steps"):
+        predict_person(made.network, made.capture, tmp_path / "out", 3, steps=-1)
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(DyngsError, match="a network, not a scene; `dyngs predict"):
+        load_run(made.network)
+
+
+def test_a_body_is_fitted_where_none_is_given(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By what `dyngs train human` does, too; without one nothing is written."""
+    asked: list[tuple[Path, bool]] = []
+
+    def fit(data: DataConfig, *, only_if_needed: bool, say: object, report: object) -> DataConfig:
+        asked.append((data.root, only_if_needed))
+        return data
+
+    monkeypatch.setattr("dyngs.api.predict.with_fitted_body", fit)
+    kept = [path.rename(tmp_path / path.name) for path in sorted(made.capture.glob("body_*.npz"))]
     try:
         with pytest.raises(DyngsError, match="no body parameters"):
             predict_person(made.network, made.capture, tmp_path / "out", 3)
     finally:
-        (made.capture / "kept.npz").rename(made.capture / "body_train.npz")
-        (made.capture / "kept_pose.npz").rename(made.capture / "body_pose.npz")
+        for path in kept:
+            path.rename(made.capture / path.name)
+    assert asked == [(made.capture, True)]
     assert not (tmp_path / "out").exists()
-    with pytest.raises(DyngsError, match="a network, not a scene; `dyngs predict"):
-        load_run(made.network)

@@ -93,12 +93,18 @@ class HumanPredictorModel(_OnTemplate):
         min_length=1,
         description=str(_OnTemplate.model_fields["scaffold_heights"].description),
     )
-    source_views: int = Field(default=3, ge=1, description="pictures of a person that it is predicted from")
+    source_views: int = Field(default=3, ge=1, description="pictures of a person that it is predicted from, at most")
+    fewest_views: int = Field(
+        default=1, ge=1, description="every other training example is predicted from fewer pictures, at least so many"
+    )
     source_sets: int = Field(
         default=6, ge=1, description="different choices of source views per person in training; their maps are cached"
     )
     target_views: int = Field(
         default=2, ge=1, description="pictures of one moment that a prediction is compared with in each step"
+    )
+    squared_weight: float = Field(
+        default=1.0, ge=0, description="weight of the mean squared error in the loss, which counts edges more"
     )
     widths: tuple[Annotated[int, Field(ge=8)], ...] = Field(
         default=(24, 32, 48, 64),

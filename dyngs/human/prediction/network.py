@@ -12,14 +12,14 @@ from torch import Tensor, nn
 
 from dyngs.errors import DyngsError
 
-HEADS = {"rotation": 4, "scale": 3, "opacity": 1, "height": 1, "colour": 3, "picture_weight": 1}
+HEADS = {"rotation": 4, "scale": 3, "opacity": 1, "height": 1, "colour": 3, "picture_weight": 1, "guess": 3}
 """Outputs per texel of a scaffold and their number of channels; see ``dyngs.human.prediction.predict``."""
 
 _GROUPS = 8
 
 
 class AtlasNetwork(nn.Module):
-    """UNet from maps (D, S, S) to raw predictions (K, 13, S, S) in the order of ``HEADS``, which are 0 before training.
+    """UNet from maps (D, S, S) to raw predictions (K, 16, S, S) in the order of ``HEADS``, which are 0 before training.
 
     Each width halves the resolution; the way up concatenates the features of the way down, and at full resolution the
     input itself.
@@ -62,7 +62,7 @@ class AtlasNetwork(nn.Module):
         self.heads = nn.Conv2d(widths[0], scaffolds * sum(HEADS.values()), 1)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """Return the raw predictions (K, 13, S, S); S must be a multiple of 2 to the number of widths."""
+        """Return the raw predictions (K, 16, S, S); S must be a multiple of 2 to the number of widths."""
         levels = [maps[None]]
         for layer in self.down:
             levels.append(layer(levels[-1]))

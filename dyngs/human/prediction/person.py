@@ -19,6 +19,7 @@ from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.posing import BodyPose, Skeleton, frame_pose, pose_blend_shapes
 from dyngs.human.avatar.subject import Subject
 from dyngs.human.motion.captured import captured_motion
+from dyngs.human.prediction.unseen import mirror_texels
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.load import rest_shape
@@ -34,6 +35,7 @@ class CapturedPerson:
         body: the template in the person's shape, without a shape space.
         normals: (M, 3) unit normals of its vertices.
         texels: P, of that shape.
+        mirror: (P,) index of the texel at the mirror image of each.
         heights: (K,) of the scaffolds, m, ascending.
         gaussians: K P grey discs, ordered by scaffold.
         subject: skeleton, poses, and the anchors of ``gaussians``.
@@ -44,6 +46,7 @@ class CapturedPerson:
     body: BodyTemplate
     normals: Tensor
     texels: Texels
+    mirror: Tensor
     heights: tuple[float, ...]
     gaussians: Gaussians
     subject: Subject
@@ -79,6 +82,7 @@ def captured_person(capture: Capture, model: HumanModel, body: BodyTemplate) -> 
             vertices
         ),
         texels=texels,
+        mirror=mirror_texels(texels),
         heights=heights,
         gaussians=gaussians,
         subject=Subject(Skeleton(joints, body.parents), anchors, captured, pose_blend_shapes(body)),

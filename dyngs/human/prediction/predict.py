@@ -16,7 +16,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.subject import Subject
 from dyngs.human.prediction.network import HEADS, AtlasNetwork
 from dyngs.human.prediction.person import CapturedPerson
-from dyngs.human.prediction.texel_maps import TexelMaps, from_atlas, to_atlas
+from dyngs.human.prediction.texel_maps import HULL_LIMIT, TexelMaps, from_atlas, to_atlas
 from dyngs.ops.quaternions import unit_quats
 
 _MAX_LOG_SCALE = 1.5
@@ -24,6 +24,9 @@ _MAX_LOG_SCALE = 1.5
 
 _PICTURE_LOGIT = 4.0
 """Logit of the weight of the pictures' colours in an untrained network, against predicted colours."""
+
+_GUESS_LOGITS = (0.0, 2.0, 0.0)
+"""Logits of the shares of the three ``guessed_colours`` in an untrained network."""
 
 _MAX_HEIGHT = 0.01
 """Limit on the offset along the normal with a single scaffold, m; with several: half their distance."""
@@ -39,21 +42,30 @@ class PredictedAvatar:
 
 def num_input_channels(scaffolds: int) -> int:
     """Return the number of input channels D of a network for so many scaffolds."""
-    return 5 * scaffolds + 10
+    return 6 * scaffolds + 18
 
 
 def network_inputs(person: CapturedPerson, maps: TexelMaps, mean: Tensor) -> Tensor:
-    """Return the input (D, S, S): per scaffold colour, cosine, silhouettes; then offsets, points, mean colours.
+    """Return the input (D, S, S): per scaffold colour, cosine, silhouettes; then offsets, points, guesses of colours.
 
     Args:
         person: the captured person.
         maps: of the pictures.
         mean: (3, S, S) mean colours of the training people.
     """
-    scaffolds = torch.cat([maps.rgb, maps.seen[..., None], maps.inside[..., None]], dim=-1)
+    measured = torch.stack([maps.seen, maps.inside, maps.hull / HULL_LIMIT], dim=-1)
+    scaffolds = torch.cat([maps.rgb, measured], dim=-1)
+    guesses = guessed_colours(person, maps, mean)
     ones = torch.ones(len(person.texels), 1, device=scaffolds.device)
-    values = torch.cat([*scaffolds, maps.offsets, person.texels.points, from_atlas(mean, person.texels), ones], dim=1)
-    return to_atlas(values, person.texels)
+    rest = [maps.offsets, person.texels.points, *guesses, maps.seen[0][person.mirror, None], ones, ones / maps.count]
+    return to_atlas(torch.cat([*scaffolds, *rest], dim=1), person.texels)
+
+
+def guessed_colours(person: CapturedPerson, maps: TexelMaps, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return three guesses (P, 3) of the colours of texels that no picture shows: the mean colours of the training
+    people, those of seen texels nearby, and those of the other side where it is seen, else as nearby."""
+    is_seen = maps.seen[0][person.mirror, None] > 0
+    return from_atlas(mean, person.texels), maps.nearby, torch.where(is_seen, maps.rgb[0][person.mirror], maps.nearby)
 
 
 def predict_gaussians(
@@ -64,7 +76,7 @@ def predict_gaussians(
     All texels of the lowest scaffold get a Gaussian; those above it where a view sees them and they lie inside at
     least the share ``min_silhouette_share`` of the silhouettes. Rotations are relative to the tangent frame, scales to
     the initial Gaussian, means move along the normal. Colours are a weighted mean of those of the pictures and those of
-    the network; without a network those of the pictures, else the mean colours.
+    the network, which mixes and corrects the ``guessed_colours``; without a network those of the pictures, else nearby.
 
     Args:
         person: the captured person.
@@ -78,15 +90,17 @@ def predict_gaussians(
     rows = kept.flatten().nonzero()[:, 0]
     first, subject = person.gaussians.select(rows), replace(person.subject, anchors=person.subject.anchors.select(rows))
     seen, observed = maps.seen.flatten()[rows], maps.rgb.flatten(0, 1)[rows]
-    average = from_atlas(mean, person.texels)[rows % len(person.texels)]
+    guesses = torch.stack(guessed_colours(person, maps, mean))[:, rows % len(person.texels)]
     if network is None:
-        rgb = torch.where(seen[:, None] > 0, observed, average)
+        rgb = torch.where(seen[:, None] > 0, observed, maps.nearby[rows % len(person.texels)])
         return PredictedAvatar(first.replace(sh=((rgb - 0.5) / SH_C0)[:, None]), subject)
     raw = network(network_inputs(person, maps, mean))
     raw = torch.cat([from_atlas(level, person.texels) for level in raw]).index_select(0, rows)
     part = dict(zip(HEADS, raw.split(tuple(HEADS.values()), dim=1), strict=True))
     weight = (part["picture_weight"] + _PICTURE_LOGIT).sigmoid() * (seen[:, None] > 0)
-    rgb = weight * observed + (1 - weight) * (average + part["colour"])
+    shares = (part["guess"] + part["guess"].new_tensor(_GUESS_LOGITS)).softmax(dim=1)
+    guess = (shares.T[..., None] * guesses).sum(0) + part["colour"]
+    rgb = weight * observed + (1 - weight) * guess
     normals = person.texels.normals[rows % len(person.texels)]
     gaussians = Gaussians(
         means=first.means + _max_height(person.heights) * part["height"].tanh() * normals,

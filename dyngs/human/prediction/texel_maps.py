@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from dyngs.camera import Cameras
@@ -21,11 +22,15 @@ from dyngs.human.avatar.observations import FACING_EXPONENT, project_points
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.pose.skinning import apply_transforms, blend_transforms, joint_transforms
 from dyngs.human.prediction.person import CapturedPerson
+from dyngs.human.prediction.unseen import colours_nearby
 from dyngs.human.template.atlas import Texels
 from dyngs.human.template.mesh import interpolate, rasterize, vertex_normals
 
 _GRAZING = 0.15
 """Cosine below which a texel does not count as seen."""
+
+HULL_LIMIT = 0.06
+"""Largest distance from the edge of a silhouette that is told apart, m."""
 
 _TOLERANCE, _TOLERANCE_PX = 0.01, 1.5
 """Depth tolerance of the visibility test: in m, and in pixels along the surface."""
@@ -39,13 +44,20 @@ class TexelMaps:
         rgb: (K, P, 3) mean colours, weighted towards frontal views; 0 where no view sees a texel.
         seen: (K, P) largest cosine between normal and view direction, 0 where a texel is hidden.
         inside: (K, P) share of the views in whose silhouette a texel lies, of those that have it in the frame.
+        hull: (K, P) least signed distance over the views to the edge of the silhouette, positive inside, m in the
+            body's size, at most ``HULL_LIMIT`` and at least its negative.
         offsets: (P, 3) unit vectors from one scaffold to the next in the first view's pose, relative to the pelvis.
+        nearby: (P, 3) colours of the lowest scaffold, where it is not seen those of seen texels nearby.
+        count: of the views.
     """
 
     rgb: Tensor
     seen: Tensor
     inside: Tensor
+    hull: Tensor
     offsets: Tensor
+    nearby: Tensor
+    count: int
 
 
 @torch.no_grad()
@@ -58,25 +70,31 @@ def observe_texels(person: CapturedPerson, pictures: Iterable[tuple[Picture, Bod
     shape, device = (len(person.heights), len(person.texels)), person.texels.points.device
     colour = torch.zeros(*shape, 3, device=device)
     weight, seen, inside, in_frames = (torch.zeros(shape, device=device) for _ in range(4))
+    hull = torch.full(shape, HULL_LIMIT, device=device)
     offsets: Tensor | None = None
+    count = 0
     for picture, pose in pictures:
+        distances, count = _edge_distances(picture), count + 1
         scaffolds = [_posed_vertices(person, pose, height) for height in person.heights]
         normals = _at_texels(person, vertex_normals(scaffolds[0], person.body.faces.cpu().numpy()))
         normals = torch.nn.functional.normalize(normals, dim=1)
         if offsets is None:
             offsets = normals @ pose.rotations[0]
         for level, vertices in enumerate(scaffolds):
-            view = _scaffold_view(person, picture, vertices, normals, float(pose.scale))
+            view = _scaffold_view(person, picture, distances, vertices, normals, float(pose.scale))
             cosine = view.cosine * (view.alpha > 0.5)
             colour[level] += cosine[:, None] ** FACING_EXPONENT * view.rgb
             weight[level] += cosine**FACING_EXPONENT * view.alpha
             seen[level] = torch.maximum(seen[level], cosine)
             inside[level] += (view.alpha > 0.5).float()
             in_frames[level] += view.in_frame
+            hull[level] = torch.minimum(hull[level], torch.where(view.in_frame > 0, view.to_edge, HULL_LIMIT))
     if offsets is None:
         raise ValueError("there must be a picture")
     rgb = (colour / weight.clamp_min(1e-6)[..., None]).clamp(0, 1)
-    return TexelMaps(rgb, seen, torch.where(in_frames > 0, inside / in_frames.clamp_min(1), 1.0), offsets)
+    share = torch.where(in_frames > 0, inside / in_frames.clamp_min(1), 1.0)
+    nearby = colours_nearby(person.texels, rgb[0], seen[0])
+    return TexelMaps(rgb, seen, share, hull.clamp_min(-HULL_LIMIT), offsets, nearby, count)
 
 
 def to_atlas(values: Tensor, texels: Texels) -> Tensor:
@@ -93,36 +111,56 @@ def from_atlas(atlas: Tensor, texels: Texels) -> Tensor:
 
 @dataclass(frozen=True)
 class _ScaffoldView:
-    """One scaffold in one view: premultiplied colour (P, 3); alpha, cosine (0 where hidden), in the frame (P,)."""
+    """One scaffold in one view: premultiplied colour (P, 3); alpha, signed distance to the silhouette's edge in m of
+    the body, cosine (0 where hidden), in the frame (P,)."""
 
     rgb: Tensor
     alpha: Tensor
+    to_edge: Tensor
     cosine: Tensor
     in_frame: Tensor
 
 
 def _scaffold_view(
-    person: CapturedPerson, picture: Picture, vertices: np.ndarray, normals: Tensor, scale: float
+    person: CapturedPerson, picture: Picture, distances: Tensor, vertices: np.ndarray, normals: Tensor, scale: float
 ) -> _ScaffoldView:
     """Return one picture's view of the scaffold with ``vertices`` (M, 3) and ``normals`` (P, 3).
 
-    ``scale`` is the length of a metre in world units.
+    ``distances`` are those of ``_edge_distances``, ``scale`` is the length of a metre in world units.
     """
     camera = picture.cameras
     world = _at_texels(person, vertices)
     at, depth, in_frame = project_points(world, camera)
     cosine = (torch.nn.functional.normalize(camera.centers[0] - world, dim=1) * normals).sum(1)
     alpha = torch.ones_like(picture.rgb_premultiplied[..., 0]) if picture.alpha is None else picture.alpha
-    found = _sampled(torch.cat([picture.rgb_premultiplied, alpha[..., None]], dim=-1), at) * in_frame[:, None]
+    planes = torch.cat([picture.rgb_premultiplied, alpha[..., None], distances[..., None]], dim=-1)
+    found = _sampled(planes, at) * in_frame[:, None]
     # On a slanted surface the pixels around a texel see nearer points, by their width over the cosine.
     slack = scale * _TOLERANCE + _TOLERANCE_PX * depth / camera.intrinsics[0, 0, 0] / cosine.clamp_min(_GRAZING)
     is_clear = depth <= _nearest_depth(vertices, person.body.faces.cpu().numpy(), camera, at) + slack
     return _ScaffoldView(
         rgb=found[:, :3],
         alpha=found[:, 3],
+        to_edge=found[:, 4] * depth / camera.intrinsics[0, 0, 0] / scale,
         cosine=torch.where(is_clear & in_frame & (cosine > _GRAZING), cosine, 0.0),
         in_frame=in_frame.float(),
     )
+
+
+def _edge_distances(picture: Picture) -> Tensor:
+    """Return the signed distances (H, W) of pixels to the edge of the silhouette, positive inside, in pixels.
+
+    Next to the edge they are the alpha less a half, which is exact for an upright edge.
+    """
+    if picture.alpha is None:
+        return torch.full_like(picture.rgb_premultiplied[..., 0], float(max(picture.rgb_premultiplied.shape)))
+    alpha = picture.alpha.double().cpu().numpy()
+    is_inside = np.pad(alpha > 0.5, 1)
+    within = np.asarray(distance_transform_edt(is_inside))[1:-1, 1:-1] - 0.5
+    beyond = np.asarray(distance_transform_edt(~is_inside))[1:-1, 1:-1] - 0.5
+    signed = np.where(alpha > 0.5, within, -beyond)
+    signed = np.where(np.abs(signed) <= 0.5, alpha - 0.5, signed)
+    return torch.from_numpy(signed).to(picture.rgb_premultiplied)
 
 
 def _nearest_depth(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at: Tensor) -> Tensor:

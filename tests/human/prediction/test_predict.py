@@ -12,7 +12,13 @@ from torch import Tensor
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.prediction.network import HEADS, AtlasNetwork
 from dyngs.human.prediction.person import CapturedPerson
-from dyngs.human.prediction.predict import PredictedAvatar, network_inputs, num_input_channels, predict_gaussians
+from dyngs.human.prediction.predict import (
+    PredictedAvatar,
+    guessed_colours,
+    network_inputs,
+    num_input_channels,
+    predict_gaussians,
+)
 from dyngs.human.prediction.texel_maps import TexelMaps
 
 Shown = tuple[CapturedPerson, TexelMaps]
@@ -47,23 +53,26 @@ def matrices(quats: Tensor) -> Tensor:
     )
 
 
-def test_without_a_network_texels_have_seen_or_mean_colours(shown: Shown) -> None:
+def test_without_a_network_texels_have_seen_or_nearby_colours(shown: Shown) -> None:
     sitter, maps = shown
     bare = predict_gaussians(sitter, maps, MEAN, None, 0.9).gaussians
     count = len(sitter.texels)
     seen = maps.seen[0] > 0
     torch.testing.assert_close(bare.base_rgb[:count][seen], maps.rgb[0][seen])
-    torch.testing.assert_close(bare.base_rgb[:count][~seen], torch.full_like(bare.base_rgb[:count][~seen], 0.25))
+    torch.testing.assert_close(bare.base_rgb[:count][~seen], maps.nearby[~seen])
     assert 0.5 < seen.float().mean() < 1
 
 
 def test_an_untrained_network_changes_colours_a_little_and_nothing_else(shown: Shown) -> None:
-    """It trusts pictures by 98 %."""
+    """It trusts pictures by 98 %, and mixes the mean into what it guesses."""
     bare, untrained = predict_gaussians(*shown, MEAN, None, 0.9), predicted(shown)
     for name in ("means", "log_scales", "logit_opacities"):
         assert torch.equal(getattr(bare.gaussians, name), getattr(untrained.gaussians, name))
     torch.testing.assert_close(untrained.gaussians.quats, bare.gaussians.quats)
-    assert 0 < (bare.gaussians.base_rgb - untrained.gaussians.base_rgb).abs().max() < 0.02
+    different, count = (bare.gaussians.base_rgb - untrained.gaussians.base_rgb).abs(), len(shown[0].texels)
+    seen = shown[1].seen[0] > 0
+    assert 0 < different[:count][seen].max() < 0.02
+    assert 0 < different[:count][~seen].max() < 0.25
 
 
 def test_the_skin_is_whole_and_scaffolds_are_carved(shown: Shown) -> None:
@@ -104,9 +113,22 @@ def test_unseen_texels_are_painted_and_mistrusted_ones_too(shown: Shown) -> None
     seen = maps.seen[0] > 0
     trusting = predicted(shown, {"colour": 0.5, "picture_weight": 50.0}).gaussians.base_rgb[: len(sitter.texels)]
     torch.testing.assert_close(trusting[seen], maps.rgb[0][seen])
-    torch.testing.assert_close(trusting[~seen], torch.full_like(trusting[~seen], 0.75))
+    mean, nearby, other_side = guessed_colours(sitter, maps, MEAN)
+    guess = torch.stack([mean, nearby, other_side], dim=-1) @ torch.tensor([0.0, 2.0, 0.0]).softmax(0)
+    torch.testing.assert_close(trusting[~seen], guess[~seen] + 0.5)
     wary = predicted(shown, {"colour": 0.5, "picture_weight": -50.0}).gaussians.base_rgb
-    torch.testing.assert_close(wary, torch.full_like(wary, 0.75))
+    torch.testing.assert_close(wary[: len(sitter.texels)], guess + 0.5)
+
+
+def test_the_other_side_is_the_mirror_image(shown: Shown) -> None:
+    """Of each texel's colour where that is seen, else as nearby; the mean is the mean."""
+    sitter, maps = shown
+    mean, nearby, other_side = guessed_colours(sitter, maps, MEAN)
+    assert bool((mean == 0.25).all())
+    assert torch.equal(nearby, maps.nearby)
+    is_seen = maps.seen[0][sitter.mirror] > 0
+    assert torch.equal(other_side[is_seen], maps.rgb[0][sitter.mirror][is_seen])
+    assert torch.equal(other_side[~is_seen], nearby[~is_seen])
 
 
 def test_all_heads_learn(shown: Shown) -> None:
@@ -123,7 +145,9 @@ def test_inputs_hold_everything_in_the_atlas(shown: Shown) -> None:
     sitter, maps = shown
     found = network_inputs(sitter, maps, MEAN)
     assert found.shape == (num_input_channels(2), NET.resolution, NET.resolution)
-    assert found[-1].sum() == len(sitter.texels)
+    assert found[-2].sum() == len(sitter.texels)
+    torch.testing.assert_close(found[-1], found[-2] / 3)
     other = network_inputs(sitter, replace(maps, rgb=1 - maps.rgb), MEAN)
     changed = (found != other).flatten(1).any(1)
-    assert changed.tolist() == [True] * 3 + [False] * 2 + [True] * 3 + [False] * 12
+    level, other_side = [True] * 3 + [False] * 3, [True] * 3
+    assert changed.tolist() == level + level + [False] * 12 + other_side + [False] * 3

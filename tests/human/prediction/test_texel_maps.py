@@ -20,7 +20,7 @@ from dyngs.data.loader import Picture
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.prediction.person import CapturedPerson, captured_person
-from dyngs.human.prediction.texel_maps import from_atlas, observe_texels, to_atlas
+from dyngs.human.prediction.texel_maps import HULL_LIMIT, from_atlas, observe_texels, to_atlas
 from dyngs.human.synthetic.capture import PosedMesh, render_mesh
 from dyngs.human.synthetic.clothes import texel_coordinates, texture_coordinates
 from dyngs.human.template.body import BodyTemplate, posed_vertices
@@ -88,6 +88,21 @@ def is_arm(joints: np.ndarray | Tensor) -> np.ndarray:
 
 def posing(of: CapturedPerson) -> BodyPose:
     return of.pose_in(of.views[0])
+
+
+def test_distances_from_the_edge_are_those_of_the_outline() -> None:
+    """From the front, texels on the outer side of the legs lie on it, and those 4 cm above them 4 cm outside."""
+    shown = sitter(torch.zeros(55, 3))
+    seen = picture(torch.zeros(55, 3), np.full((4, 4, 3), 0.5), FRONT)
+    maps = observe_texels(shown, [(seen, shown.pose_in(shown.views[0]))])
+    points, normals = shown.texels.points, shown.texels.normals
+    outer = (normals[:, 0] * points[:, 0].sign() > 0.98) & (points[:, 1] < -0.1) & (points[:, 1] > -0.7)
+    assert outer.sum() > 10
+    assert maps.hull[0, outer].abs().max() < 0.025
+    torch.testing.assert_close(maps.hull[1, outer].mean(), torch.tensor(-0.04), atol=0.008, rtol=0)
+    middle = (points[:, 1] - 0.3).abs() < 0.05
+    assert (maps.hull[:, middle & (points[:, 0].abs() < 0.05)] == HULL_LIMIT).all()
+    assert maps.count == 1
 
 
 def test_what_is_behind_an_arm_does_not_get_its_colour() -> None:

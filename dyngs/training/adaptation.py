@@ -1,0 +1,65 @@
+"""Training of a network of people on the pictures of one person, before that person is predicted from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from dyngs.config import Config, HumanPredictorModel
+from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.human.prediction.network import AtlasNetwork
+from dyngs.human.prediction.predict import predict_gaussians
+from dyngs.scene import render_options
+from dyngs.static.rates import Rates
+from dyngs.training.background import evaluation_background
+from dyngs.training.prediction import MAX_GRADIENT, Filmed, human_options, picture_loss, scene_of
+
+_RATE = 1e-3
+"""Highest learning rate of Adam, which falls linearly."""
+
+
+def adapt_network(
+    network: AtlasNetwork,
+    person: Filmed,
+    views: Sequence[int],
+    mean: Tensor,
+    config: Config,
+    model: HumanPredictorModel,
+    steps: int,
+    report: ReportProgress = report_nothing,
+) -> None:
+    """Train ``network`` in place until its prediction shows the pictures better that it is predicted from.
+
+    Args:
+        network: trained on other people.
+        person: with pictures.
+        views: predicted from, and compared with.
+        mean: (3, S, S) colours of the training people.
+        config: of the network's run.
+        model: its section.
+        steps: 0 changes nothing.
+        report: is told how far it has come.
+    """
+    options = replace(render_options(model), nonfinite="trust")
+    background = evaluation_background(config.data.background, True)[1]
+    pictures, maps = [person.pictures[i] for i in views], person.look(list(views))
+    human, optimizer = human_options(model), torch.optim.Adam(network.parameters(), lr=_RATE)
+    for step in range(steps):
+        avatar = predict_gaussians(person.sitter, maps, mean, network, model.min_silhouette_share)
+        scene = scene_of(human, avatar, Rates(1))[0]
+        total = torch.zeros((), device=mean.device)
+        for picture in pictures:
+            moment = scene.moment(picture.time)
+            rendering = scene.render(picture.cameras, moment, options=options, background=background)
+            total = total + picture_loss(rendering, picture, picture.composite(background), config) / len(pictures)
+        optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        if not bool(torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT).isfinite()):
+            break
+        for group in optimizer.param_groups:
+            group["lr"] = _RATE * (1.0 - step / steps)
+        optimizer.step()
+        report("training on the pictures", step + 1, steps)
