@@ -1,14 +1,15 @@
 """The network that predicts people, on held-out synthetic people, compared with mean textures.
 
-    python benchmarks/human_predictor.py FOLDER [--people 12] [--held-out 4] [--size 128] [--steps 2000] [--threads 1]
+    python benchmarks/human_predictor.py FOLDER [--people 48] [--held-out 6] [--size 128] [--steps 2000] [--threads 1]
 
-FOLDER keeps the captures and the run, which are reused. Printed per held-out person, for other cameras (`test`) and
-another clip (`pose`): PSNR in the box of the person / of the whole picture, from three pictures of one time, by
+People differ in body shape, clothes, light and clips; those of even number wear usual clothes. FOLDER keeps the
+captures and the run, which are reused. Printed per held-out person, for other cameras (`test`) and another clip (`pose`):
+PSNR in the box of the person / of the whole picture, from three pictures of one time or from one, by
 
 - network: the result of `dyngs predict`;
-- seen, else mean: the template with the colours of the three pictures where visible, elsewhere with the mean texture of
-  the training people;
-- mean texture: the template with that mean texture alone;
+- as trained: the same without adaptation to the pictures (`--steps 0`);
+- seen, else nearby: the template with the colours of the three pictures where visible, elsewhere with colours nearby;
+- mean texture: the template with the mean texture of the training people;
 and the seconds from pictures in memory or on disk to Gaussians.
 """
 
@@ -29,7 +30,8 @@ from dyngs.config.io import load_config, packaged_preset
 from dyngs.evaluate.report import evaluate_run
 from dyngs.human.prediction.person import spread_views
 from dyngs.human.prediction.predict import predict_gaussians
-from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.human.prediction.texel_maps import from_atlas
+from dyngs.human.synthetic.capture import HumanOptions, varied, write_human_capture
 from dyngs.human.template.load import load_template
 from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at
 from dyngs.training.prediction import filmed, human_options, load_network, new_network
@@ -38,6 +40,9 @@ FIRST_HELD_OUT = 101
 """Seed of the first held-out person."""
 
 SPLITS = ("test", "pose")
+
+ADAPTED = 20
+"""Steps on the pictures of a person, as `dyngs predict` has it."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +55,10 @@ class Row:
 
 
 def captures(folder: Path, seeds: range, options: HumanOptions) -> None:
-    """Write the synthetic people that do not exist yet."""
+    """Write the synthetic people that do not exist yet, every other one in usual clothes."""
     for seed in seeds:
         if not (folder / f"p{seed:03d}").exists():
-            write_human_capture(folder / f"p{seed:03d}", replace(options, seed=seed))
+            write_human_capture(folder / f"p{seed:03d}", varied(replace(options, usual_clothes=seed % 2 == 0), seed))
 
 
 def trained(folder: Path, run: Path, steps: int, threads: int) -> Path:
@@ -69,6 +74,15 @@ def scored(name: str, run: Path, seconds: float) -> Row:
     return Row(name, {split: (r.psnr_person or 0.0, r.psnr) for split, r in reports.items()}, seconds)
 
 
+def predicted(network: Path, capture: Path, out: Path, views: int, steps: int) -> Row:
+    """The result of `dyngs predict` from so many pictures, after so many steps on these."""
+    name = f"network, {views} views" + ("" if steps else ", as trained")
+    run = out / f"network_{views}_{steps}"
+    if not checkpoint_paths(run):
+        predict_person(network, capture, run, views, steps=steps)
+    return scored(name, run, seconds_at(run, 0))
+
+
 def baselines(network: Path, capture: Path, out: Path, count: int) -> list[Row]:
     """The bare template, coloured without the network."""
     config, model = network_config(network)
@@ -77,11 +91,11 @@ def baselines(network: Path, capture: Path, out: Path, count: int) -> list[Row]:
     data = config.data.model_copy(update={"root": capture.absolute()})
     person = filmed(data, bare, load_template(human_options(bare)))
     rows = []
-    for name in ("seen, else mean", "mean texture"):
+    for name in ("seen, else nearby", "mean texture"):
         start = time.perf_counter()
         maps = person.look(spread_views(person.sitter, count))
         if name == "mean texture":
-            maps = replace(maps, seen=torch.zeros_like(maps.seen))
+            maps = replace(maps, seen=torch.zeros_like(maps.seen), nearby=from_atlas(mean, person.sitter.texels))
         avatar = predict_gaussians(person.sitter, maps, mean, None, bare.min_silhouette_share)
         seconds = time.perf_counter() - start
         run = out / name.replace(", ", "_").replace(" ", "_")
@@ -95,14 +109,13 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--people", type=int, default=12)
-    parser.add_argument("--held-out", type=int, default=4)
+    parser.add_argument("--people", type=int, default=48)
+    parser.add_argument("--held-out", type=int, default=6)
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--views", type=int, default=3)
     given = parser.parse_args()
-    options = HumanOptions(size=given.size, num_frames=6, num_new=0, num_test=0)
+    options = HumanOptions(size=given.size, num_frames=5, num_new=0, num_test=0)
     captures(given.folder / "train", range(1, given.people + 1), options)
     held_out = range(FIRST_HELD_OUT, FIRST_HELD_OUT + given.held_out)
     captures(given.folder / "held_out", held_out, replace(options, num_new=4, num_test=4))
@@ -111,13 +124,8 @@ def main() -> None:
     table: dict[str, list[Row]] = {}
     for seed in held_out:
         capture, out = given.folder / "held_out" / f"p{seed:03d}", given.folder / "predicted" / f"p{seed:03d}"
-        start = time.perf_counter()
-        if not checkpoint_paths(out / "network"):
-            predict_person(network, capture, out / "network", given.views)
-        whole = time.perf_counter() - start
-        print(f"person {seed}: dyngs predict took {whole:.1f} s with reading and writing")
-        seconds = seconds_at(out / "network", 0)
-        for row in (scored("network", out / "network", seconds), *baselines(network, capture, out, given.views)):
+        rows = [predicted(network, capture, out, *which) for which in ((3, ADAPTED), (3, 0), (1, ADAPTED), (1, 0))]
+        for row in (*rows, *baselines(network, capture, out, 3)):
             table.setdefault(row.name, []).append(row)
             print(line(f"{seed} {row.name}", [row]), flush=True)
     for name, rows in table.items():
