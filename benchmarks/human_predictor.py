@@ -2,9 +2,10 @@
 
     python benchmarks/human_predictor.py FOLDER [--people 48] [--held-out 6] [--size 128] [--steps 2000] [--threads 1]
 
-People differ in body shape, clothes, light and clips; those of even number wear usual clothes. FOLDER keeps the
-captures and the run, which are reused. Printed per held-out person, for other cameras (`test`) and another clip (`pose`):
-PSNR in the box of the person / of the whole picture, from three pictures of one time or from one, by
+People differ in body shape, clothes, light and clips. Usual clothes are worn by every other training person, and by the
+second half of the held-out ones. FOLDER keeps the captures and the run, which are reused. Printed per held-out person,
+for other cameras (`test`) and another clip (`pose`): PSNR in the box of the person / of the whole picture, from three
+pictures of one time or from one, by
 
 - network: the result of `dyngs predict`;
 - as trained: the same without adaptation to the pictures (`--steps 0`);
@@ -54,11 +55,12 @@ class Row:
     seconds: float
 
 
-def captures(folder: Path, seeds: range, options: HumanOptions) -> None:
-    """Write the synthetic people that do not exist yet, every other one in usual clothes."""
+def captures(folder: Path, seeds: range, options: HumanOptions, usual: range) -> None:
+    """Write the synthetic people that do not exist yet, those of the seeds ``usual`` in usual clothes."""
     for seed in seeds:
         if not (folder / f"p{seed:03d}").exists():
-            write_human_capture(folder / f"p{seed:03d}", varied(replace(options, usual_clothes=seed % 2 == 0), seed))
+            person = varied(replace(options, usual_clothes=seed in usual), seed)
+            write_human_capture(folder / f"p{seed:03d}", person)
 
 
 def trained(folder: Path, run: Path, steps: int, threads: int) -> Path:
@@ -116,9 +118,12 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     given = parser.parse_args()
     options = HumanOptions(size=given.size, num_frames=5, num_new=0, num_test=0)
-    captures(given.folder / "train", range(1, given.people + 1), options)
+    seeds = range(1, given.people + 1)
+    captures(given.folder / "train", seeds, options, seeds[1::2])
     held_out = range(FIRST_HELD_OUT, FIRST_HELD_OUT + given.held_out)
-    captures(given.folder / "held_out", held_out, replace(options, num_new=4, num_test=4))
+    captures(
+        given.folder / "held_out", held_out, replace(options, num_new=4, num_test=4), held_out[len(held_out) // 2 :]
+    )
     network = trained(given.folder / "train", given.folder / "network", given.steps, given.threads)
     torch.set_num_threads(given.threads)
     table: dict[str, list[Row]] = {}
