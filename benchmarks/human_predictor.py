@@ -42,7 +42,7 @@ FIRST_HELD_OUT = 101
 
 SPLITS = ("test", "pose")
 
-ADAPTED = 20
+ADAPTED = 10
 """Steps on the pictures of a person, as `dyngs predict` has it."""
 
 

@@ -57,7 +57,7 @@ def predict_person(
     out: Path,
     views: int | tuple[str, ...],
     *,
-    steps: int = 20,
+    steps: int = 10,
     say: Callable[[str], None] = print,
     report: ReportProgress = report_nothing,
 ) -> Prediction:

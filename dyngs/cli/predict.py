@@ -41,9 +41,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--steps",
         type=int,
-        default=20,
+        default=10,
         metavar="N",
-        help="first train the network on these pictures for so many steps (default 20)",
+        help="first train the network on these pictures for so many steps (default 10)",
     )
     parser.set_defaults(run=run)
 

@@ -17,8 +17,8 @@ from dyngs.static.rates import Rates
 from dyngs.training.background import evaluation_background
 from dyngs.training.prediction import MAX_GRADIENT, Filmed, human_options, picture_loss, scene_of
 
-_RATE = 1e-3
-"""Highest learning rate of Adam, which falls linearly."""
+_RATE = 1e-4
+"""Highest learning rate of Adam per picture, which falls linearly: a single one says little about the other sides."""
 
 
 def adapt_network(
@@ -46,7 +46,8 @@ def adapt_network(
     options = replace(render_options(model), nonfinite="trust")
     background = evaluation_background(config.data.background, True)[1]
     pictures, maps = [person.pictures[i] for i in views], person.look(list(views))
-    human, optimizer = human_options(model), torch.optim.Adam(network.parameters(), lr=_RATE)
+    rate, human = _RATE * len(views), human_options(model)
+    optimizer = torch.optim.Adam(network.parameters(), lr=rate)
     for step in range(steps):
         avatar = predict_gaussians(person.sitter, maps, mean, network, model.min_silhouette_share)
         scene = scene_of(human, avatar, Rates(1))[0]
@@ -60,6 +61,6 @@ def adapt_network(
         if not bool(torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT).isfinite()):
             break
         for group in optimizer.param_groups:
-            group["lr"] = _RATE * (1.0 - step / steps)
+            group["lr"] = rate * (1.0 - step / steps)
         optimizer.step()
         report("training on the pictures", step + 1, steps)
