@@ -41,7 +41,7 @@ def test_what_cannot_be_fitted_is_refused_in_one_line(tmp_path: Path, capsys: Pr
     for words, wanted in (
         ([str(tmp_path / "nothing"), str(tmp_path / "out")], "no such folder"),
         ([str(tmp_path / "scene"), str(tmp_path / "full")], "exists already"),
-        ([str(tmp_path / "scene"), str(tmp_path / "out")], "no silhouettes; add masks"),
+        ([str(tmp_path / "scene"), str(tmp_path / "out")], "give masks of the person"),
     ):
         assert main(["data", "fit", *words]) == 2
         error = capsys.readouterr().err.strip().splitlines()

@@ -109,7 +109,9 @@ def _standing_cameras(capture: Capture) -> list[_Camera]:
             for view in views
         )
         if not same:
-            raise DyngsError(f"{where}: moves, so there is no background to compare with; give masks of the person")
+            raise DyngsError(
+                f"{where} moves, so there is no background to compare with; give masks of the person (--masks)"
+            )
         if len(views) < LEAST:
             raise DyngsError(f"{where}: has {len(views)} pictures, too few for a background; {_ADVICE}")
         views.sort(key=lambda view: (view.time or 0.0, view.name))
