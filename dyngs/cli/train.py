@@ -118,11 +118,7 @@ def _with_fitted_body(config: Config) -> Config:
     from dyngs.human.fit.before_training import with_fitted_body
 
     model = person_of(config)
-    if model is None:
-        return config
-    if model.body is not None:
-        if model.fit:
-            raise DyngsError(f"model.fit=true fits the free template only; leave out it or model.body={model.body}")
+    if model is None or model.body is not None:
         return config
     with ProgressBar() as report:
         data = with_fitted_body(config.data, only_if_needed=not model.fit, report=report)

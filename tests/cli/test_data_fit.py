@@ -50,7 +50,10 @@ def test_what_cannot_be_fitted_is_refused_in_one_line(tmp_path: Path, capsys: Pr
     assert not (tmp_path / "out").exists()
 
 
-def test_a_fit_of_another_template_is_refused(tmp_path: Path, capsys: PrintedOutput) -> None:
-    keys = [f"data.root={tmp_path}", "model.fit=true", "model.body=smplx.npz", f"run.dir={tmp_path / 'run'}"]
+def test_a_body_of_another_template_is_never_fitted(tmp_path: Path, capsys: PrintedOutput) -> None:
+    keys = [f"data.root={tmp_path / 'ann'}", "model.body=smplx.npz", f"run.dir={tmp_path / 'run'}"]
+    write_human_capture(tmp_path / "ann", HumanOptions(size=16, num_frames=1, num_new=0, num_cameras=1, num_test=1))
     assert main(["train", "human", *keys]) == 2
-    assert "model.fit=true fits the free template only" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert "smplx.npz" in said.err
+    assert "fitted" not in said.out

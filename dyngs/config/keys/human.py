@@ -37,9 +37,9 @@ class HumanModel(_OnTemplate):
         default="human", description="one person: Gaussians on a body template, moved by its skeleton (docs/human.md)"
     )
     fit: bool = Field(
-        default=False,
+        default=True,
         description="fit the free template to the silhouettes before training, as `dyngs data fit` does; a capture "
-        "without body parameters always is",
+        "without body parameters always is, one for another template (body) never",
     )
     refine: bool = Field(
         default=True, description="learn corrections of poses, skeleton and skinning weights with the Gaussians"
