@@ -20,7 +20,7 @@ GAP = 0.006
 OFTEN, MOST_STAYING = 0.4, 0.1
 LEAST_ON_EDGES, LEAST_AREA = 0.8, 1e-3
 """Limits of what can be trusted. Two people walking by, and on the spot: on edges 0.96 to 1.00, and 0.56 to 0.79;
-staying 0.00, and 0.18 to 0.61."""
+staying 0.00, and 0.14 to 0.61."""
 LEAST_SHARE = 0.1
 """Smaller parts than this share of the largest are left out."""
 SHADE = (0.5, 0.97)
