@@ -26,7 +26,7 @@ LR = {
     "poses": 1e-3,  # of single frames, rad
     "trans": 5e-4,  # of single frames, m
     "turns": 1e-3,  # of all frames, rad
-    "joints": 5e-3,  # at rest, m
+    "joints": 2e-3,  # at rest, m
     "log_scale": 2e-4,
     "weights": 5e-3,  # logarithms
     "pose_dirs": 1e-4,  # m per unit of a rotation matrix
