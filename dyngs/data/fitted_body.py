@@ -39,6 +39,11 @@ def with_fitted_body(capture: Capture, folder: Path) -> Capture:
     Raises:
         DyngsError: a file is missing or broken.
     """
+    if not (folder / "body_train.npz").is_file():
+        raise DyngsError(
+            f"{folder / 'body_train.npz'}: no such file (data.body); a fit that `dyngs train human` made comes back by "
+            f"training with data.root={capture.root} into another run.dir"
+        )
     with staying_within(folder, False), reading(folder, "give a folder that `dyngs data fit` wrote"):
         train = read_body_file(folder / "body_train.npz")
         body: dict[Split, BodyFrames] = {"train": train, "val": train, "test": train}
