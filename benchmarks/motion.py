@@ -43,8 +43,9 @@ from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.trajectory import Trajectory
 from dyngs.evaluate.regions import Regions
-from dyngs.evaluate.report import evaluate_run, score_views, split_views
+from dyngs.evaluate.report import evaluate_run, split_views
 from dyngs.evaluate.tracks import TrackScores, track_scores
+from dyngs.evaluate.view_scores import score_views
 from dyngs.gaussians import TopologyEdit
 from dyngs.metrics import Lpips
 from dyngs.ops.native import kernel_threads

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from dyngs.evaluate.report import EvalReport
 
-_REFINED = ", poses refined"
-"""On the tested pictures."""
+_OUTLINED, _REFINED = ", poses from silhouettes", ", poses refined"
+"""Of the tested pictures, and on them."""
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -103,9 +103,9 @@ def report_table(report: EvalReport) -> Table:
 
 
 def _rows_of_person(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the scores of a person: as given, then with poses refined on the pictures."""
+    """Return labels and values of the scores of a person: as given, from silhouettes, refined on the pictures."""
     rows: list[tuple[str, str]] = []
-    for scores, suffix in ((report, ""), (report.own_poses, _REFINED)):
+    for scores, suffix in ((report, ""), (report.silhouette_poses, _OUTLINED), (report.own_poses, _REFINED)):
         if scores is None:
             continue
         for label, psnr, ssim, lpips in (

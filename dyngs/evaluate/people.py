@@ -15,7 +15,7 @@ from dyngs.rendering import Rendering
 
 
 def person_scores(picture: Picture, rendering: Rendering, background: Tensor, lpips: Lpips) -> dict[str, float | None]:
-    """Return the scores by their names in ``dyngs.evaluate.report.ViewScore``; none where nobody is to be seen.
+    """Return the scores by their names in ``dyngs.evaluate.view_scores.ViewScore``; none where nobody is to be seen.
 
     Args:
         picture: the truth.

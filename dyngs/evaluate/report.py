@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
-import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -13,26 +11,22 @@ from statistics import fmean, median
 from typing import Any, cast
 
 import torch
-from torch import Tensor
 
 from dyngs.config.kinds import field_of
 from dyngs.data.capture import Capture, Split, View, all_views
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.data.true_tracks import read_true_tracks
 from dyngs.errors import DyngsError
-from dyngs.evaluate.half_fit import right_half_scores
-from dyngs.evaluate.own_poses import pictures_of_split, psnr_from_own_poses
-from dyngs.evaluate.people import person_scores
-from dyngs.evaluate.regions import RegionName, Regions, RegionScores
+from dyngs.evaluate.own_poses import PoseRefinement, pictures_of_split, scores_from_own_poses
+from dyngs.evaluate.regions import RegionName, Regions
 from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
+from dyngs.evaluate.view_scores import PoseScores, ViewScore, mean_of, means_of, score_views
 from dyngs.files.write import write_text
-from dyngs.human.avatar.pose_fit import fitted_to_pictures
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.captured import captured_motion, same_bodies
-from dyngs.metrics import Lpips, LpipsNet, MetricValue, flip, load_lpips, psnr, ssim
-from dyngs.rendering import Rendering, RenderOptions
+from dyngs.metrics import LpipsNet, MetricValue, load_lpips
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 from dyngs.scene import Scene, render_options
 from dyngs.training.background import evaluation_background
@@ -44,58 +38,6 @@ REGION_METRICS: dict[str, RegionName] = {
     "psnr_still": "still",
 }
 """Metrics of regions: their names, and the regions."""
-
-
-@dataclass(frozen=True)
-class ViewScore:
-    """Metrics of one view; None where a metric cannot be had (``EvalReport.reasons`` says why).
-
-    ``render_seconds`` holds ``deform_seconds``; ``time`` is None for a still capture. Of people, ``psnr_person``
-    and ``ssim_person`` are those inside the person's box, and ``psnr_black``, ``ssim_black`` and ``lpips_black`` those
-    of the whole picture on black.
-    """
-
-    name: str
-    width: int
-    height: int
-    psnr: float
-    ssim: float
-    flip: float | None
-    lpips: float | None
-    render_seconds: float
-    deform_seconds: float
-    time: float | None = None
-    psnr_person: float | None = None
-    ssim_person: float | None = None
-    psnr_foreground: float | None = None
-    psnr_moving: float | None = None
-    psnr_still: float | None = None
-    psnr_right: float | None = None
-    psnr_right_fitted: float | None = None
-    psnr_black: float | None = None
-    ssim_black: float | None = None
-    lpips_black: float | None = None
-
-
-@dataclass(frozen=True)
-class OwnPoseScores:
-    """Means over views of a person in poses that were refined on these views themselves; names as in ``ViewScore``.
-
-    Attributes:
-        updates: mean number of updates that the pose of a moment took.
-        per_view: the single views.
-    """
-
-    psnr: float
-    ssim: float
-    lpips: float | None
-    psnr_person: float | None
-    ssim_person: float | None
-    psnr_black: float | None
-    ssim_black: float | None
-    lpips_black: float | None
-    updates: float
-    per_view: tuple[ViewScore, ...]
 
 
 @dataclass(frozen=True)
@@ -137,6 +79,7 @@ class EvalReport:
         psnr_own_poses: PSNR from poses refined on the pictures themselves, of cameras (``dyngs.evaluate.own_poses``)
             or of the body (``dyngs.human.avatar.pose_fit``); None where that was not asked for.
         own_poses: of a person, all scores from these poses.
+        silhouette_poses: of a person, all scores from poses fitted to the silhouettes of these pictures alone.
     """
 
     split: str
@@ -181,7 +124,8 @@ class EvalReport:
     psnr_black: float | None = None
     ssim_black: float | None = None
     lpips_black: float | None = None
-    own_poses: OwnPoseScores | None = None
+    own_poses: PoseScores | None = None
+    silhouette_poses: PoseScores | None = None
 
     def to_json(self) -> str:
         """Return the report as strict JSON (no NaN or Infinity), ending in a newline."""
@@ -224,13 +168,13 @@ def evaluate_run(
         temporal = _temporal(drawing, loader, views)
         tracks = _track_scores(run, capture, scene, views)
         asked = split != "train" and (refine_poses or run.config.camera.refine == "always")
-        own_poses, person = _from_own_poses(drawing, loader, run.info.extent, lpips) if asked else (None, None)
+        fitted = scores_from_own_poses(drawing, loader, run.info.extent, lpips) if asked else PoseRefinement()
     reasons |= {name: measured.reason for name, measured in temporal.items() if measured.reason is not None}
     report = EvalReport(
         split=split,
         num_views=len(scores),
         background=background,
-        flip=_mean([s.flip for s in scores]),
+        flip=mean_of([s.flip for s in scores]),
         lpips_net=lpips_net,
         flicker=temporal["flicker"].value,
         flicker_error=temporal["flicker_error"].value,
@@ -238,35 +182,16 @@ def evaluate_run(
         reasons=reasons,
         notes=_notes(run, scores),
         per_view=tuple(scores),
-        psnr_own_poses=own_poses,
-        own_poses=person,
-        **_means(scores),
+        psnr_own_poses=fitted.psnr,
+        own_poses=fitted.to_pictures,
+        silhouette_poses=fitted.to_silhouettes,
+        **means_of(scores),
         **_facts(run_dir, run, scene),
         **_sizes_and_speed(scores),
     )
     report = _with_parts(report, regions, tracks)
     write_text(report_path(run_dir, split), report.to_json())
     return report
-
-
-def _from_own_poses(
-    drawing: Drawing, pictures: PictureLoader, size: float, lpips: Lpips
-) -> tuple[float, OwnPoseScores | None]:
-    """Return the PSNR from poses that were fitted to the pictures, and all scores if these are poses of a person."""
-    avatar = avatar_of(drawing.scene)
-    if avatar is None:
-        return psnr_from_own_poses(drawing, pictures, size), None
-    fitted = fitted_to_pictures(avatar, pictures, drawing.background, drawing.options)
-    each = (pictures[i] for i in range(len(pictures)))
-    views, _ = score_views(fitted.scene, each, drawing.options, drawing.background, lpips)
-    scores = OwnPoseScores(**_means(views), updates=fmean(fitted.updates), per_view=tuple(views))
-    return scores.psnr, scores
-
-
-def _means(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the means of the metrics that exist for poses as given and for refined ones."""
-    names = "psnr ssim lpips psnr_person ssim_person psnr_black ssim_black lpips_black"
-    return {name: _mean([getattr(score, name) for score in scores]) for name in names.split()}
 
 
 def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:
@@ -303,7 +228,9 @@ def _with_parts(report: EvalReport, regions: Regions, tracks: TrackScores) -> Ev
         means[region] = fmean(known) if known else None
         if not known:
             reasons[metric] = regions.reason(region)
-    right, fitted = (_mean([getattr(x, name) for x in report.per_view]) for name in ("psnr_right", "psnr_right_fitted"))
+    right, fitted = (
+        mean_of([getattr(x, name) for x in report.per_view]) for name in ("psnr_right", "psnr_right_fitted")
+    )
     if right is None:
         reasons["psnr_right"] = reasons["psnr_right_fitted"] = "half a view has no pixel that counts"
     if tracks.reason is not None:
@@ -326,67 +253,6 @@ def _with_parts(report: EvalReport, regions: Regions, tracks: TrackScores) -> Ev
 def report_path(run_dir: Path, split: str) -> Path:
     """Return the path of the report of ``split`` in a run folder."""
     return run_dir / ("metrics.json" if split == "test" else f"metrics_{split}.json")
-
-
-def score_views(
-    scene: Scene,
-    pictures: Iterable[Picture],
-    options: RenderOptions,
-    background: Tensor,
-    lpips: Lpips,
-    regions: Regions | None = None,
-) -> tuple[list[ViewScore], dict[str, str]]:
-    """Return scores of the Gaussians against pictures, and the reasons for metrics that are None.
-
-    Args:
-        scene: what to draw, at the time of each picture.
-        pictures: truth and camera of each view, drawn one at a time.
-        options: as in training, without depth.
-        background: (3,) colour behind both the truth and the render.
-        lpips: from ``load_lpips``.
-        regions: of the split of the pictures; None: they are not measured.
-
-    Raises:
-        DyngsError: a value that is not finite, naming the view.
-    """
-    scores: list[ViewScore] = []
-    reasons: dict[str, str] = {}
-    for picture in pictures:
-        if not scores:
-            _timed_render(scene, picture, options, background)  # the warm-up
-        rendering, seconds, deform_seconds = _timed_render(scene, picture, options, background)
-        rendered = rendering.rgb[0]
-        if not rendered.isfinite().all():
-            raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
-        truth, mask = picture.composite(background), picture.mask
-        people = {} if avatar_of(scene) is None else person_scores(picture, rendering, background, lpips)
-        parts = RegionScores() if regions is None else regions.scores(picture, rendered, truth)
-        halves = right_half_scores(picture, rendering, background)
-        optional = {"flip": flip(rendered, truth, mask), "lpips": lpips(rendered, truth, mask)}
-        for name, metric in optional.items():
-            if metric.reason is not None:
-                reasons.setdefault(name, metric.reason)
-        score = ViewScore(
-            name=picture.name,
-            width=picture.cameras.width,
-            height=picture.cameras.height,
-            psnr=psnr(rendered, truth, mask),
-            ssim=ssim(rendered, truth, mask),
-            flip=optional["flip"].value,
-            lpips=optional["lpips"].value,
-            render_seconds=seconds,
-            deform_seconds=deform_seconds,
-            time=picture.time,
-            psnr_foreground=parts.foreground,
-            psnr_moving=parts.moving,
-            psnr_still=parts.still,
-            psnr_right=halves.plain,
-            psnr_right_fitted=halves.fitted,
-            **people,
-        )
-        _require_finite(score, mask)
-        scores.append(score)
-    return scores, reasons
 
 
 def split_views(capture: Capture, split: str) -> Sequence[View]:
@@ -439,19 +305,6 @@ def parameter_megabytes(scene: Scene) -> float:
     return 4e-6 * (shapes + scene.num_colour_values + scene.num_motion_values) + 1e-6 * scene.num_mask_bytes
 
 
-def _timed_render(
-    scene: Scene, picture: Picture, options: RenderOptions, background: Tensor
-) -> tuple[Rendering, float, float]:
-    """Return the rendering, the seconds it took, and the seconds of these for deformation."""
-    with torch.no_grad():
-        start = time.perf_counter()
-        moment = scene.moment(picture.time)
-        deformed = time.perf_counter()
-        rendering = scene.render(picture.cameras, moment, options=options, background=background)
-        end = time.perf_counter()
-    return rendering, end - start, deformed - start
-
-
 def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
     """Return notes on how to read the numbers."""
     notes = []
@@ -467,20 +320,6 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
     if len({(s.width, s.height) for s in scores}) > 1:
         notes.append("views differ in size; width and height are those of the first")
     return tuple(notes)
-
-
-def _require_finite(score: ViewScore, mask: Tensor | None) -> None:
-    for name in ("psnr", "ssim", "flip", "lpips"):
-        value = getattr(score, name)
-        if value is not None and not math.isfinite(value):
-            empty = mask is not None and not bool((mask > 0).any())
-            why = "its mask ignores every pixel" if empty else "the picture holds NaN or Inf"
-            raise DyngsError(f"view {score.name!r}: {name} is not finite, {why}")
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return fmean(known) if len(known) == len(values) else None
 
 
 @contextmanager

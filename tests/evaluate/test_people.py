@@ -93,10 +93,10 @@ def test_refined_poses_stand_beside_those_as_given(
         assert main(["eval", str(run), "--split", "pose", *more]) == 0
         stored[name] = json.loads((run / "metrics_pose.json").read_text())
     out = capsys.readouterr().out
-    assert out.count("on black, poses refined") == 2
+    assert out.count("on black, poses refined") == out.count("on black, poses from silhouettes") == 2
     given, refined = stored["given"], stored["refined"]
     changed = {key for key in given if given[key] != refined[key]} - {"fps", "deform_share", "per_view"}
-    assert changed == {"psnr_own_poses", "own_poses"}
+    assert changed == {"psnr_own_poses", "own_poses", "silhouette_poses"}
     timed = {"render_seconds", "deform_seconds"}
     views = [
         [{k: x for k, x in view.items() if k not in timed} for view in own["per_view"]] for own in (given, refined)

@@ -10,15 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from moving_scene import TEST_TIMES, Sliding, moving_scene, row_of_balls, still_scene, write_moving_run
+from moving_scene import TEST_TIMES, row_of_balls, write_moving_run
 
-from dyngs.camera import Cameras
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig, StaticModel, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import RasterizeMode
 from dyngs.data.capture import Capture
-from dyngs.data.loader import Picture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.data.true_tracks import TrueTracks, write_true_tracks
 from dyngs.errors import DyngsError
@@ -27,17 +25,13 @@ from dyngs.evaluate.report import (
     parameter_megabytes,
     render_options,
     report_path,
-    score_views,
     split_views,
 )
 from dyngs.files.write import write_image
 from dyngs.gaussians import Gaussians
-from dyngs.metrics import Lpips, psnr
-from dyngs.rendering import RenderOptions, render
+from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.static.scene import StaticScene
-
-NO_LPIPS = Lpips("alex", "no weights here")
 
 
 def some_gaussians(count: int = 12, degree: int = 0) -> Gaussians:
@@ -54,17 +48,6 @@ def as_scene(gaussians: Gaussians) -> StaticScene:
     return StaticScene(gaussians=gaussians)
 
 
-def camera(width: int = 20, height: int = 14, distance: float = 4.0) -> Cameras:
-    pose = torch.eye(4)
-    pose[2, 3] = distance
-    intrinsics = torch.tensor([[20.0, 0, width / 2], [0, 20, height / 2], [0, 0, 1]])
-    return Cameras(pose[None], intrinsics[None], width, height)
-
-
-def picture(rgb: torch.Tensor, cameras: Cameras, name: str = "a", mask: torch.Tensor | None = None) -> Picture:
-    return Picture(name=name, cameras=cameras, rgb_premultiplied=rgb, alpha=None, mask=mask, time=None)
-
-
 def write_run(folder: Path, gaussians: Gaussians, background: str = "auto") -> Path:
     """A run folder with a 16x16 capture of 2 train and 3 test pictures beside it."""
     root = write_still_capture(folder / "capture", StillOptions(size=16, num_train=2, num_test=3, samples=1))
@@ -75,52 +58,6 @@ def write_run(folder: Path, gaussians: Gaussians, background: str = "auto") -> P
     tensors = {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
     save_checkpoint(run_dir, Checkpoint(CheckpointInfo(7, 1.0, (0.0, 0.0, 0.0), "white", "classic"), tensors), 12.5)
     return run_dir
-
-
-def test_scores_are_those_of_the_pictures() -> None:
-    gaussians, cameras, options = some_gaussians(), camera(), RenderOptions()
-    background = torch.tensor([0.2, 0.4, 0.6])
-    rendered = render(gaussians, cameras, options, background=background).rgb[0].clamp(0, 1)
-    darker = rendered * 0.5
-    pictures = [picture(rendered, cameras, "same"), picture(darker, cameras, "darker")]
-    scores, reasons = score_views(as_scene(gaussians), pictures, options, background, NO_LPIPS)
-    same, other = scores
-    assert (same.name, same.psnr, same.width, same.height) == ("same", 100.0, 20, 14)
-    assert same.ssim == pytest.approx(1.0, abs=1e-6)
-    assert other.psnr == psnr(rendered, darker)
-    assert other.ssim < 0.99
-    assert same.lpips is None
-    assert reasons["lpips"] == "no weights here"
-    assert (same.flip is None) == ("flip" in reasons)
-    assert same.flip in (None, 0.0)
-    assert all(score.render_seconds > 0 for score in scores)
-
-
-def test_masks_reach_every_metric() -> None:
-    gaussians, cameras, options = some_gaussians(), camera(), RenderOptions()
-    rendered = render(gaussians, cameras, options).rgb[0].clamp(0, 1)
-    mask = torch.ones(14, 20)
-    mask[:, :10] = 0
-    spoiled = torch.where(mask[..., None] > 0, rendered, 1 - rendered)
-    scores, _ = score_views(
-        as_scene(gaussians), [picture(spoiled, cameras, mask=mask)], options, torch.zeros(3), NO_LPIPS
-    )
-    assert scores[0].psnr == 100.0
-    assert scores[0].ssim == pytest.approx(1.0, abs=1e-6)
-    assert scores[0].flip in (None, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("truth", "mask", "message"),
-    [
-        (torch.full((14, 20, 3), math.nan), None, "view 'a': psnr is not finite, the picture holds"),
-        (torch.zeros(14, 20, 3), torch.zeros(14, 20), "view 'a': psnr is not finite, its mask ignores every pixel"),
-    ],
-)
-def test_values_that_are_not_finite_are_refused(truth, mask, message) -> None:
-    pictures = [picture(truth, camera(), mask=mask)]
-    with pytest.raises(DyngsError, match=message):
-        score_views(as_scene(some_gaussians()), pictures, RenderOptions(), torch.zeros(3), NO_LPIPS)
 
 
 def test_report_of_a_run(tmp_path) -> None:
@@ -134,7 +71,7 @@ def test_report_of_a_run(tmp_path) -> None:
         "num_moving moving_share field_mb deform_share flicker flicker_error psnr_per_time psnr_person ssim_person"
     )
     parts = "psnr_foreground psnr_moving psnr_still moving_from track_error_px track_within_5px track_motion_px"
-    parts += " psnr_right psnr_right_fitted psnr_own_poses own_poses psnr_black ssim_black lpips_black"
+    parts += " psnr_right psnr_right_fitted psnr_own_poses own_poses silhouette_poses psnr_black ssim_black lpips_black"
     rest = {*parts.split(), "seconds_train", "step", "reasons", "notes", "per_view", "colour_floats", "stored_mb"}
     assert set(keys.split()) | set(over_time.split()) | rest == set(stored)
     facts = {"split": "test", "num_views": 3, "width": 16, "height": 16, "background": "white", "lpips_net": "alex"}
@@ -279,16 +216,3 @@ def test_still_models_of_moving_captures(tmp_path) -> None:
     (run_dir / RESOLVED_NAME).write_text(config)
     (note,) = evaluate_run(run_dir).notes
     assert "nothing moves" in note
-
-
-def test_views_are_drawn_at_their_own_times() -> None:
-    scene, options, black = moving_scene(Sliding()), RenderOptions(), torch.zeros(3)
-    pictures = [
-        replace(picture(render(scene.at(t), camera(), options).rgb[0].clamp(0, 1), camera()), time=t)
-        for t in (0.0, 0.8)
-    ]
-    scores, _ = score_views(scene, pictures, options, black, NO_LPIPS)
-    assert [(s.psnr, s.time) for s in scores] == [(100.0, 0.0), (100.0, 0.8)]
-    scores, _ = score_views(still_scene(), pictures, options, black, NO_LPIPS)
-    assert scores[1].psnr < 40
-    assert all(s.deform_seconds <= s.render_seconds for s in scores)

@@ -1,7 +1,8 @@
 """Body poses fitted to pictures: the poses in which an avatar, which stays as it is, looks most like them.
 
-GART (Lei et al. 2024), Anim-NeRF (Chen et al. 2021) and others fit the poses of test pictures like this before they
-score new poses. Local letters: F moments, J joints, V pictures of a moment.
+Either the whole pictures count, or their silhouettes alone (``dyngs.human.avatar.pose_comparison``). GART (Lei et al.
+2024), Anim-NeRF (Chen et al. 2021) and others fit the poses of test pictures like this before they score new poses.
+Local letters: F moments, J joints, V pictures of a moment.
 """
 
 from __future__ import annotations
@@ -14,19 +15,16 @@ import torch
 from torch import Tensor
 
 from dyngs.data.loader import Picture, PictureLoader
-from dyngs.data.pictures.images import area_downscale
-from dyngs.human.avatar.corrections import POSE_CM, POSE_WEIGHT, SharedCorrection, corrected_clip
+from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
+from dyngs.human.avatar.pose_comparison import PICTURES, Comparison
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.ops.adam import adam_step_
-from dyngs.ops.loss import l1_ssim_loss
-from dyngs.rendering import RenderOptions
+from dyngs.rendering import Rendering, RenderOptions
 from dyngs.scene import Moment
 
-SSIM_WEIGHT, ALPHA_WEIGHT = 0.2, 0.1
-"""Of SSIM and of the mean error of alpha in the loss, as in training."""
 COARSE_PX = 40
 """Height of the person, px, in the coarsest of the three rounds."""
 FIRST_RATES, LAST_RATES = (5e-3, 5e-3, 3e-3), (2.5e-3, 1.2e-3, 5e-4)
@@ -65,7 +63,11 @@ class FittedPoses:
 
 
 def fitted_to_pictures(
-    scene: HumanScene, pictures: PictureLoader, background: Tensor, options: RenderOptions
+    scene: HumanScene,
+    pictures: PictureLoader,
+    background: Tensor,
+    options: RenderOptions,
+    comparison: Comparison = PICTURES,
 ) -> FittedPoses:
     """Return the person in the poses in which it looks most like ``pictures``: rotations of joints and translation.
 
@@ -78,6 +80,7 @@ def fitted_to_pictures(
         pictures: of a split.
         background: (3,) behind both.
         options: as in training.
+        comparison: what of the pictures counts.
     """
     groups: dict[float, list[int]] = {}
     for index, time in enumerate(pictures.times):
@@ -88,7 +91,7 @@ def fitted_to_pictures(
     counts: list[int] = []
     for row, time in enumerate(times):
         start = starts.select(torch.tensor([row], device="cpu"))
-        fit = _Fit(scene, start, time, background, options, tuple(pictures[i] for i in groups[time]))
+        fit = _Fit(scene, start, time, background, options, tuple(pictures[i] for i in groups[time]), comparison)
         correction, count = fit.fitted(found[-1] if found else None)
         found.append(correction)
         counts.append(count)
@@ -121,6 +124,7 @@ class _Fit:
         time: of the pictures.
         background, options: to draw with.
         pictures: V.
+        comparison: what of these counts.
     """
 
     scene: HumanScene
@@ -129,6 +133,7 @@ class _Fit:
     background: Tensor
     options: RenderOptions
     pictures: tuple[Picture, ...]
+    comparison: Comparison
 
     def fitted(self, guess: Correction | None) -> tuple[Correction, int]:
         """Return the correction of the pose, and the number of updates it took.
@@ -167,7 +172,8 @@ class _Fit:
                     loss = self._loss(leaves, (self.pictures[update % len(self.pictures)],), shrink)
                     by_turns, by_shift = torch.autograd.grad(loss, [leaves.turns, leaves.shift])
                 total += float(loss.detach())
-                adam_step_(now.turns, by_turns, *moments[:2], lr=rate, step=update, betas=BETAS)
+                if len(self.pictures) >= self.comparison.views_to_turn:
+                    adam_step_(now.turns, by_turns, *moments[:2], lr=rate, step=update, betas=BETAS)
                 adam_step_(now.shift, by_shift, *moments[2:], lr=SHIFT_RATE * rate, step=update, betas=BETAS)
             if total > (1 - LEAST_GAIN) * before:
                 rate /= 2
@@ -177,32 +183,21 @@ class _Fit:
         return now, update
 
     def _loss(self, correction: Correction, pictures: Sequence[Picture], shrink: int) -> Tensor:
-        """Return the loss () of a correction: the mean over ``pictures``, compared after shrinking, and its size.
-
-        Render and picture are both shrunk: drawn at a smaller size the same Gaussians look larger, because of the
-        low-pass that every Gaussian gets in pixels, and the fit ends elsewhere.
-        """
-        start = self.start
+        """Return the loss () of a correction: the mean over ``pictures``, compared after shrinking, and its size."""
+        start, how = self.start, self.comparison
         posing = BodyPose(
             axis_angle_to_matrix(start.poses[0]) @ axis_angle_to_matrix(correction.turns),
             start.trans[0] + correction.shift * start.scale[0],
             start.scale[0],
         )
         moment = self.scene.in_pose(posing, self.time)
-        losses = [self._difference(picture, moment, shrink) for picture in pictures]
-        return torch.stack(losses).mean() + POSE_WEIGHT * correction.turns.square().mean() / POSE_CM**2
+        losses = [how.difference(self._drawn(x, moment), x, self.background, shrink) for x in pictures]
+        size = how.turn_weight * correction.turns.square().mean() + how.shift_weight * correction.shift.square().mean()
+        return torch.stack(losses).mean() + size
 
-    def _difference(self, picture: Picture, moment: Moment, shrink: int) -> Tensor:
-        """Return the loss () between the person at ``moment`` and a picture."""
-        drawn = self.scene.render(picture.cameras, moment, options=self.options, background=self.background)
-        rendered, truth, mask = drawn.rgb[0], picture.composite(self.background), picture.mask
-        error = None if picture.alpha is None else (drawn.alpha[0] - picture.alpha)[..., None]
-        if mask is not None:
-            rendered, truth = rendered * mask[..., None], truth * mask[..., None]
-            error = None if error is None else error * mask[..., None]
-            mask = _shrunk(mask[..., None], shrink)[..., 0]
-        loss = l1_ssim_loss(_shrunk(rendered, shrink), _shrunk(truth, shrink), SSIM_WEIGHT, mask)
-        return loss if error is None else loss + ALPHA_WEIGHT * _shrunk(error, shrink).abs().mean()
+    def _drawn(self, picture: Picture, moment: Moment) -> Rendering:
+        """Return the person at ``moment`` as the camera of a picture sees it."""
+        return self.scene.render(picture.cameras, moment, options=self.options, background=self.background)
 
 
 def _shrinks(pictures: Sequence[Picture]) -> tuple[int, int, int]:
@@ -210,11 +205,3 @@ def _shrinks(pictures: Sequence[Picture]) -> tuple[int, int, int]:
     heights = [int((x.alpha > 0).any(1).sum()) if x.alpha is not None else x.cameras.height for x in pictures]
     coarse = max(1, round(max(heights) / COARSE_PX))
     return coarse, round(math.sqrt(coarse)), 1
-
-
-def _shrunk(picture: Tensor, factor: int) -> Tensor:
-    """Return the (H, W, C) picture with its sides divided by ``factor``, averaged over pixel areas."""
-    if factor == 1:
-        return picture
-    height, width = (max(1, round(side / factor)) for side in picture.shape[:2])
-    return area_downscale(picture, width, height)

@@ -15,6 +15,7 @@ from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.human.avatar import pose_fit
+from dyngs.human.avatar.pose_comparison import PICTURES, SILHOUETTES, Comparison
 from dyngs.human.avatar.pose_fit import FittedPoses, fitted_to_pictures
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
@@ -70,8 +71,8 @@ def pictures_of(
     return found
 
 
-def fitted(scene: HumanScene, pictures: list[Picture]) -> FittedPoses:
-    return fitted_to_pictures(scene, cast(PictureLoader, Shown(pictures)), WHITE, scene.options)
+def fitted(scene: HumanScene, pictures: list[Picture], comparison: Comparison = PICTURES) -> FittedPoses:
+    return fitted_to_pictures(scene, cast(PictureLoader, Shown(pictures)), WHITE, scene.options, comparison)
 
 
 def disturbed(scene: HumanScene) -> HumanScene:
@@ -123,6 +124,37 @@ def test_what_fits_already_stays(truth: tuple[HumanScene, list[Cameras]], monkey
     fit = fitted(scene, pictures)
     torch.testing.assert_close(fit.scene.moves_as.poses, scene.moves_as.poses[:1], rtol=0, atol=1e-5)
     torch.testing.assert_close(fit.scene.moves_as.trans, scene.moves_as.trans[:1], rtol=0, atol=1e-6)
+
+
+def test_silhouettes_alone_find_poses_again(
+    truth: tuple[HumanScene, list[Cameras]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 6)
+    scene, cameras = truth
+    pictures = pictures_of(scene, cameras, list(scene.times[:1]))
+    start = disturbed(scene)
+    without_colours = [replace(x, rgb_premultiplied=torch.rand_like(x.rgb_premultiplied)) for x in pictures]
+    fit = fitted(start, without_colours, SILHOUETTES)
+    true = joints_of(scene, scene.moves_as, 0)
+    before, after = (joints_of(x, x.moves_as, 0) for x in (start, fit.scene))
+    errors = [float((x - true).norm(dim=1).mean()) for x in (before, after)]
+    assert errors[1] < 0.5 * errors[0]
+    assert mean_psnr(fit.scene, pictures) > mean_psnr(start, pictures) + 3
+
+
+def test_one_silhouette_moves_the_person_and_turns_no_joint(
+    truth: tuple[HumanScene, list[Cameras]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 6)
+    scene, cameras = truth
+    pictures = pictures_of(scene, cameras[:1], [0.0])
+    camera = cameras[0].cam_from_world[0]
+    sideways = camera[0, :3] * 0.03  # in the picture, where one view shows it
+    start = scene.playing(replace(scene.clip, trans=scene.clip.trans + sideways))
+    fit = fitted(start, pictures, SILHOUETTES)
+    torch.testing.assert_close(fit.scene.moves_as.poses, start.moves_as.poses[:1], rtol=0, atol=1e-6)
+    off = [(x.moves_as.trans[0] - scene.moves_as.trans[0]).norm() for x in (start, fit.scene)]
+    assert off[1] < 0.4 * off[0]
 
 
 def test_masked_pixels_say_nothing_about_the_pose(
