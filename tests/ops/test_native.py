@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,11 @@ import torch
 from dyngs.ops.native import active_isa, array, core, kernel_threads, num_threads
 
 ROOT = Path(__file__).parents[2]
+
+
+def best_isa() -> str:
+    """Return the newest level that this processor runs; only the baseline module knows it."""
+    return import_module("dyngs.ops._core_v2").best_isa()
 
 
 def import_with(isa: str) -> subprocess.CompletedProcess[str]:
@@ -31,7 +37,7 @@ def import_with(isa: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_best_kernels_are_loaded() -> None:
-    assert active_isa() == os.environ.get("DYNGS_ISA", core.best_isa())
+    assert active_isa() == os.environ.get("DYNGS_ISA", best_isa())
 
 
 def test_an_older_instruction_set_can_be_asked_for() -> None:
@@ -39,7 +45,7 @@ def test_an_older_instruction_set_can_be_asked_for() -> None:
 
 
 def test_an_unknown_instruction_set_is_refused() -> None:
-    assert import_with("v9").stdout.startswith(f"DYNGS_ISA=v9: this processor runs v2 to {core.best_isa()}")
+    assert import_with("v9").stdout.startswith(f"DYNGS_ISA=v9: this processor runs v2 to {best_isa()}")
 
 
 def test_kernels_follow_torch_unless_told_otherwise() -> None:
