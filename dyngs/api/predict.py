@@ -11,7 +11,7 @@ import torch
 
 from dyngs.build import assemble
 from dyngs.config import Config, DataConfig, HumanPredictorModel
-from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
+from dyngs.config.io import load_config, load_resolved, packaged_preset
 from dyngs.config.kinds import network_of, person_of
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.errors import DyngsError
@@ -20,6 +20,7 @@ from dyngs.human.prediction.person import CapturedPerson, named_views, spread_vi
 from dyngs.human.prediction.predict import PredictedAvatar, predict_gaussians
 from dyngs.human.template.load import load_template
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
+from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import new_folder, require_empty
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.rates import Rates
@@ -148,7 +149,7 @@ def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: Human
     scene = replace(scene.with_gaussians(optimizer.parameters), colour=trainer.scene.colour)
     trainer = replace(trainer, scene=scene, training=training, optimizer=optimizer)
     with new_folder(out) as started:
-        save_config(config, started / RESOLVED_NAME)
+        write_config(config, started)
         save_checkpoint(started, trainer.checkpoint(), seconds)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from dyngs.api.train import num_cores, train
 from dyngs.build import assemble
 from dyngs.config import Config, PruneConfig
-from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.config.io import load_resolved
 from dyngs.config.kinds import network_of, person_of
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture, PictureLoader
@@ -22,6 +22,7 @@ from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.search import MOST_HELD_OUT, Limit, Search, Stored
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, latest_checkpoint, save_checkpoint, seconds_at
+from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, new_folder, require_empty
 from dyngs.runs.log import LOG_NAME
 from dyngs.storage.file import write_scene
@@ -86,7 +87,7 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
     with new_folder(out) as started:
         _copy_start(run_dir, started)
         save_checkpoint(started, start, 0.0)
-        save_config(config, started / RESOLVED_NAME)
+        write_config(config, started)
     train(config, resume_from=out)
     write_scene_file(out, file_of(out))
     return out
@@ -177,6 +178,6 @@ def _write(folder: Path, stored: Stored, seconds: float) -> None:
     """Write the chosen candidate as a run, with its file in a folder of its own."""
     config = stored.candidate.config
     save_checkpoint(folder, stored.candidate.checkpoint, seconds)
-    save_config(config, folder / RESOLVED_NAME)
+    write_config(config, folder)
     write_scene(folder / EXPORT_FOLDER / SCENE_FILE, stored.file.data)
-    save_config(config, folder / EXPORT_FOLDER / RESOLVED_NAME)
+    write_config(config, folder / EXPORT_FOLDER)

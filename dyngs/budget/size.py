@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from dyngs.build import restored_scene
-from dyngs.config.io import RESOLVED_NAME, save_config
+from dyngs.config.io import RESOLVED_NAME
 from dyngs.errors import DyngsError
 from dyngs.prune.selection import highest
 from dyngs.prune.stage import default_scores, probe_pictures, quality_of
 from dyngs.runs.checkpoint import SCENE_FILE
+from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, FORMER_EXPORT_FOLDER
 from dyngs.scene import Scene
 from dyngs.storage.drawable import drawable
@@ -118,7 +119,7 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
     if chosen is None:
         raise DyngsError(f"budget.max_mb={megabytes:g}: what is trained does not fit; the run itself is in {run_dir}")
     write_scene(run_dir / EXPORT_FOLDER / SCENE_FILE, chosen.data)
-    save_config(config, run_dir / EXPORT_FOLDER / RESOLVED_NAME)
+    write_config(config, run_dir / EXPORT_FOLDER)
     got = 1e-6 * len(chosen.data)
     return SizeReport(megabytes, got, before, chosen.psnr, len(scene), chosen.num_kept, chosen.coarser)
 

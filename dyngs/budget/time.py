@@ -16,9 +16,9 @@ from torch import Tensor
 from dyngs.budget.run import LimitedRun
 from dyngs.build import assemble
 from dyngs.config import Config
-from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.config.kinds import harmonics_measured_after
 from dyngs.errors import DyngsError
+from dyngs.runs.config_file import write_config
 from dyngs.training.events import Event, StepDone
 from dyngs.training.schedule import motion_begins_after, picture_divisor, scaled
 from dyngs.training.trainer import Trainer
@@ -135,7 +135,7 @@ class Deadline:
             self.begin(done, now)
         else:
             run.trainer.config = with_steps(run.trainer.config, done)
-        save_config(run.config, run.folder / RESOLVED_NAME)
+        write_config(run.config, run.folder)
         run.loop.expect(run.config.total_steps)
 
 

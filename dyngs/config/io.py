@@ -79,7 +79,7 @@ def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
     """Return the configuration of a finished or interrupted run.
 
     Args:
-        path: a run folder, or the YAML file in it.
+        path: a run folder, or the YAML file in it; a relative ``data.body`` there is one beside the file.
         overrides: as in ``load_config``.
 
     Raises:
@@ -97,13 +97,22 @@ def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
     layers.add(present(read_file(file)))
     if not layers.tree.get("data"):
         raise DyngsError(f"{file}: does not say which capture the run was trained on (data.root); restore the file")
+    body = layers.value_at(("data", "body"))
+    if isinstance(body, str):
+        layers.tree["data"]["body"] = str(file.parent.absolute() / body)
     layers.add_overrides(overrides)
     return _validate(layers)
 
 
 def save_config(config: Config, path: Path) -> None:
-    """Write every value of ``config`` as YAML, atomically: ``path`` is either the old file or the new one."""
+    """Write every value of ``config`` as YAML, atomically: ``path`` is either the old file or the new one.
+
+    A ``data.body`` beside the file is written relative to it, so that their folder may be moved.
+    """
     values = config.model_dump(mode="json")
+    body, beside = config.data.body, path.parent.absolute()
+    if body is not None and body.is_relative_to(beside):
+        values["data"]["body"] = body.relative_to(beside).as_posix()
     text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
     if not _ODD_LINE_BREAKS.isdisjoint(text):
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=False)  # escapes, where YAML would fold them

@@ -10,9 +10,10 @@ from pathlib import Path
 from torch import Tensor
 
 from dyngs.build import restored_scene
-from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
+from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
 from dyngs.scene import Scene
 from dyngs.storage.drawable import FIELD, drawable
@@ -69,7 +70,7 @@ def write_scene_file(run_dir: Path, out: Path, max_change: float | None = None, 
             precision = _checked(run_dir, precision, plan.pictures(scene), plan.pictures(stored))
         write_scene(folder / SCENE_FILE, data)
         if out.resolve() != run_dir.resolve():
-            save_config(config, folder / RESOLVED_NAME)
+            write_config(config, folder)
     return SceneFile(out / SCENE_FILE, precision, len(data), num_bytes_exact(scene))
 
 

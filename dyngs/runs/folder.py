@@ -13,6 +13,7 @@ from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.files.temporary import remove_leftovers, remove_quietly, temporary_folder_beside
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of
+from dyngs.runs.config_file import BODY_FOLDER, with_body_of, write_config
 from dyngs.runs.lock import LOCK_NAME, writing
 from dyngs.runs.log import LOG_NAME
 
@@ -24,7 +25,7 @@ STILL_FOLDER = "still"
 """In the folder of a run of a moving scene: the run of the still model that it is compared with."""
 ASKED_NAME = "asked.yaml"
 """In a run folder: the configuration as it was asked for, where training has chosen something else (config.yaml)."""
-_BEGUN = (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, STILL_FOLDER)
+_BEGUN = (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, STILL_FOLDER, BODY_FOLDER)
 """Files that a run stopped before its first checkpoint may have written."""
 _OLD_LEFTOVER = re.compile(r"\.step_\d+\.\d+\.safetensors|\.tmp[A-Za-z0-9]{6}")
 """Names of half-written checkpoints of earlier versions and of the library that wrote them."""
@@ -157,11 +158,11 @@ def is_done(folder: Path, config: Config) -> bool:
 
 def note_asked(folder: Path, asked: Config) -> None:
     """Write the configuration that was asked for beside that of the run, if the two differ; otherwise there is none."""
-    path = folder / ASKED_NAME
-    if _is_same_run(load_resolved(folder), asked):
+    path, stored = folder / ASKED_NAME, load_resolved(folder)
+    if _is_same_run(stored, asked):
         path.unlink(missing_ok=True)
     else:
-        save_config(asked, path)
+        save_config(with_body_of(asked, stored), path)
 
 
 def asked_for(folder: Path) -> Config:
@@ -206,7 +207,8 @@ def _about_other(folder: Path, config: Config) -> str:
 
 def _differences(one: Config, other: Config) -> Iterator[tuple[str, object, object]]:
     """Yield dotted key and both values, as they are printed, of what makes two runs different."""
-    first, second = (_flat(c.model_dump(mode="json", exclude={"run"}) | {"run.seed": c.run.seed}) for c in (one, other))
+    both = one, with_body_of(other, one)
+    first, second = (_flat(c.model_dump(mode="json", exclude={"run"}) | {"run.seed": c.run.seed}) for c in both)
     for key in dict.fromkeys((*first, *second)):
         if first.get(key) != second.get(key):
             yield key, first.get(key, "not"), second.get(key, "not")
@@ -229,7 +231,7 @@ def begin(folder: Path, config: Config) -> None:
     """Write the configuration of a run, unless the same one is there already, which may be a person's own file."""
     begun = _config_of_begun(folder)
     if begun is None or not _is_same_run(begun, config):
-        save_config(config, folder / RESOLVED_NAME)
+        write_config(config, folder)
 
 
 def tidy(folder: Path, *, sole_writer: bool) -> None:
@@ -274,5 +276,5 @@ def _config_of_begun(folder: Path) -> Config | None:
 
 def _is_same_run(one: Config, other: Config) -> bool:
     """Return whether two runs have the same bytes, whatever they are called, wherever they are, by how many threads."""
-    first, second = (c.model_copy(update={"run": RunConfig(seed=c.run.seed)}) for c in (one, other))
+    first, second = (c.model_copy(update={"run": RunConfig(seed=c.run.seed)}) for c in (one, with_body_of(other, one)))
     return first == second

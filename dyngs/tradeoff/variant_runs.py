@@ -10,7 +10,7 @@ from dyngs.api.prune import prune_run
 from dyngs.api.train import num_cores, train
 from dyngs.build import assemble, restored_scene
 from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig
-from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.config.kinds import field_of, network_of
 from dyngs.config.schema import section_class
 from dyngs.conventions import num_sh_terms
@@ -28,6 +28,7 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
+from dyngs.runs.config_file import write_config
 from dyngs.state import tensors_of
 from dyngs.storage.file import write_scene
 from dyngs.tradeoff.measure import with_render_settings
@@ -168,7 +169,7 @@ def write_chosen(models: VariantRuns, variant: Variant) -> Path:
     chosen = config.model_copy(update={"model": model, "data": data})
     if has_only_scene_file(made):
         write_scene(out / SCENE_FILE, (made / SCENE_FILE).read_bytes())
-        save_config(chosen, out / RESOLVED_NAME)
+        write_config(chosen, out)
     else:
         _write(out, latest_checkpoint(made), chosen, made)
     return out
@@ -214,4 +215,4 @@ def _write(folder: Path, checkpoint: Checkpoint, config: Config, source: Path, *
     if not whole:
         tensors = tensors_of(restored_scene(checkpoint, config.model).state())
     save_checkpoint(folder, replace(checkpoint, tensors=tensors), seconds_at(source, checkpoint.info.step))
-    save_config(config, folder / RESOLVED_NAME)
+    write_config(config, folder)

@@ -100,7 +100,7 @@ def test_an_interruption_leaves_nothing(run_dir: Path, tmp_path: Path, monkeypat
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("dyngs.api.prune.save_config", interrupted)
+        patch.setattr("dyngs.api.prune.write_config", interrupted)
         with pytest.raises(KeyboardInterrupt):
             prune_run(run_dir, tmp_path / "small", ASKED)
         patch.setattr("dyngs.prune.search.apply_cut", interrupted)

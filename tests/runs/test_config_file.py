@@ -1,0 +1,105 @@
+"""A run of a person keeps the fit that it was trained on, wherever the fit lay and wherever the folder goes."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dyngs
+from dyngs.cli import main
+from dyngs.config import Config
+from dyngs.config.io import load_resolved, save_config
+from dyngs.errors import DyngsError
+from dyngs.evaluate.report import evaluate_run
+from dyngs.export.scene_file import write_scene_file
+from dyngs.runs.checkpoint import latest_checkpoint
+from dyngs.runs.config_file import is_same_body, with_body_of, write_config
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def fit_of(person: Path, folder: Path, raised: float = 0.01) -> Path:
+    """A fit that differs from the body parameters of the capture."""
+    folder.mkdir(parents=True)
+    for name in ("body_train.npz", "body_pose.npz"):
+        arrays = dict(np.load(person / name))
+        np.savez(folder / name, **(arrays | {"trans": arrays["trans"] + np.array([0, raised, 0], np.float32)}))
+    (folder / "fit_report.json").write_text("{}")
+    (folder / "fit_overlays.png").write_bytes(b"a picture")
+    return folder
+
+
+def config_of(person: Path, fit: Path, run_dir: Path) -> Config:
+    words = [f"data.root={person}", f"data.body={fit}", f"run.dir={run_dir}", "run.threads=1", "train.steps=3"]
+    return dyngs.load_config("human", [*words, "train.log_every=1", "model.resolution=24"])
+
+
+def test_a_moved_run_needs_no_cache(person: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fit = fit_of(person, tmp_path / "cache" / "bodies" / "person.1")
+    config = config_of(person, fit, tmp_path / "run")
+    run = dyngs.train(config)
+    assert sorted(path.name for path in (run / "body").iterdir()) == [
+        *("body_pose.npz", "body_train.npz", "fit_report.json")
+    ]
+    assert not (run / "asked.yaml").exists(), "the same body, elsewhere"
+    before = evaluate_run(run, "pose")
+    capsys.readouterr()
+    dyngs.train(config)
+    assert "holds just this run, finished" in capsys.readouterr().out
+    shutil.rmtree(tmp_path / "cache")
+    moved = tmp_path / "elsewhere" / "moved"
+    moved.parent.mkdir()
+    run.rename(moved)
+    assert load_resolved(moved).data.body == moved / "body"
+    assert evaluate_run(moved, "pose").psnr == before.psnr
+    assert main(["train", "--resume", str(moved), "train.steps=5"]) == 0
+    assert latest_checkpoint(moved).info.step == 5
+    assert load_resolved(moved).data.body == moved / "body"
+    assert "body: body\n" in (moved / "config.yaml").read_text()
+
+
+def test_an_exported_run_has_its_own_copy(person: Path, tmp_path: Path) -> None:
+    run = dyngs.train(config_of(person, fit_of(person, tmp_path / "fit"), tmp_path / "run"))
+    for _ in range(2):  # the second one is an export of the same run
+        write_scene_file(run, tmp_path / "export", max_change=0.2)
+    shutil.rmtree(run)
+    assert load_resolved(tmp_path / "export").data.body == tmp_path / "export" / "body"
+    assert evaluate_run(tmp_path / "export", "pose").psnr > 5
+
+
+def test_a_fit_that_is_gone_stays_named(person: Path, tmp_path: Path) -> None:
+    """As in runs of former versions, whose fit lies in the cache."""
+    fit = fit_of(person, tmp_path / "fit")
+    config = config_of(person, fit, tmp_path / "run")
+    save_config(config, tmp_path / "old" / "config.yaml")
+    assert load_resolved(tmp_path / "old") == config
+    shutil.rmtree(fit)
+    write_config(config, tmp_path / "new")
+    assert load_resolved(tmp_path / "new").data.body == fit
+    assert not (tmp_path / "new" / "body").exists()
+    with pytest.raises(DyngsError, match=r"body_train\.npz: no such file"):
+        dyngs.train(config)
+
+
+def test_bodies_are_the_same_by_their_contents(person: Path, tmp_path: Path) -> None:
+    one, two = fit_of(person, tmp_path / "one"), fit_of(person, tmp_path / "two")
+    other = fit_of(person, tmp_path / "other", raised=0.02)
+    assert is_same_body(one, two)
+    assert is_same_body(None, None)
+    assert is_same_body(tmp_path / "gone", tmp_path / "gone")
+    for different in (other, None, tmp_path / "gone"):
+        assert not is_same_body(one, different)
+        assert not is_same_body(different, one)
+    (two / "body_pose.npz").unlink()
+    assert not is_same_body(one, two)
+    first, second = (config_of(person, fit, tmp_path / "run") for fit in (one, other))
+    assert with_body_of(second, first) == second
+
+
+def test_another_fit_is_another_run(person: Path, tmp_path: Path) -> None:
+    dyngs.train(config_of(person, fit_of(person, tmp_path / "one"), tmp_path / "run"))
+    with pytest.raises(DyngsError, match=r"another one \(data\.body is .*run/body there and .*two here\)"):
+        dyngs.train(config_of(person, fit_of(person, tmp_path / "two", raised=0.02), tmp_path / "run"))
