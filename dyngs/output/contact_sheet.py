@@ -11,6 +11,7 @@ from dyngs.files.write import to_uint8
 
 GAP = 6
 LABEL_HEIGHT = 22
+LARGEST_TEXT, SMALLEST_TEXT = 14, 9
 BACKGROUND = 32
 
 
@@ -99,7 +100,7 @@ def _band(label: str, error_name: str, panels: list[np.ndarray]) -> np.ndarray:
     for i, panel in enumerate(panels):
         left = GAP + i * (width + GAP)
         band[LABEL_HEIGHT:, left : left + width] = panel
-    texts = (f"{label}   truth", "render", error_name)
+    texts = (f"truth  {label}", "render", error_name)
     for i, text in enumerate(texts):
         left = GAP + i * (width + GAP)
         _write_text(band[:LABEL_HEIGHT, left : left + width], text)
@@ -107,12 +108,17 @@ def _band(label: str, error_name: str, panels: list[np.ndarray]) -> np.ndarray:
 
 
 def _write_text(strip: np.ndarray, text: str) -> None:
-    """Write text into ``strip`` (H, W, 3) in place, cut off at its edge; nothing if no font is installed."""
+    """Write text into ``strip`` (H, W, 3) in place, nothing if no font is installed.
+
+    It is made smaller to fit, down to a limit at which it is cut off at the strip's edge.
+    """
     import OpenImageIO as oiio
 
     picture = oiio.ImageBuf(np.ascontiguousarray(strip))
-    ink = (0.85, 0.85, 0.85)
-    if oiio.ImageBufAlgo.render_text(picture, 2, LABEL_HEIGHT - 7, text, 14, textcolor=ink):
+    ink, size = (0.85, 0.85, 0.85), LARGEST_TEXT
+    while size > SMALLEST_TEXT and oiio.ImageBufAlgo.text_size(text, size).width > strip.shape[1] - 4:
+        size -= 1
+    if oiio.ImageBufAlgo.render_text(picture, 2, LABEL_HEIGHT - 7, text, size, textcolor=ink):
         strip[:] = picture.get_pixels(oiio.UINT8)
 
 

@@ -119,7 +119,7 @@ def write_split_images(
             report("views", i + 1, len(views))
             if i in shown:
                 truth = picture.composite(background)
-                label = f"{picture.name}  {psnr(torch.from_numpy(frame.rgb), truth, picture.mask):.2f} dB"
+                label = f"{psnr(torch.from_numpy(frame.rgb), truth, picture.mask):.2f} dB  {picture.name}"
                 rows.append(_sheet_row(label, truth, torch.from_numpy(frame.rgb), picture.mask))
     writer.write_picture(out_dir / "sheet.png", contact_sheet(rows))
     return writer.written

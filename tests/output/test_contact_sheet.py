@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dyngs.output.contact_sheet import GAP, LABEL_HEIGHT, SheetRow, color_map, contact_sheet, depth_limits, depth_to_rgb
+from dyngs.output.contact_sheet import (
+    BACKGROUND,
+    GAP,
+    LABEL_HEIGHT,
+    SheetRow,
+    color_map,
+    contact_sheet,
+    depth_limits,
+    depth_to_rgb,
+)
 
 RNG = np.random.default_rng(0)
 
@@ -36,6 +45,16 @@ def test_large_and_unequal_pictures_fit() -> None:
     sheet = contact_sheet(rows, panel_width=50)
     assert sheet.shape[1] == GAP + 3 * (50 + GAP)
     assert sheet.shape[0] == 3 * LABEL_HEIGHT + 20 + 10 + 1 + GAP
+
+
+def test_captions_of_small_pictures_end_inside() -> None:
+    """At the width of the demo's panels nothing of the last letter is cut off."""
+    panel = np.zeros((8, 160, 3), np.uint8)
+    sheet = contact_sheet([SheetRow("31.23 dB  images/test/r_M", panel, panel)])
+    ink = np.flatnonzero((sheet[:LABEL_HEIGHT, GAP : GAP + 160] != BACKGROUND).any(axis=(0, 2)))
+    if not len(ink):
+        pytest.skip("no font is installed")
+    assert 140 < ink.max() < 159
 
 
 def test_wrong_rows_are_refused() -> None:
