@@ -1,6 +1,6 @@
 """The network that predicts people, on held-out synthetic people, compared with mean textures.
 
-    python benchmarks/human_predictor.py FOLDER [--people 48] [--held-out 6] [--size 128] [--steps 2000] [--threads 1]
+    python benchmarks/human_predictor.py FOLDER [--people 48] [--held-out 6] [--size 128] [--steps 4000] [--threads 1]
 
 People differ in body shape, clothes, light and clips. Usual clothes are worn by every other training person, and by the
 second half of the held-out ones. FOLDER keeps the captures and the run, which are reused. Printed per held-out person,
@@ -114,7 +114,7 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=48)
     parser.add_argument("--held-out", type=int, default=6)
     parser.add_argument("--size", type=int, default=128)
-    parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--threads", type=int, default=1)
     given = parser.parse_args()
     options = HumanOptions(size=given.size, num_frames=5, num_new=0, num_test=0)
