@@ -13,16 +13,7 @@ constexpr int64_t kBlock = 64 * kLanes;  // Gaussians per work item
 
 template <class S>
 Pinhole<S> load_pinhole(const GaussianViews<S>& in, const ProjectOptions<S>& options, int64_t view) {
-  const S* m = in.viewmats + view * 16;
-  const S* k = in.intrinsics + view * 9;
-  Pinhole<S> cam;
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) cam.rotation.m[i][j] = m[4 * i + j];
-  }
-  cam.translation = {m[3], m[7], m[11]};
-  cam.fx = k[0], cam.fy = k[4], cam.cx = k[2], cam.cy = k[5];
-  cam.width = static_cast<S>(options.width), cam.height = static_cast<S>(options.height);
-  return cam;
+  return pinhole(in.viewmats + view * 16, in.intrinsics + view * 9, options.width, options.height);
 }
 
 // Column `c` of rows first..first+15 of an (N, stride) array; lanes past `count` repeat the last row.

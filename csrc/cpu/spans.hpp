@@ -45,12 +45,9 @@ void tile_rows(const Ellipse<Packet<S>>& e, const Grid& grid, int32_t (&begin)[k
 // Tile columns within one tile row each (lane i: tile_row[i]).
 template <class S>
 void row_spans(const Ellipse<Packet<S>>& e, Packet<S> tile_row, const Grid& grid, Span (&spans)[kLanes]) {
-  using P = Packet<S>;
-  const P top = tile_row * P(S(kTile)) + P(S(0.5)) - e.y;
-  const P lo = max(top, -e.half_height), hi = min(top + P(S(kTile - 1)), e.half_height);
-  const PixelRange<Packet<S>> range = pixels_between(reach(e, lo, hi, P(S(-1))), reach(e, lo, hi, P(S(1))), grid.width);
-  const PacketMask<S> hit = (lo <= hi + P(S(1e-3))) & (range.begin < range.end);
-  const uint32_t bits = to_bits(hit);
+  const RowCover<Packet<S>> cover = columns_in_rows(e, tile_row * Packet<S>(S(kTile)), kTile, grid.width);
+  const PixelRange<Packet<S>>& range = cover.columns;
+  const uint32_t bits = to_bits(cover.any);
   for (int i = 0; i < kLanes; ++i) {
     const auto first = static_cast<int32_t>(range.begin[i]), last = static_cast<int32_t>(range.end[i]);
     spans[i] = bits >> i & 1 ? Span{first / kTile, (last + kTile - 1) / kTile} : Span{0, 0};

@@ -35,11 +35,23 @@ DYNGS_INLINE Vec2<R> whitened(R u, R w, R v, const Vec2<R>& first, R x, R y) {
   return {first.x - u * x - w * y, first.y - v * y};
 }
 
-// log2 of alpha before clamping, at offset (x, y) from some first pixel centre; `dx`, `dy`: the mean minus that centre.
+// (u, v) of a pixel centre; `dx`, `dy`: the mean minus it.
+template <class S>
+DYNGS_INLINE Vec2<S> whitened_first(const BlendGaussian<S>& g, S dx, S dy) {
+  return {g.u * dx + g.w * dy, g.v * dy};
+}
+
+// log2 of alpha before clamping, where (u, v) are `at`.
+template <class R>
+DYNGS_INLINE R log2_alpha(R log2_opacity, const Vec2<R>& at) {
+  return log2_opacity - at.x * at.x - at.y * at.y;
+}
+
+// The same at offset (x, y) from some first pixel centre; `dx`, `dy`: the mean minus that centre.
 template <class R, class S>
 DYNGS_INLINE R log2_alpha(const BlendGaussian<S>& g, S dx, S dy, R x, R y) {
-  const Vec2<R> at = whitened(R(g.u), R(g.w), R(g.v), Vec2<R>{R(g.u * dx + g.w * dy), R(g.v * dy)}, x, y);
-  return R(g.log2_opacity) - at.x * at.x - at.y * at.y;
+  const Vec2<S> first = whitened_first(g, dx, dy);
+  return log2_alpha(R(g.log2_opacity), whitened(R(g.u), R(g.w), R(g.v), Vec2<R>{R(first.x), R(first.y)}, x, y));
 }
 
 // `raw`: alpha before clamping.

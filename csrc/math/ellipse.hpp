@@ -47,6 +47,22 @@ DYNGS_HD PixelRange<R> pixels_between(R lo, R hi, int size) {
   return {down + select(first > down, one, zero), trunc(last)};
 }
 
+template <class R>
+struct RowCover {
+  PixelRange<R> columns;
+  MaskOf<R> any;
+};
+
+// The pixel columns that the ellipse covers in the `rows` pixel rows from `top` on, in a picture `width` px wide.
+template <class R>
+DYNGS_HD RowCover<R> columns_in_rows(const Ellipse<R>& e, R top, int rows, int width) {
+  const R first = top + real<R>(0.5) - e.y;
+  const R lo = max(first, -e.half_height), hi = min(first + real<R>(rows - 1), e.half_height);
+  const PixelRange<R> range = pixels_between(reach(e, lo, hi, real<R>(-1)), reach(e, lo, hi, real<R>(1)), width);
+  const MaskOf<R> any = (lo <= hi + real<R>(1e-3)) & (range.begin < range.end);
+  return {range, any};
+}
+
 // Smallest u^2 + v^2 within boxes [x0, x1] x [y0, y1] relative to the centre. The quadratic form is convex: its minimum
 // lies at the centre if that is inside, else on the facing vertical or horizontal edge; both are minimised in closed form.
 template <class R, class S>

@@ -15,6 +15,19 @@ struct Pinhole {
   S width, height;
 };
 
+// `viewmat` (4, 4) cam_from_world, `intrinsics` (3, 3) px.
+template <class S>
+DYNGS_HD Pinhole<S> pinhole(const S* viewmat, const S* intrinsics, int width, int height) {
+  Pinhole<S> cam;
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) cam.rotation.m[i][j] = viewmat[4 * i + j];
+  }
+  cam.translation = {viewmat[3], viewmat[7], viewmat[11]};
+  cam.fx = intrinsics[0], cam.fy = intrinsics[4], cam.cx = intrinsics[2], cam.cy = intrinsics[5];
+  cam.width = static_cast<S>(width), cam.height = static_cast<S>(height);
+  return cam;
+}
+
 // One Gaussian in the image plane.
 template <class R>
 struct Splat {

@@ -40,6 +40,8 @@ inline constexpr S kNaN = std::numeric_limits<S>::quiet_NaN();
 
 DYNGS_INLINE float select(bool condition, float a, float b) { return condition ? a : b; }
 DYNGS_INLINE double select(bool condition, double a, double b) { return condition ? a : b; }
+DYNGS_INLINE int32_t select(bool condition, int32_t a, int32_t b) { return condition ? a : b; }
+DYNGS_INLINE int64_t select(bool condition, int64_t a, int64_t b) { return condition ? a : b; }
 
 DYNGS_INLINE float sqrt(float x) { return std::sqrt(x); }
 DYNGS_INLINE double sqrt(double x) { return std::sqrt(x); }
