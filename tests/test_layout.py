@@ -16,7 +16,7 @@ import dyngs
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHON_FILES = sorted((ROOT / "dyngs").rglob("*.py"))
-CPP_FILES = sorted(f for suffix in ("hpp", "cpp", "h", "inl") for f in (ROOT / "csrc").rglob(f"*.{suffix}"))
+CPP_FILES = sorted(f for suffix in ("hpp", "cpp", "h", "inl", "cu") for f in (ROOT / "csrc").rglob(f"*.{suffix}"))
 TEST_FILES = sorted((ROOT / "tests").rglob("test_*.py"))
 
 MAX_FILE_LINES = 500

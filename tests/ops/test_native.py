@@ -117,6 +117,28 @@ def test_formulas_in_cpp(tmp_path: Path, name: str) -> None:
     assert "all passed" in done.stdout
 
 
+def test_cuda_kernels_in_cpp(tmp_path: Path) -> None:
+    """csrc/tests/test_cuda_*.cpp: the kernels of csrc/cuda as plain C++, run by an emulation, against csrc/cpu."""
+    compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        pytest.skip("no C++ compiler here")
+    # nothing contracted, as in CMakeLists.txt
+    command = [compiler, "-std=gnu++20", "-O1", "-ffp-contract=off", "-w", "-fopenmp", f"-I{ROOT / 'csrc'}"]
+    cpu = ("adam", "bin_tiles", "finite", "harmonics", "loss", "memory", "project")
+    cpu += ("rasterize_backward", "rasterize_forward")
+    sources = [ROOT / f"csrc/cpu/{name}.cpp" for name in cpu] + sorted((ROOT / "csrc/cuda").glob("*.cu"))
+    kernels = [tmp_path / f"{source.name}.o" for source in sources]
+    for source, to in zip(sources, kernels, strict=True):
+        subprocess.run([*command, "-x", "c++", "-c", str(source), "-o", str(to)], check=True, timeout=300)
+    for name, objects in (("test_cuda_emulator", []), ("test_cuda_render", kernels)):
+        program = tmp_path / name
+        needed = [str(ROOT / f"csrc/tests/{name}.cpp"), *map(str, objects)]
+        subprocess.run([*command, *needed, "-o", str(program)], check=True, timeout=300)
+        done = subprocess.run([str(program)], capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "all passed" in done.stdout
+
+
 # --- after a fork -----------------------------------------------------------------------------------------------------
 
 FORKED = """

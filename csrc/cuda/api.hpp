@@ -1,0 +1,73 @@
+// The ops of core/api.hpp on a CUDA card, in float32: the same structs with pointers to the card's memory (`threads` is not
+// read), the same results up to rounding, and the same bytes whenever a call is repeated. Work is queued on `stream`; nothing
+// is allocated and nothing waits, but for the one number that bin_entries reads back. A function with a `workspace` takes
+// memory that the caller allocated, of at least as many bytes as its neighbour `..._workspace` says; its contents are of no use
+// afterwards. Errors of a launch are thrown as std::runtime_error.
+#pragma once
+
+#include "core/api.hpp"
+
+namespace dyngs::cuda {
+
+using Stream = void*;  // a cudaStream_t
+
+// Memory of the card that is lent for one call.
+struct Lent {
+  void* memory;
+  int64_t bytes;
+};
+
+// Projection ----------------------------------------------------------------------------------------------------------
+
+void project_forward(const GaussianViews<float>& in, const ProjectOptions<float>& options, const Projected<float>& out,
+                     Stream stream);
+int64_t project_backward_workspace(int64_t num_gaussians, int64_t num_views);
+void project_backward(const GaussianViews<float>& in, const ProjectOptions<float>& options, const int32_t* radii,
+                      const ProjectedGrads<float>& grads, const GaussianGrads<float>& out, const Lent& workspace,
+                      Stream stream);
+
+// Spherical harmonics -------------------------------------------------------------------------------------------------
+
+void harmonics_forward(const Harmonics<float>& in, float* colors, Stream stream);
+int64_t harmonics_backward_workspace(int64_t num_gaussians, int64_t num_views);
+void harmonics_backward(const Harmonics<float>& in, const float* colors, const float* grad_colors, float* grad_means,
+                        float* grad_sh, float* grad_centers, const Lent& workspace, Stream stream);
+
+// Rasterization -------------------------------------------------------------------------------------------------------
+
+// Binning takes two calls, since the caller allocates the lists between them. bin_count sorts by depth, counts, and
+// returns the number of entries E; it throws std::length_error with the numbers if that is more than `max_entries`.
+// bin_emit writes the lists; its `entries` are those of core/api.hpp with room for E, and `counted` the workspace as
+// bin_count left it.
+struct EntryArrays {
+  int64_t* tile_offsets;  // (V * tiles + 1)
+  int32_t* slot_ranges;   // (V * N, 2)
+  int32_t* gaussians;     // (E,)
+  int32_t* slots;         // (E,)
+};
+int64_t bin_count_workspace(int64_t num_splats);
+int64_t bin_count(const Splats<float>& splats, int64_t max_entries, const Lent& workspace, Stream stream);
+int64_t bin_emit_workspace(int64_t num_entries);
+void bin_emit(const Splats<float>& splats, int64_t num_entries, const Lent& counted, const EntryArrays& out,
+              const Lent& workspace, Stream stream);
+
+int64_t rasterize_forward_workspace(int64_t num_entries, Tally tallied);
+void rasterize_forward(const Splats<float>& splats, const Entries& entries, const Image<float>& image,
+                       const Lent& workspace, Stream stream);
+int64_t rasterize_backward_workspace(int64_t num_entries, int channels, bool absolute);
+void rasterize_backward(const Splats<float>& splats, const Entries& entries, const ImageGrads<float>& image,
+                        const SplatGrads<float>& out, const Lent& workspace, Stream stream);
+
+// Training ------------------------------------------------------------------------------------------------------------
+
+int64_t l1_ssim_loss_workspace(int64_t height, int64_t width);
+// Writes the loss to `loss` (one double on the card) and, unless null, its gradient (H, W, 3).
+void l1_ssim_loss(const LossInput& input, double* loss, float* gradient, const Lent& workspace, Stream stream);
+
+// Adds to *skipped the rows that were asked for but had NaN, infinity or a gradient of 2^63 or more.
+void adam_step(const AdamState& state, const AdamRates& rates, int32_t* skipped, Stream stream);
+void seen_rows(const float* grads, int64_t num_rows, int64_t row_size, bool* seen, Stream stream);
+// Adds to *count how many of n elements are NaN or infinite.
+void count_nonfinite(const float* x, int64_t n, int32_t* count, Stream stream);
+
+}  // namespace dyngs::cuda

@@ -1,0 +1,40 @@
+// Prefix sums, and a stable sort of pairs by the bits of a key. Both give the same bytes every time: blocks only meet at the ends
+// of launches, and the only atomics count.
+#pragma once
+
+#include "cuda/device.hpp"
+
+namespace dyngs::cuda {
+
+// The memory that the functions below need for up to `count` items.
+struct ScanScratch {
+  int64_t* partials;  // per block
+  int64_t* total;     // (1,)
+  ScanScratch(Workspace& workspace, int64_t count);
+};
+
+// Replaces counts[i] by the sum of all before it, and writes the sum of all to scratch.total. The sums must fit 32 bits;
+// the total may be larger, and is then the only thing of use.
+void exclusive_scan(int32_t* counts, int64_t count, const ScanScratch& scratch, Stream stream);
+
+struct SortScratch {
+  int32_t* histogram;
+  ScanScratch scan;
+  SortScratch(Workspace& workspace, int64_t count);
+};
+
+struct Pairs {
+  uint32_t* keys;
+  int32_t* values;
+};
+
+// Eight bits of the key are sorted in one pass.
+inline constexpr int kRadixBits = 8;
+inline int passes_for(int bits) { return (bits + kRadixBits - 1) / kRadixBits; }
+
+// Sorts by the lowest `bits` bits, ties in the order they came. Passes go to and fro between `from` and `other`; the result
+// lies in `from` after an even number of them, else in `other`.
+void stable_sort(const Pairs& from, const Pairs& other, int64_t count, int bits, const SortScratch& scratch,
+                 Stream stream);
+
+}  // namespace dyngs::cuda

@@ -1,0 +1,253 @@
+// The CUDA kernels from Gaussians to pictures and back, run by the emulation of cuda_on_cpu.hpp with all its checks: against the
+// CPU's kernels in float64 and float32, and bit by bit against themselves under other orders of blocks and threads.
+#include <functional>
+
+#include "tests/scene_on_card.hpp"
+
+namespace {
+
+using namespace check;
+using Order = cuda::emulated::Schedule::Order;
+
+// The same tiles and the same order as the CPU's lists. Slots are numbers of places: contiguous for each splat, each once.
+void expect_same_lists(const std::string& what, const Binning& card, const Binning& cpu) {
+  expect_same_bits("tile offsets, " + what, card.tile_offsets, cpu.tile_offsets);
+  expect_same_bits("entries, " + what, card.gaussians, cpu.gaussians);
+  std::vector<int> used(card.slots.size());
+  bool own = true;
+  for (size_t i = 0; i < card.slots.size(); ++i) {
+    const int32_t slot = card.slots[i], row = card.gaussians[i];
+    ++used[slot];
+    own &= card.slot_ranges[2 * row] <= slot && slot < card.slot_ranges[2 * row + 1];
+  }
+  int64_t covered = 0;
+  for (size_t row = 0; row < card.slot_ranges.size() / 2; ++row)
+    covered += card.slot_ranges[2 * row + 1] - card.slot_ranges[2 * row];
+  expect(own, "every slot lies in its splat's range, " + what);
+  expect(std::all_of(used.begin(), used.end(), [](int n) { return n == 1; }), "every slot is used once, " + what);
+  expect(covered == static_cast<int64_t>(card.slots.size()), "ranges cover the slots, " + what);
+}
+
+// Lists for splats that the CPU projected, so that both start from the same bits.
+void test_lists(const std::string& what, const Scene& s) {
+  const Inputs<float> in(s, 1);
+  Drawn<float> d;
+  project_all(in, d);
+  CardSplats held(d);
+  expect_same_lists(what, bin_on_card(held.splats(in, d)), bin_tiles(in.splats(d), kNoLimit));
+}
+
+void expect_same_drawing(const std::string& what, const Drawn<float>& a, const Drawn<float>& b) {
+  expect_same_bits("means2d, " + what, a.means2d, b.means2d);
+  expect_same_bits("picture, " + what, a.color, b.color);
+  expect_same_bits("stop, " + what, a.stop, b.stop);
+  expect_same_bits("probe, " + what, a.probe, b.probe);
+  expect_same_bits("means gradient, " + what, a.g_means, b.g_means);
+  expect_same_bits("quats gradient, " + what, a.g_quats, b.g_quats);
+  expect_same_bits("scales gradient, " + what, a.g_scales, b.g_scales);
+  expect_same_bits("opacities gradient, " + what, a.g_opacities, b.g_opacities);
+  expect_same_bits("features gradient, " + what, a.g_features, b.g_features);
+  expect_same_bits("sh gradient, " + what, a.g_sh, b.g_sh);
+  expect_same_bits("centers gradient, " + what, a.g_centers, b.g_centers);
+  expect_same_bits("viewmats gradient, " + what, a.g_viewmats, b.g_viewmats);
+  expect_same_bits("intrinsics gradient, " + what, a.g_intrinsics, b.g_intrinsics);
+  for (int k = 0; k < 4; ++k) expect_same_bits("tally, " + what, a.tallies[k], b.tallies[k]);
+}
+
+// As expect_close; where nothing but zeros and rounding is wanted, nothing else will do.
+template <class A, class B>
+void expect_as(const std::string& what, const std::vector<A>& got, const std::vector<B>& wanted, double tolerance) {
+  const auto is_nothing = [](auto x) { return std::abs(static_cast<double>(x)) < 1e-15; };
+  if (!std::all_of(wanted.begin(), wanted.end(), is_nothing)) return expect_close(what, got, wanted, tolerance);
+  expect(got.size() == wanted.size() && std::all_of(got.begin(), got.end(), is_nothing), what + " is zero");
+}
+
+// To which share of the largest value.
+struct Tolerance {
+  double picture = 2e-5, gradient = 2e-4;  // those that float32 on the CPU is held to (test_render.cpp)
+};
+
+// `card` against the CPU.
+template <class S>
+void expect_as_cpu(const std::string& what, const Scene& s, const Drawn<float>& card, const Drawn<S>& cpu,
+                   const Tolerance& to) {
+  expect_as("means2d, " + what, card.means2d, cpu.means2d, 1e-6);
+  expect_as("factors, " + what, card.factors, cpu.factors, to.picture);
+  expect_as("compensations, " + what, card.compensations, cpu.compensations, to.picture);
+  expect_as("colours, " + what, card.colors, cpu.colors, 2e-6);
+  expect_as("picture, " + what, card.color, cpu.color, to.picture);
+  expect_as("transmittance, " + what, card.transmittance, cpu.transmittance, to.picture);
+  expect_as("means gradient, " + what, card.g_means, cpu.g_means, to.gradient);
+  expect_as("quats gradient, " + what, card.g_quats, cpu.g_quats, to.gradient);
+  expect_as("scales gradient, " + what, card.g_scales, cpu.g_scales, to.gradient);
+  expect_as("opacities gradient, " + what, card.g_opacities, cpu.g_opacities, to.gradient);
+  expect_as("features gradient, " + what, card.g_features, cpu.g_features, to.gradient);
+  expect_as("probe, " + what, card.probe, cpu.probe, to.gradient);
+  expect_as("viewmats gradient, " + what, card.g_viewmats, cpu.g_viewmats, to.gradient);
+  expect_as("intrinsics gradient, " + what, card.g_intrinsics, cpu.g_intrinsics, to.gradient);
+  for (int k :
+       {0, 3})  // not the pixels counted: in float more weights round to zero; nor the lanes: warps are not blocks
+    expect_as("tally " + std::to_string(k) + ", " + what, card.tallies[k], cpu.tallies[k], to.gradient);
+  if (s.channels != 3) return;
+  expect_as("sh gradient, " + what, card.g_sh, cpu.g_sh, to.gradient);
+  expect_as("centers gradient, " + what, card.g_centers, cpu.g_centers, to.gradient);
+}
+
+template <class S = double>
+void compare(const std::string& what, const Scene& s, const Tolerance& to = {}) {
+  const Cotangents cotangents = random_cotangents(s);
+  expect_as_cpu(what, s, draw_on_card(s, &cotangents), draw<S>(s, 1, &cotangents), to);
+}
+
+Scene with_thresholds(Scene s) {
+  s.alpha_min = 1.0 / 255, s.transmittance_min = 1e-4;
+  return s;
+}
+
+// With thresholds a pixel may fall on the other side by rounding: nearly all are as in float64, and none further off than the
+// least alpha that is drawn.
+void test_thresholds() {
+  const Scene s = with_thresholds(random_scene(120, 41, 35, 3, 0.3));
+  const Drawn<float> card = draw_on_card(s, nullptr);
+  const Drawn<double> cpu = draw<double>(s, 1);
+  int64_t far = 0;
+  double largest = 0;
+  for (size_t i = 0; i < card.color.size(); ++i) {
+    const double error = std::abs(card.color[i] - cpu.color[i]);
+    if (!(error <= 2e-5)) ++far;
+    largest = error <= largest ? largest : error;
+  }
+  expect(far <= static_cast<int64_t>(card.color.size()) / 100, std::to_string(far) + " pixels differ with thresholds");
+  expect(largest < 2.0 / 255, "with thresholds no pixel is further off than what is not drawn");
+  expect(std::any_of(card.stop.begin(), card.stop.end(), [](int32_t stop) { return stop < 1000; }),
+         "some pixels are full");
+}
+
+// Every order of blocks and threads gives the same bytes, with and without pixels that are full before the end.
+void test_orders() {
+  const Scene s = with_thresholds(random_scene(150, 41, 35, 3, 0.3));
+  const Cotangents cotangents = random_cotangents(s);
+  const Drawn<float> forward = draw_on_card(s, &cotangents);
+  for (const auto& [order, seed] : {std::pair{Order::kReversed, 0u}, {Order::kShuffled, 1u}, {Order::kShuffled, 2u}}) {
+    machine.schedule = {order, seed};
+    expect_same_drawing("order " + std::to_string(static_cast<int>(order)) + ", seed " + std::to_string(seed), forward,
+                        draw_on_card(s, &cotangents));
+  }
+  machine.schedule = {};
+}
+
+void test_all_lists() {
+  test_lists("thresholds", with_thresholds(random_scene(500, 90, 70, 3, 0.1)));
+  test_lists("no thresholds", random_scene(100, 90, 70, 3, 0.1));
+  test_lists("several pieces to sort", with_thresholds(random_scene(3000, 75, 50, 3, 0.05)));
+  Scene tall =
+      with_thresholds(random_scene(60, 33, 900, 3, 0.5));  // 57 tile rows: those of large splats by whole warps
+  test_lists("large splats", tall);
+  Scene equal = with_thresholds(random_scene(200, 40, 40, 3, 0.2));
+  for (int64_t i = 0; i < equal.n; ++i) equal.means[3 * i + 2] = 4;
+  for (int k = 0; k < 32; ++k) equal.viewmats[k] = k % 16 % 5 == 0 ? 1 : 0;
+  test_lists("equal depths", equal);
+  test_lists("more than 65536 tiles", with_thresholds(random_scene(8, 4099, 4200, 3, 0.0002)));
+  test_lists("a picture of one pixel", random_scene(5, 1, 1, 3, 0.5));
+}
+
+void test_limit_of_entries() {
+  const Scene s = random_scene(20, 37, 29, 3, 0.3);
+  const Inputs<float> in(s, 1);
+  Drawn<float> d;
+  project_all(in, d);
+  CardSplats held(d);
+  std::string message;
+  try {
+    bin_on_card(held.splats(in, d), 3);
+  } catch (const std::length_error& error) {
+    message = error.what();
+  }
+  const int64_t count = bin_tiles(in.splats(d), kNoLimit).gaussians.size();
+  expect(message ==
+             "20 Gaussians in 2 view(s) of 37x29 px meet " + std::to_string(count) + " tiles, more than the limit of 3",
+         "more entries than allowed are refused: " + message);
+}
+
+void test_nothing_to_draw() {
+  Scene s = random_scene(3, 20, 18, 3, 0.1);
+  for (int64_t i = 0; i < s.n; ++i) s.means[3 * i + 2] = -5;  // behind the cameras
+  compare("behind the cameras", s);
+  compare("no Gaussians", random_scene(0, 20, 18, 3, 0.1));
+}
+
+// Rows of the table of docs/numerics.md.
+void test_extremes() {
+  const auto changed = [](const std::string& what, const std::function<void(Scene&)>& change,
+                          const Tolerance& to = {}) {
+    Scene s = random_scene(30, 37, 29, 3, 0.2);
+    change(s);
+    compare(what, s, to);
+  };
+  const auto scaled = [](double to) {
+    return [to](Scene& s) {
+      for (double& x : s.scales) x = to;
+    };
+  };
+  const auto turned = [](double by) {
+    return [by](Scene& s) {
+      for (double& x : s.quats) x = static_cast<float>(x * by);
+    };
+  };
+  const auto plain = [](const std::function<void(Scene&)>& change) {
+    return [change](Scene& s) { change(s), s.antialiased = false; };
+  };
+  changed("scales 1e-12", plain(scaled(1e-12)));
+  changed("scales 1e-12, antialiased", scaled(1e-12));
+  changed("scales 0", plain(scaled(0)));
+  changed("scales 1e12", scaled(1e12));
+  changed("needles", plain([](Scene& s) {
+            for (int64_t i = 0; i < s.n; ++i)
+              for (int k = 0; k < 3; ++k) s.scales[3 * i + k] = k == i % 3 ? 1e4 : 1e-4;
+          }),
+          {2e-5, 1e-3});
+  changed("zero quaternions", turned(0));
+  for (double by : {1e-3, 1e3, 1e30, 1e-30}) changed("quaternions times " + std::to_string(by), turned(by));
+  changed("opacity 0", [](Scene& s) {
+    for (double& x : s.opacities) x = 0;
+  });
+  changed("opacity 1", [](Scene& s) {
+    for (double& x : s.opacities) x = 1;
+  });
+  changed("at the camera and on the near plane", [](Scene& s) {
+    for (int64_t i = 0; i < s.n; ++i) s.means[3 * i + 2] = i % 3 == 0 ? 0 : i % 3 == 1 ? 0.2f : 0.25f;
+  });
+  changed("far away", [](Scene& s) {
+    for (double& x : s.means) x = static_cast<float>(x * 20);
+    for (double& x : s.scales) x = static_cast<float>(x * 20);
+  });
+  changed("coincident and opaque", [](Scene& s) {
+    for (int64_t i = 0; i < s.n; ++i)
+      for (int k = 0; k < 3; ++k) s.means[3 * i + k] = k == 2 ? 4 : 0;
+    for (double& x : s.opacities) x = 1;
+  });
+  Scene thin = random_scene(400, 20, 17, 3, 0.5);
+  for (double& x : thin.opacities) x = static_cast<float>(0.01);
+  for (int64_t i = 0; i < thin.n; ++i) thin.means[3 * i] = thin.means[3 * i + 1] = 0, thin.means[3 * i + 2] = 4;
+  compare("400 coincident of opacity 0.01", thin, {3e-5, 1e-3});
+  Scene huge = random_scene(30, 37, 29, 3, 0.2);
+  scaled(1e20)(huge);
+  compare<float>("scales 1e20", huge);  // culled in float32 alone
+  compare("1x1", random_scene(20, 1, 1, 3, 0.3));
+  compare("1x700", random_scene(20, 1, 700, 3, 0.3), {2e-5, 1e-3});
+  compare("700x1", random_scene(20, 700, 1, 3, 0.3), {2e-5, 1e-3});
+}
+
+}  // namespace
+
+int main() {
+  for (int channels : {1, 3, 4, 7, 13, kMaxChannels})
+    compare("D=" + std::to_string(channels), random_scene(40, 37, 19, channels, 0.2));
+  test_all_lists();
+  test_thresholds();
+  test_orders();
+  test_limit_of_entries();
+  test_nothing_to_draw();
+  test_extremes();
+  return report();
+}
