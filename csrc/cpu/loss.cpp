@@ -2,9 +2,8 @@
 //
 // SSIM, its gradient and the letters d, s, G(.) are those of math/ssim.hpp.
 //
-// Precision. V = G(x^2) - G(x)^2 loses digits where x^2 is large beside C2: in float32 0.1% of Q at kLargestInFloat. A
-// tile with more than that anywhere, which no ordinary picture has, is computed again in float64: 0.1% are then reached at
-// 1e5, and nothing overflows. The choice depends on the tile's pixels alone.
+// Precision. A tile with squares beyond kLargestSquaresInFloat anywhere, which no ordinary picture has, is computed again in
+// float64: 0.1% of Q are then reached at pictures of 1e5, and nothing overflows. The choice depends on the tile's pixels alone.
 //
 // Channels are interleaved: a row is 3 * width numbers, and the horizontal taps lie 3 numbers apart.
 #include "core/api.hpp"
@@ -23,9 +22,7 @@ namespace dyngs {
 namespace {
 
 constexpr int kChannels = 3;
-constexpr int kRadius = 5;
-constexpr int kTaps = 2 * kRadius + 1;
-constexpr double kLargestInFloat = 16;  // of G(d^2) + G(s^2): pictures up to 2
+constexpr int kRadius = kSsimRadius, kTaps = kSsimTaps;
 
 constexpr int kBatch = 4;                      // rows filtered together: each row read serves up to four sums
 constexpr int kWindow = kBatch + 2 * kRadius;  // rows that a batch reads
@@ -33,20 +30,6 @@ constexpr int kRing = 16;                      // rows kept of each map; a power
 constexpr int kHalo = 2 * kRadius;             // a gradient depends on pixels this far away
 constexpr int kTileRows = 96;
 constexpr int kTilePixels = 256;
-
-template <class T>
-struct Kernel {
-  T tap[kTaps];
-};
-
-template <class T>
-Kernel<T> gaussian_kernel() {
-  double value[kTaps], sum = 0;
-  for (int i = 0; i < kTaps; ++i) sum += value[i] = std::exp(-(i - kRadius) * (i - kRadius) / (2 * 1.5 * 1.5));
-  Kernel<T> kernel;
-  for (int i = 0; i < kTaps; ++i) kernel.tap[i] = static_cast<T>(value[i] / sum);
-  return kernel;
-}
 
 // Pixels [row_begin, row_end) x [col_begin, col_end). Tiles depend on the picture only, never on the thread count.
 struct Tile {
@@ -92,7 +75,7 @@ class Workspace {
 template <class T>
 struct Context {
   const LossInput& input;
-  const Kernel<T>& kernel;
+  const SsimKernel<T>& kernel;
   Tile tile;
   T scale;          // 1 / (channels * sum of the mask)
   float* gradient;  // nullptr: value only
@@ -106,7 +89,8 @@ struct Context {
 template <class T>
 bool is_precise(const Context<T>& c) {
   bool precise = true;
-  for (int k = 0; k < Native<T>::kSize; ++k) precise = precise && c.largest[k] <= static_cast<T>(kLargestInFloat);
+  for (int k = 0; k < Native<T>::kSize; ++k)
+    precise = precise && c.largest[k] <= static_cast<T>(kLargestSquaresInFloat);
   return precise || sizeof(T) == sizeof(double);
 }
 
@@ -184,7 +168,7 @@ void blur_columns(Context<T>& c, int ring_map, int64_t row, int to, int square_t
 }
 
 template <class T>
-inline Native<T> blur_along(const T* centre, const Kernel<T>& kernel) {
+inline Native<T> blur_along(const T* centre, const SsimKernel<T>& kernel) {
   Native<T> sum = load_native(centre) * kernel.tap[kRadius];
 #pragma GCC unroll 8
   for (int k = 1; k <= kRadius; ++k)
@@ -333,8 +317,8 @@ double sum_of_mask(const LossInput& input) {
 }  // namespace
 
 double l1_ssim_loss(const LossInput& input, float* gradient, int threads) {
-  const Kernel<float> kernel = gaussian_kernel<float>();
-  const Kernel<double> fine_kernel = gaussian_kernel<double>();
+  const SsimKernel<float> kernel = ssim_kernel<float>();
+  const SsimKernel<double> fine_kernel = ssim_kernel<double>();
   const Pieces strips(input.height, kTileRows), columns(input.width, kTilePixels);
   const double mask_sum = sum_of_mask(input);
   const double scale = mask_sum == 0 ? 0 : 1 / (kChannels * mask_sum);

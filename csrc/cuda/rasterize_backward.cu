@@ -268,8 +268,8 @@ __global__ void __launch_bounds__(kTileThreads)
     __syncthreads();
     walk_chunk<kCap, kAbsolute>(s, image, tile, pixel, at, count, staged, colors, arrays, state);
     __syncthreads();
-    store_chunk<kCap, kAbsolute>(s, entries, tile, at, count, staged, sums, slots);
-    __syncthreads();
+    store_chunk<kCap, kAbsolute>(s, entries, tile, at, count, staged, sums,
+                                 slots);  // of `staged` a thread reads there only what it writes next
   }
 }
 

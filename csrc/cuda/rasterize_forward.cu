@@ -78,7 +78,7 @@ __device__ void write_pixel(const Splats<float>& s, const Image<float>& image, c
 
 // `slot_sums` (E): the tally per entry. Every warp adds up its own pixels; the sums of the warps are added in their order.
 template <int kCap, Tally kTally>
-__global__ void __launch_bounds__(kTileThreads)
+__global__ void __launch_bounds__(kTileThreads, kCap <= 4 ? 4 : 2)
     blend_kernel(Splats<float> s, Entries entries, Image<float> image, float* slot_sums) {
   constexpr int kChunk = chunk_of(kCap);
   constexpr bool kTallied = kTally != Tally::kNone;

@@ -25,6 +25,26 @@ namespace dyngs {
 inline constexpr double kSsimC1 = 0.01 * 0.01;
 inline constexpr double kSsimC2 = 0.03 * 0.03;
 
+// The Gaussian G along one axis, of standard deviation 1.5.
+inline constexpr int kSsimRadius = 5, kSsimTaps = 2 * kSsimRadius + 1;
+template <class T>
+struct SsimKernel {
+  T tap[kSsimTaps];
+};
+
+template <class T>
+SsimKernel<T> ssim_kernel() {
+  double value[kSsimTaps], sum = 0;
+  for (int i = 0; i < kSsimTaps; ++i)
+    sum += value[i] = std::exp(-(i - kSsimRadius) * (i - kSsimRadius) / (2 * 1.5 * 1.5));
+  SsimKernel<T> kernel;
+  for (int i = 0; i < kSsimTaps; ++i) kernel.tap[i] = static_cast<T>(value[i] / sum);
+  return kernel;
+}
+
+// G(d^2) + G(s^2) up to which float32 is precise: V = G(x^2) - G(x)^2 loses digits where x^2 is large beside C2; here 0.1% of Q.
+inline constexpr double kLargestSquaresInFloat = 16;  // pictures up to 2
+
 template <class R>
 struct SsimTerms {
   R dissimilarity;                                 // 1 - SSIM

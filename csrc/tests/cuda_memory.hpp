@@ -297,7 +297,7 @@ class Memory {
 
   T* get() { return values_.get(); }
   int64_t count() const { return count_; }
-  std::vector<T> values() const { return {values_.get(), values_.get() + count_}; }
+  std::vector<T> values() const { return std::vector<T>(values_.get(), values_.get() + count_); }
 
  private:
   void add(const std::string& name, int64_t count, bool known) {

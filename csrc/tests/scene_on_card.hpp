@@ -20,6 +20,7 @@ inline constexpr int64_t kNoLimit = std::numeric_limits<int32_t>::max();
 struct OnCard {
   const Scene& scene;
   const Inputs<float> in;
+  bool with_cameras = true, with_probe = true, with_background = true;  // whether these are given, or asked for
   Memory<float> means, quats, scales, opacities, viewmats, intrinsics, centers, sh, background;
 
   explicit OnCard(const Scene& s)
@@ -35,6 +36,7 @@ struct OnCard {
         sh(in.sh, "sh"),
         background(in.background, "background") {}
 
+  const float* behind() { return with_background ? background.get() : nullptr; }
   GaussianViews<float> views() {
     GaussianViews<float> v = in.views();
     v.means = means.get(), v.quats = quats.get(), v.scales = scales.get(), v.opacities = opacities.get();
@@ -122,7 +124,7 @@ inline void draw_on_card(OnCard& card, const Splats<float>& splats, const Entrie
   Memory<int32_t> stop(s.pixels());
   Borrowed workspace(cuda::rasterize_forward_workspace(entries.count, tally));
   cuda::rasterize_forward(splats, entries,
-                          {color.get(), transmittance.get(), stop.get(), card.background.get(),
+                          {color.get(), transmittance.get(), stop.get(), card.behind(),
                            tally == Tally::kNone ? nullptr : sums.get(), tally},
                           workspace.lent(), nullptr);
   d.color = color.values(), d.transmittance = transmittance.values(), d.stop = stop.values();
@@ -137,8 +139,9 @@ inline void harmonics_backward_on_card(OnCard& card, Drawn<float>& d) {
   Memory<int32_t> radii(d.radii);
   Borrowed workspace(cuda::harmonics_backward_workspace(s.n, s.views));
   cuda::harmonics_backward(card.harmonics(radii.get()), colors.get(), grads.get(), by_direction.get(), sh.get(),
-                           centers.get(), workspace.lent(), nullptr);
-  d.g_sh = sh.values(), d.g_centers = centers.values();
+                           card.with_cameras ? centers.get() : nullptr, workspace.lent(), nullptr);
+  d.g_sh = sh.values();
+  if (card.with_cameras) d.g_centers = centers.values();
   for (size_t i = 0; i < d.g_means.size(); ++i) d.g_means[i] += by_direction.values()[i];
 }
 
@@ -150,12 +153,14 @@ inline void backward_on_card(OnCard& card, const Splats<float>& splats, const En
   Memory<float> final_transmittance(d.transmittance), g_means2d(2 * rows), g_factors(3 * rows), g_seen(rows);
   Memory<float> g_colors(rows * s.channels), probe(4 * rows);
   Memory<int32_t> stop(d.stop);
-  Borrowed workspace(cuda::rasterize_backward_workspace(entries.count, s.channels, true));
-  cuda::rasterize_backward(
-      splats, entries,
-      {g_color.get(), g_transmittance.get(), final_transmittance.get(), stop.get(), card.background.get()},
-      {g_means2d.get(), g_factors.get(), g_seen.get(), g_colors.get(), probe.get(), true}, workspace.lent(), nullptr);
-  d.g_features = g_colors.values(), d.probe = probe.values(), d.g_opacities.assign(s.n, 0.f);
+  Borrowed workspace(cuda::rasterize_backward_workspace(entries.count, s.channels, card.with_probe));
+  cuda::rasterize_backward(splats, entries,
+                           {g_color.get(), g_transmittance.get(), final_transmittance.get(), stop.get(), card.behind()},
+                           {g_means2d.get(), g_factors.get(), g_seen.get(), g_colors.get(),
+                            card.with_probe ? probe.get() : nullptr, card.with_probe},
+                           workspace.lent(), nullptr);
+  if (card.with_probe) d.probe = probe.values();
+  d.g_features = g_colors.values(), d.g_opacities.assign(s.n, 0.f);
   std::vector<float> by_compensation(rows);
   const std::vector<float> seen = g_seen.values();
   for (int64_t i = 0; i < rows; ++i) {
@@ -168,16 +173,16 @@ inline void backward_on_card(OnCard& card, const Splats<float>& splats, const En
   Borrowed partials(cuda::project_backward_workspace(s.n, s.views));
   cuda::project_backward(card.views(), card.in.options(), radii.get(),
                          {g_means2d.get(), g_depths.get(), g_factors.get(), g_compensations.get()},
-                         {means.get(), quats.get(), scales.get(), viewmats.get(), intrinsics.get()}, partials.lent(),
-                         nullptr);
+                         {means.get(), quats.get(), scales.get(), card.with_cameras ? viewmats.get() : nullptr,
+                          card.with_cameras ? intrinsics.get() : nullptr},
+                         partials.lent(), nullptr);
   d.g_means = means.values(), d.g_quats = quats.values(), d.g_scales = scales.values();
-  d.g_viewmats = viewmats.values(), d.g_intrinsics = intrinsics.values();
+  if (card.with_cameras) d.g_viewmats = viewmats.values(), d.g_intrinsics = intrinsics.values();
   if (s.channels == 3) harmonics_backward_on_card(card, d);
 }
 
 // Everything that `draw` computes on the CPU.
-inline Drawn<float> draw_on_card(const Scene& s, const Cotangents* cotangents) {
-  OnCard card(s);
+inline Drawn<float> draw_on_card(OnCard& card, const Cotangents* cotangents) {
   Drawn<float> d;
   project_on_card(card, d);
   CardSplats held(d);
@@ -188,6 +193,11 @@ inline Drawn<float> draw_on_card(const Scene& s, const Cotangents* cotangents) {
   backward_on_card(card, splats, lists.entries(), *cotangents, d);
   for (const Tally tally : kTallies) draw_on_card(card, splats, lists.entries(), tally, d);
   return d;
+}
+
+inline Drawn<float> draw_on_card(const Scene& s, const Cotangents* cotangents) {
+  OnCard card(s);
+  return draw_on_card(card, cotangents);
 }
 
 }  // namespace check

@@ -121,6 +121,47 @@ void test_thresholds() {
   expect(largest < 2.0 / 255, "with thresholds no pixel is further off than what is not drawn");
   expect(std::any_of(card.stop.begin(), card.stop.end(), [](int32_t stop) { return stop < 1000; }),
          "some pixels are full");
+  const std::vector<int32_t> radii = draw<float>(s, 1).radii;  // rounded up, so that one pixel may go either way
+  bool near = true;
+  for (size_t i = 0; i < radii.size(); ++i) near &= std::abs(radii[i] - card.radii[i]) <= 1;
+  expect(near, "extents with thresholds");
+}
+
+// Gradients with pixels that are full before the last Gaussian, with whole tiles that are, and with a least alpha. Rounding hardly
+// ever decides on which side of a threshold a pixel falls, but it may in the last of them.
+void test_gradients_with_thresholds() {
+  Scene pixels = random_scene(60, 37, 19, 3, 0.2);
+  pixels.transmittance_min = 0.05;
+  compare("full pixels", pixels);
+  for (int channels : {3, 7}) {
+    Scene tiles = random_scene(300, 20, 18, channels, 100);
+    tiles.transmittance_min = 1e-4, tiles.opacities.assign(tiles.n, 0.5);
+    compare("full tiles, D=" + std::to_string(channels), tiles);
+  }
+  Scene faint = random_scene(60, 37, 19, 3, 0.2);
+  faint.alpha_min = 0.05;
+  compare("a least alpha", faint, {1e-3, 5e-3});
+}
+
+// Without gradients of cameras, probe and background.
+void test_parts() {
+  const Scene s = random_scene(70, 37, 19, 3, 0.2);
+  const Cotangents cotangents = random_cotangents(s);
+  const Drawn<float> all = draw_on_card(s, &cotangents);
+  OnCard card(s);
+  card.with_cameras = false, card.with_probe = false;
+  Drawn<float> some = draw_on_card(card, &cotangents);
+  expect(some.probe.empty() && some.g_viewmats.empty() && some.g_centers.empty(), "nothing that was not asked for");
+  some.probe = all.probe, some.g_viewmats = all.g_viewmats, some.g_intrinsics = all.g_intrinsics;
+  some.g_centers = all.g_centers;
+  expect_same_drawing("without cameras and probe", some, all);
+
+  Scene black = s;
+  black.background.assign(black.background.size(), 0);
+  const Drawn<float> on_black = draw_on_card(black, &cotangents);
+  OnCard none(black);
+  none.with_background = false;
+  expect_same_drawing("without a background", draw_on_card(none, &cotangents), on_black);
 }
 
 // Every order of blocks and threads gives the same bytes, with and without pixels that are full before the end.
@@ -200,6 +241,9 @@ void test_extremes() {
   changed("scales 1e-12", plain(scaled(1e-12)));
   changed("scales 1e-12, antialiased", scaled(1e-12));
   changed("scales 0", plain(scaled(0)));
+  changed("dark colours", [](Scene& s) {  // a third of them clamped to zero
+    for (double& x : s.sh) x = static_cast<float>(x * 20);
+  });
   changed("scales 1e12", scaled(1e12));
   changed("needles", plain([](Scene& s) {
             for (int64_t i = 0; i < s.n; ++i)
@@ -245,6 +289,8 @@ int main() {
     compare("D=" + std::to_string(channels), random_scene(40, 37, 19, channels, 0.2));
   test_all_lists();
   test_thresholds();
+  test_gradients_with_thresholds();
+  test_parts();
   test_orders();
   test_limit_of_entries();
   test_nothing_to_draw();

@@ -130,7 +130,7 @@ def test_cuda_kernels_in_cpp(tmp_path: Path) -> None:
     kernels = [tmp_path / f"{source.name}.o" for source in sources]
     for source, to in zip(sources, kernels, strict=True):
         subprocess.run([*command, "-x", "c++", "-c", str(source), "-o", str(to)], check=True, timeout=300)
-    for name, objects in (("test_cuda_emulator", []), ("test_cuda_render", kernels)):
+    for name, objects in (("test_cuda_emulator", []), ("test_cuda_render", kernels), ("test_cuda_train", kernels)):
         program = tmp_path / name
         needed = [str(ROOT / f"csrc/tests/{name}.cpp"), *map(str, objects)]
         subprocess.run([*command, *needed, "-o", str(program)], check=True, timeout=300)
