@@ -53,7 +53,7 @@ void expect_close(const std::string& what, const std::vector<A>& got, const std:
   double error = 0, largest = 0;
   for (size_t i = 0; i < got.size(); ++i) {
     const double difference = std::abs(static_cast<double>(got[i]) - static_cast<double>(wanted[i]));
-    if (!(difference <= error)) error = difference;
+    if (!std::isnan(error) && !(difference <= error)) error = difference;  // NaN stays
     largest = std::max(largest, std::abs(static_cast<double>(wanted[i])));
   }
   if (got.size() == wanted.size() && largest > 0 && error <= tolerance * largest) return;
