@@ -187,12 +187,10 @@ __device__ bool beside_flag(const TilePixels& tile, const int32_t* flags) {
 
 template <bool kSsim>
 __global__ void __launch_bounds__(kThreads)
-    gradient_kernel(LossInput in, SsimKernel<float> kernel, const float* maps, const TileSums* total,
-                    const int32_t* flags, float* gradient) {
+    gradient_kernel(LossInput in, SsimKernel<float> kernel, const float* maps, const TileSums* total, float* gradient) {
   DYNGS_SHARED(float, window, kMaps * kWindow * kWindow);
   DYNGS_SHARED(float, rows, kMaps * kWindow * kSide);
   const TilePixels tile = place(in);
-  if (kSsim && beside_flag(tile, flags)) return;
   const int thread = static_cast<int>(threadIdx.x);
   const int64_t pixel = pixel_at(in, tile.x0 + thread % kSide, tile.y0 + thread / kSide);
   const TileSums sums = global(total)[0];
@@ -322,9 +320,8 @@ void l1_ssim_loss(const LossInput& in, double* loss, float* gradient, const Lent
          b.total, loss);
   if (gradient == nullptr) return;
   launch("gradient", {tiles, kThreads}, stream, ssim ? gradient_kernel<true> : gradient_kernel<false>, in, kernel,
-         static_cast<const float*>(b.maps), static_cast<const TileSums*>(b.total), static_cast<const int32_t*>(b.flags),
-         gradient);
-  if (ssim)
+         static_cast<const float*>(b.maps), static_cast<const TileSums*>(b.total), gradient);
+  if (ssim)  // overwrites some of it
     launch("fine_gradient", {tiles, kThreads}, stream, fine_gradient_kernel, in, fine_kernel,
            static_cast<const int32_t*>(b.flags), static_cast<const TileSums*>(b.total), gradient);
 }

@@ -1,5 +1,6 @@
-// The CUDA kernels from Gaussians to pictures and back, run by the emulation of cuda_on_cpu.hpp with all its checks: against the
-// CPU's kernels in float64 and float32, and bit by bit against themselves under other orders of blocks and threads.
+// The CUDA kernels from Gaussians to pictures and back, run by the emulation of cuda_on_cpu.hpp with all its checks, or on a card
+// (tests/card.hpp): against the CPU's kernels in float64 and float32, and bit by bit against themselves under other orders of
+// blocks and threads.
 #include <functional>
 
 #include "tests/scene_on_card.hpp"
@@ -7,7 +8,6 @@
 namespace {
 
 using namespace check;
-using Order = cuda::emulated::Schedule::Order;
 
 // The same tiles and the same order as the CPU's lists. Slots are numbers of places: contiguous for each splat, each once.
 void expect_same_lists(const std::string& what, const Binning& card, const Binning& cpu) {
@@ -121,10 +121,15 @@ void test_thresholds() {
   expect(largest < 2.0 / 255, "with thresholds no pixel is further off than what is not drawn");
   expect(std::any_of(card.stop.begin(), card.stop.end(), [](int32_t stop) { return stop < 1000; }),
          "some pixels are full");
-  const std::vector<int32_t> radii = draw<float>(s, 1).radii;  // rounded up, so that one pixel may go either way
-  bool near = true;
-  for (size_t i = 0; i < radii.size(); ++i) near &= std::abs(radii[i] - card.radii[i]) <= 1;
-  expect(near, "extents with thresholds");
+}
+
+// Of Gaussians hardly wider than the low-pass, whose compensation decides how far they are seen.
+void test_extents() {
+  const Scene s = with_thresholds(random_scene(200, 61, 50, 3, 0.01));
+  const std::vector<int32_t> card = draw_on_card(s, nullptr).radii, cpu = draw<float>(s, 1).radii;
+  int64_t differ = 0;
+  for (size_t i = 0; i < cpu.size(); ++i) differ += card[i] != cpu[i] ? 1 : 0;
+  expect(differ <= 4, std::to_string(differ) + " extents differ");  // they are rounded up
 }
 
 // Gradients with pixels that are full before the last Gaussian, with whole tiles that are, and with a least alpha. Rounding hardly
@@ -169,12 +174,7 @@ void test_orders() {
   const Scene s = with_thresholds(random_scene(150, 41, 35, 3, 0.3));
   const Cotangents cotangents = random_cotangents(s);
   const Drawn<float> forward = draw_on_card(s, &cotangents);
-  for (const auto& [order, seed] : {std::pair{Order::kReversed, 0u}, {Order::kShuffled, 1u}, {Order::kShuffled, 2u}}) {
-    machine.schedule = {order, seed};
-    expect_same_drawing("order " + std::to_string(static_cast<int>(order)) + ", seed " + std::to_string(seed), forward,
-                        draw_on_card(s, &cotangents));
-  }
-  machine.schedule = {};
+  in_other_orders([&] { expect_same_drawing("in another order", forward, draw_on_card(s, &cotangents)); });
 }
 
 void test_all_lists() {
@@ -191,6 +191,17 @@ void test_all_lists() {
   test_lists("more than 65536 tiles", with_thresholds(random_scene(8, 4099, 4200, 3, 0.0002)));
   test_lists("a picture of one pixel", random_scene(5, 1, 1, 3, 0.5));
 }
+
+#if !defined(DYNGS_ON_CARD)
+// The host waits for the card once per picture, for the number of entries.
+void test_host_reads() {
+  const Scene s = random_scene(20, 37, 29, 3, 0.3);
+  const Cotangents cotangents = random_cotangents(s);
+  const int64_t before = cuda::emulated::machine.host_reads;
+  draw_on_card(s, &cotangents);
+  expect(cuda::emulated::machine.host_reads == before + 1, "one number is read back");
+}
+#endif
 
 void test_limit_of_entries() {
   const Scene s = random_scene(20, 37, 29, 3, 0.3);
@@ -285,13 +296,18 @@ void test_extremes() {
 }  // namespace
 
 int main() {
+  skip_without_card();
   for (int channels : {1, 3, 4, 7, 13, kMaxChannels})
     compare("D=" + std::to_string(channels), random_scene(40, 37, 19, channels, 0.2));
   test_all_lists();
   test_thresholds();
+  test_extents();
   test_gradients_with_thresholds();
   test_parts();
   test_orders();
+#if !defined(DYNGS_ON_CARD)
+  test_host_reads();
+#endif
   test_limit_of_entries();
   test_nothing_to_draw();
   test_extremes();

@@ -1,27 +1,14 @@
-// The CUDA kernels of the loss and of the optimiser, run by the emulation of cuda_on_cpu.hpp with all its checks: against the CPU's,
-// and bit by bit against themselves under other orders of blocks and threads.
+// The CUDA kernels of the loss and of the optimiser, run by the emulation of cuda_on_cpu.hpp with all its checks, or on a card
+// (tests/card.hpp): against the CPU's, and bit by bit against themselves under other orders of blocks and threads.
 #include <limits>
 
-#include "cuda/api.hpp"
-#include "cuda/device.hpp"
+#include "tests/card.hpp"
 #include "tests/check.hpp"
 
 namespace {
 
 using namespace dyngs;
 using namespace check;
-using cuda::emulated::machine;
-using cuda::emulated::Memory;
-using Order = cuda::emulated::Schedule::Order;
-
-template <class Run>
-void in_every_order(const Run& run) {
-  for (const auto& [order, seed] : {std::pair{Order::kReversed, 0u}, {Order::kShuffled, 1u}, {Order::kShuffled, 2u}}) {
-    machine.schedule = {order, seed};
-    run();
-  }
-  machine.schedule = {};
-}
 
 // A picture, its target and a mask, or none.
 struct Pictures {
@@ -70,7 +57,7 @@ void test_loss(const std::string& name, const Pictures& p, float ssim_weight) {
   expect_close("loss, " + what, Values{card.value}, Values{cpu.value}, 2e-6);
   expect_close("gradient of the loss, " + what, card.gradient, cpu.gradient, 2e-5);
   expect(loss_on_card(p, ssim_weight, false).value == card.value, "the loss without its gradient, " + what);
-  in_every_order([&] {
+  in_other_orders([&] {
     const Loss again = loss_on_card(p, ssim_weight);
     expect(again.value == card.value, "the loss in another order, " + what);
     expect_same_bits("gradient in another order, " + what, again.gradient, card.gradient);
@@ -83,6 +70,9 @@ void test_bright_pictures() {
   Pictures spot = random_pictures(40, 50, false);
   spot.rendered[3 * (17 * 50 + 15) + 1] = 1e30f;
   test_loss("one pixel of 1e30", spot, 0.2f);
+  Pictures spots = random_pictures(40, 50, false);  // the gradient reaches tiles that are themselves precise in float32
+  spots.rendered[3 * (8 * 50 + 8)] = spots.rendered[3 * (24 * 50 + 40) + 2] = 1e30f;
+  test_loss("two pixels of 1e30", spots, 0.2f);
   Pictures beside = random_pictures(33, 49, false);  // the bright pixel's window reaches four tiles
   beside.rendered[3 * (15 * 49 + 16)] = 300;
   test_loss("one pixel of 300", beside, 0.5f);
@@ -114,7 +104,7 @@ AdamCase adam_case(int64_t rows, int64_t size, double share) {
   AdamCase c{rows, size, as<float>(uniforms(rows * size, -1, 1)), as<float>(uniforms(size, 1e-3, 1e-2)), {}, {}};
   for (int step = 0; step < 3; ++step) c.grads.push_back(as<float>(uniforms(rows * size, -1, 1)));
   c.grads[1][rows / 2 * size] = std::numeric_limits<float>::quiet_NaN();
-  c.grads[2][rows * size - 1] = 1e19f;
+  c.grads[2][size - 1] = 1e19f, c.grads[0][size - 1] = 9e18f;  // 2^63 lies between them
   c.grads[2][(rows - 1) * size] = -std::numeric_limits<float>::infinity();
   for (int64_t r = 0; share < 1 && r < rows; ++r) c.asked.push_back(uniform(0, 1) < share ? 1 : 0);
   return c;
@@ -155,7 +145,7 @@ void test_adam(int64_t rows, int64_t size, double share) {
   expect_close("first moment " + what, card.first, cpu.first, 1e-6);
   expect_close("second moment " + what, card.second, cpu.second, 1e-6);
   expect(card.skipped == cpu.skipped, "rows left out " + what);
-  in_every_order([&] {
+  in_other_orders([&] {
     const Trained again = adam_on_card(c);
     expect_same_bits("Adam in another order " + what, again.param, card.param);
     expect(again.skipped == card.skipped, "rows left out in another order " + what);
@@ -188,11 +178,13 @@ void test_finite() {
 }  // namespace
 
 int main() {
+  skip_without_card();
   for (const float ssim_weight : {0.f, 0.2f, 1.f}) {
     test_loss("plain", random_pictures(1, 1, false), ssim_weight);
     test_loss("plain", random_pictures(20, 40, false), ssim_weight);
     test_loss("masked", random_pictures(33, 19, true), ssim_weight);
   }
+  test_loss("many tiles", random_pictures(260, 271, true), 0);
   test_bright_pictures();
   test_empty_mask();
   for (const double share : {1.0, 0.5, 0.1})
