@@ -58,6 +58,18 @@ int64_t rasterize_backward_workspace(int64_t num_entries, int channels, bool abs
 void rasterize_backward(const Splats<float>& splats, const Entries& entries, const ImageGrads<float>& image,
                         const SplatGrads<float>& out, const Lent& workspace, Stream stream);
 
+// Moving Gaussians ----------------------------------------------------------------------------------------------------
+
+int64_t skinning_forward_workspace(int64_t num_nodes);
+void skinning_forward(const SkinNodes<float>& nodes, const SkinPoints<float>& points, const Skinned<float>& out,
+                      const Lent& workspace, Stream stream);
+int64_t skinning_backward_workspace(int64_t num_nodes, int64_t num_points, int64_t nodes_per_point);
+void skinning_backward(const SkinNodes<float>& nodes, const SkinPoints<float>& points, const Skinned<const float>& g,
+                       const SkinGrads<float>& grads, const Lent& workspace, Stream stream);
+
+void add_offsets(const RowOffsets<float>& offsets, const MovedGaussians<float>& gaussians, Stream stream);
+void shading_inputs(const Shading<float>& in, float* out, Stream stream);
+
 // Training ------------------------------------------------------------------------------------------------------------
 
 int64_t l1_ssim_loss_workspace(int64_t height, int64_t width);

@@ -11,7 +11,6 @@
 // Limits, H100 (3.35 TB/s, 67 TFLOP/s). Per splat 72 bytes for two walks and about 60 operations per tile row: bound by memory,
 // 22 ps; per entry 8 bytes emitted, 8 + 4 + 4 gathered at the end, beside the partition (sort.cu): 7 ps and 12. The entry
 // count is read back once, because the caller allocates the lists.
-#include <bit>
 #include <limits>
 
 #include "cuda/api.hpp"
@@ -168,22 +167,13 @@ __global__ void __launch_bounds__(kThreads)
   global(slot_ranges)[2 * row + 1] = begin < end ? end : 0;
 }
 
-// Entry i gets its splat, tile i the place of its first entry: the first whose tile is not below it.
+// Entry i gets its splat, tile i the place of its first entry.
 __global__ void __launch_bounds__(kThreads)
     finish_kernel(const uint32_t* tiles, const int32_t* rows, int64_t num_entries, int64_t num_tiles, EntryArrays out) {
   const int64_t i = int64_t{blockIdx.x} * kThreads + threadIdx.x;
   if (i < num_entries) global(out.gaussians)[i] = static_cast<int32_t>(global(rows)[global(out.slots)[i]]);
   if (i > num_tiles) return;
-  int64_t lo = 0, hi = num_entries;
-  while (lo < hi) {
-    const int64_t middle = (lo + hi) / 2;
-    if (static_cast<int64_t>(static_cast<uint32_t>(global(tiles)[middle])) < i) {
-      lo = middle + 1;
-    } else {
-      hi = middle;
-    }
-  }
-  global(out.tile_offsets)[i] = lo;
+  global(out.tile_offsets)[i] = first_of(tiles, num_entries, i);
 }
 
 // What bin_count leaves for bin_emit, and what it needs besides.
@@ -259,8 +249,7 @@ void bin_emit(const Splats<float>& s, int64_t num_entries, const Lent& counted, 
   const int64_t splats = s.num_views * s.num_gaussians, tiles = s.num_views * grid.tiles();
   const EmitBuffers buffers(Workspace(workspace.memory, workspace.bytes), num_entries);
   // The passes end in out.slots.
-  const int bits =
-      std::max(1, static_cast<int>(std::bit_width(static_cast<uint64_t>(std::max<int64_t>(tiles, 1) - 1))));
+  const int bits = bits_for(tiles);
   const bool even = passes_for(bits) % 2 == 0;
   const Pairs from{buffers.tiles, even ? out.slots : buffers.other_slots};
   const Pairs other{buffers.other_tiles, even ? buffers.other_slots : out.slots};

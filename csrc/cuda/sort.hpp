@@ -2,6 +2,9 @@
 // of launches, and the only atomics count.
 #pragma once
 
+#include <algorithm>
+#include <bit>
+
 #include "cuda/device.hpp"
 
 namespace dyngs::cuda {
@@ -30,11 +33,28 @@ struct Pairs {
 
 // Eight bits of the key are sorted in one pass.
 inline constexpr int kRadixBits = 8;
+inline int bits_for(int64_t keys) {  // of the largest of so many keys
+  return std::max(1, static_cast<int>(std::bit_width(static_cast<uint64_t>(std::max<int64_t>(keys, 1) - 1))));
+}
 inline int passes_for(int bits) { return (bits + kRadixBits - 1) / kRadixBits; }
 
 // Sorts by the lowest `bits` bits, ties in the order they came. Passes go to and fro between `from` and `other`; the result
 // lies in `from` after an even number of them, else in `other`.
 void stable_sort(const Pairs& from, const Pairs& other, int64_t count, int bits, const SortScratch& scratch,
                  Stream stream);
+
+// The place of the first key that is not below `key`.
+__device__ inline int64_t first_of(const uint32_t* keys, int64_t count, int64_t key) {
+  int64_t lo = 0, hi = count;
+  while (lo < hi) {
+    const int64_t middle = (lo + hi) / 2;
+    if (static_cast<int64_t>(static_cast<uint32_t>(global(keys)[middle])) < key) {
+      lo = middle + 1;
+    } else {
+      hi = middle;
+    }
+  }
+  return lo;
+}
 
 }  // namespace dyngs::cuda
