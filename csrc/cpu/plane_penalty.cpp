@@ -22,9 +22,7 @@ struct Plane {
   const S* values;
   S* grad;  // or nullptr
   int64_t rows, columns, channels;
-  double by_rows;     // of the sum of squared differences from row to row
-  double by_columns;  // and from column to column
-  double one;         // of the sum of |1 - p|
+  PenaltyFactors factors;
 
   int64_t row_size() const { return columns * channels; }
 };
@@ -124,7 +122,8 @@ int64_t room_for(const Plane<S>& plane) {
 template <class S>
 double band_penalty(const Plane<S>& plane, int64_t begin, int64_t end, S* room) {
   const int64_t n = plane.row_size(), channels = plane.channels;
-  const S by_rows = static_cast<S>(2 * plane.by_rows), by_columns = static_cast<S>(2 * plane.by_columns);
+  const S by_rows = static_cast<S>(2 * plane.factors.by_rows),
+          by_columns = static_cast<S>(2 * plane.factors.by_columns);
   RowDifferences<S> down{plane, room};
   S* across = room + 3 * n + channels;  // differences along the row, with a zero before and after
   std::fill(across - channels, across + n + channels, S(0));
@@ -140,17 +139,14 @@ double band_penalty(const Plane<S>& plane, int64_t begin, int64_t end, S* room) 
       down.compute(row + 1);
     }
     if (to) gradient_row<false>(down.at(row - 1), down.at(row), down.at(row + 1), by_rows, to, n);
-    if (plane.by_columns != 0 && plane.columns >= 3) {
+    if (plane.factors.by_columns != 0 && plane.columns >= 3) {
       columns_sum += differences(p, p + channels, p + 2 * channels, across + channels, n - 2 * channels);
       if (to) gradient_row<true>(across - channels, across, across + channels, by_columns, to, n);
     }
-    if (plane.one != 0) one_sum += distance_from_one(p, static_cast<S>(plane.one), to, n);
+    if (plane.factors.one != 0) one_sum += distance_from_one(p, static_cast<S>(plane.factors.one), to, n);
   }
-  return plane.by_rows * rows_sum + plane.by_columns * columns_sum + plane.one * one_sum;
+  return plane.factors.by_rows * rows_sum + plane.factors.by_columns * columns_sum + plane.factors.one * one_sum;
 }
-
-// The factor that turns a sum of `count` numbers into weight times their mean; 0 if there are none.
-double mean_factor(double weight, int64_t count) { return count > 0 ? weight / static_cast<double>(count) : 0; }
 
 template <class S>
 std::vector<Plane<S>> all_planes(const HexPlane<S>& hexplane, const PenaltyWeights& weights,
@@ -160,14 +156,13 @@ std::vector<Plane<S>> all_planes(const HexPlane<S>& hexplane, const PenaltyWeigh
   for (size_t l = 0; l < hexplane.levels.size(); ++l) {
     const auto& level = hexplane.levels[l];
     const int64_t row = level.size * channels, space_size = level.size * row, time_size = level.times * row;
-    const double square = mean_factor(weights.space / 2, std::max<int64_t>(level.size - 2, 0) * row);
-    const double along_time = mean_factor(weights.time, std::max<int64_t>(level.times - 2, 0) * row);
+    const PenaltyFactors of_space = space_factors(weights.space, level.size, channels);
+    const PenaltyFactors of_time = time_factors(weights.time, weights.one, level.times, level.size, channels);
     for (int p = 0; p < kAxes; ++p) {
       S* g_space = grads.empty() ? nullptr : grads[l].space + p * space_size;
       S* g_time = grads.empty() ? nullptr : grads[l].time + p * time_size;
-      planes.push_back({level.space + p * space_size, g_space, level.size, level.size, channels, square, square, 0});
-      planes.push_back({level.time + p * time_size, g_time, level.times, level.size, channels, along_time, 0,
-                        mean_factor(weights.one, time_size)});
+      planes.push_back({level.space + p * space_size, g_space, level.size, level.size, channels, of_space});
+      planes.push_back({level.time + p * time_size, g_time, level.times, level.size, channels, of_time});
     }
   }
   return planes;

@@ -58,6 +58,21 @@ int64_t rasterize_backward_workspace(int64_t num_entries, int channels, bool abs
 void rasterize_backward(const Splats<float>& splats, const Entries& entries, const ImageGrads<float>& image,
                         const SplatGrads<float>& out, const Lent& workspace, Stream stream);
 
+// Factored space-time grids -------------------------------------------------------------------------------------------
+
+// `levels` of HexPlane and `grads` are arrays of the host with pointers to the card's memory. No order of the points is needed.
+int64_t hexplane_forward_workspace(const HexPlane<float>& planes);
+void hexplane_forward(const HexPlane<float>& planes, const PlanePoints<float>& points, float* features,
+                      const Lent& workspace, Stream stream);
+int64_t hexplane_backward_workspace(const HexPlane<float>& planes, int64_t num_points);
+void hexplane_backward(const HexPlane<float>& planes, const PlanePoints<float>& points, const float* g_features,
+                       std::span<const PlaneGrads<float>> grads, float* g_coords, const Lent& workspace, Stream stream);
+
+int64_t plane_penalty_workspace(const HexPlane<float>& planes);
+// Writes the penalty to `penalty` (one double on the card).
+void plane_penalty(const HexPlane<float>& planes, const PenaltyWeights& weights,
+                   std::span<const PlaneGrads<float>> grads, double* penalty, const Lent& workspace, Stream stream);
+
 // Moving Gaussians ----------------------------------------------------------------------------------------------------
 
 int64_t skinning_forward_workspace(int64_t num_nodes);

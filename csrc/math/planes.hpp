@@ -106,6 +106,28 @@ DYNGS_HD void coordinate_vjp(const PlaneValue<V> (&plane)[3], const V (&by_line)
   g[2] = dot3(g_plane[1], plane[1].by_slow, g_plane[2], plane[2].by_slow, g_line[2], by_line[2]);
 }
 
+// The factors of a plane's three sums: of squared second differences from row to row, and from column to column, and of |p - 1|.
+struct PenaltyFactors {
+  double by_rows, by_columns, one;
+};
+
+// Turns a sum of `count` numbers into weight times their mean; 0 if there are none.
+DYNGS_HD inline double mean_factor(double weight, int64_t count) {
+  return count > 0 ? weight / static_cast<double>(count) : 0;
+}
+
+// Of a plane over space (size, size, C): the mean over both axes.
+DYNGS_HD inline PenaltyFactors space_factors(double weight, int64_t size, int64_t channels) {
+  const double square = mean_factor(weight / 2, (size > 2 ? size - 2 : 0) * size * channels);
+  return {square, square, 0};
+}
+
+// Of a plane over time (times, size, C): along time, and the distance from one.
+DYNGS_HD inline PenaltyFactors time_factors(double weight, double one, int64_t times, int64_t size, int64_t channels) {
+  const int64_t row = size * channels;
+  return {mean_factor(weight, (times > 2 ? times - 2 : 0) * row), 0, mean_factor(one, times * row)};
+}
+
 // The penalties: d_i = p_(i-1) - 2 p_i + p_(i+1), squared, and |p - 1|.
 template <class R>
 DYNGS_HD R second_difference(R a, R b, R c) {

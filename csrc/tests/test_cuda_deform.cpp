@@ -1,6 +1,7 @@
 // The CUDA kernels of moving Gaussians, run by the emulation of cuda_on_cpu.hpp with all its checks, or on a card
 // (tests/card.hpp): against the CPU's in float64, and bit by bit against themselves under other orders of blocks and threads.
-#include <limits>
+#include <memory>
+#include <utility>
 
 #include "tests/card.hpp"
 #include "tests/check.hpp"
@@ -113,6 +114,172 @@ void test_far_points() {
   expect(alike, "far points follow all nodes alike");
 }
 
+// Planes --------------------------------------------------------------------------------------------------------------
+
+struct PlaneCase {
+  int64_t channels, points;
+  double time;
+  std::vector<std::pair<int64_t, int64_t>> sizes;  // size and times of each level
+  std::vector<Values> space, lines;
+  Values coords, g_features;
+};
+
+PlaneCase plane_case(int64_t channels, int64_t points, double time, std::vector<std::pair<int64_t, int64_t>> sizes) {
+  PlaneCase c{channels, points, time, std::move(sizes), {}, {}, uniforms(3 * points, -1.2, 1.2), {}};
+  for (const auto& [size, times] : c.sizes) {
+    c.space.push_back(uniforms(3 * size * size * channels, 0.5, 1.5));
+    c.lines.push_back(uniforms(3 * times * size * channels, 0.5, 1.5));
+  }
+  c.g_features = uniforms(points * channels * static_cast<int64_t>(c.sizes.size()), -1, 1);
+  return c;
+}
+
+template <class S>
+struct PlaneResults {
+  std::vector<S> features, g_coords;
+  std::vector<std::vector<S>> g_space, g_time;
+};
+
+PlaneResults<double> planes_on_cpu(const PlaneCase& c) {
+  PlaneResults<double> r;
+  std::vector<PlaneLevel<double>> levels;
+  std::vector<PlaneGrads<double>> grads;
+  for (size_t l = 0; l < c.sizes.size(); ++l)
+    r.g_space.emplace_back(c.space[l].size()), r.g_time.emplace_back(c.lines[l].size());
+  for (size_t l = 0; l < c.sizes.size(); ++l) {
+    levels.push_back({c.space[l].data(), c.lines[l].data(), c.sizes[l].first, c.sizes[l].second});
+    grads.push_back({r.g_space[l].data(), r.g_time[l].data()});
+  }
+  std::vector<int32_t> order(c.points);
+  r.features.resize(c.g_features.size()), r.g_coords.resize(c.coords.size());
+  const HexPlane<double> planes{levels, c.channels, c.time};
+  const PlanePoints<double> points{c.coords.data(), c.points};
+  hexplane_forward(planes, points, r.features.data(), order.data(), 1);
+  hexplane_backward<double>(planes, points, order.data(), c.g_features.data(), grads, r.g_coords.data(), 1);
+  return r;
+}
+
+PlaneResults<float> planes_on_card(const PlaneCase& c, bool with_coords = true) {
+  std::vector<std::unique_ptr<Memory<float>>> arrays;
+  const auto hold = [&arrays](auto&&... arguments) {
+    arrays.push_back(std::make_unique<Memory<float>>(arguments...));
+    return arrays.back()->get();
+  };
+  std::vector<PlaneLevel<float>> levels;
+  std::vector<PlaneGrads<float>> grads;
+  for (size_t l = 0; l < c.sizes.size(); ++l) {
+    levels.push_back({hold(as<float>(c.space[l])), hold(as<float>(c.lines[l])), c.sizes[l].first, c.sizes[l].second});
+    float* g_space = hold(static_cast<int64_t>(c.space[l].size()));
+    grads.push_back({g_space, hold(static_cast<int64_t>(c.lines[l].size()))});
+  }
+  const HexPlane<float> planes{levels, c.channels, c.time};
+  Memory<float> coords(as<float>(c.coords), "coords"), g_features(as<float>(c.g_features), "g_features");
+  Memory<float> features(g_features.count()), g_coords(coords.count());
+  Memory<char> forward(cuda::hexplane_forward_workspace(planes));
+  Memory<char> backward(cuda::hexplane_backward_workspace(planes, c.points));
+  const PlanePoints<float> points{coords.get(), c.points};
+  cuda::hexplane_forward(planes, points, features.get(), {forward.get(), forward.count()}, nullptr);
+  cuda::hexplane_backward(planes, points, g_features.get(), grads, with_coords ? g_coords.get() : nullptr,
+                          {backward.get(), backward.count()}, nullptr);
+  PlaneResults<float> r{features.values(), g_coords.values(), {}, {}};
+  for (size_t l = 0; l < c.sizes.size(); ++l)
+    r.g_space.push_back(arrays[4 * l + 2]->values()), r.g_time.push_back(arrays[4 * l + 3]->values());
+  return r;
+}
+
+void test_planes(const std::string& what, const PlaneCase& c) {
+  const PlaneResults<float> card = planes_on_card(c);
+  const PlaneResults<double> cpu = planes_on_cpu(c);
+  expect_close("features, " + what, card.features, cpu.features, 2e-6);
+  expect_close("gradient by coordinates, " + what, card.g_coords, cpu.g_coords, 1e-5);
+  for (size_t l = 0; l < c.sizes.size(); ++l) {
+    expect_close("gradient by planes over space, " + what, card.g_space[l], cpu.g_space[l], 1e-5);
+    expect_close("gradient by planes over time, " + what, card.g_time[l], cpu.g_time[l], 1e-5);
+  }
+  const auto expect_same = [&](const PlaneResults<float>& again) {
+    expect_same_bits("features again, " + what, again.features, card.features);
+    for (size_t l = 0; l < c.sizes.size(); ++l) {
+      expect_same_bits("gradient by planes over space again, " + what, again.g_space[l], card.g_space[l]);
+      expect_same_bits("gradient by planes over time again, " + what, again.g_time[l], card.g_time[l]);
+    }
+  };
+  in_other_orders([&] { expect_same(planes_on_card(c)); });
+  expect_same(planes_on_card(c, false));
+}
+
+void test_no_points() {
+  const PlaneCase c = plane_case(2, 0, 0.5, {{3, 2}});
+  const PlaneResults<float> card = planes_on_card(c);
+  const auto is_zero = [](float x) { return x == 0; };
+  expect(std::all_of(card.g_space[0].begin(), card.g_space[0].end(), is_zero) &&
+             std::all_of(card.g_time[0].begin(), card.g_time[0].end(), is_zero),
+         "no points, no gradients");
+}
+
+struct Penalty {
+  double value;
+  std::vector<Values> g_space, g_time;
+};
+
+constexpr PenaltyWeights kWeights{0.3, 0.2, 0.1};
+
+Penalty penalty_on_cpu(const PlaneCase& c) {
+  Penalty r{0, {}, {}};
+  std::vector<PlaneLevel<double>> levels;
+  std::vector<PlaneGrads<double>> grads;
+  for (size_t l = 0; l < c.sizes.size(); ++l)
+    r.g_space.emplace_back(c.space[l].size()), r.g_time.emplace_back(c.lines[l].size());
+  for (size_t l = 0; l < c.sizes.size(); ++l) {
+    levels.push_back({c.space[l].data(), c.lines[l].data(), c.sizes[l].first, c.sizes[l].second});
+    grads.push_back({r.g_space[l].data(), r.g_time[l].data()});
+  }
+  r.value = plane_penalty<double>({levels, c.channels, c.time}, kWeights, grads, 1);
+  return r;
+}
+
+// Without gradients, `space` and `time` of the result are empty.
+Penalty penalty_on_card(const PlaneCase& c, bool with_gradients) {
+  std::vector<std::unique_ptr<Memory<float>>> arrays;
+  const auto hold = [&arrays](auto&&... arguments) {
+    arrays.push_back(std::make_unique<Memory<float>>(arguments...));
+    return arrays.back()->get();
+  };
+  std::vector<PlaneLevel<float>> levels;
+  std::vector<PlaneGrads<float>> grads;
+  for (size_t l = 0; l < c.sizes.size(); ++l) {
+    levels.push_back({hold(as<float>(c.space[l])), hold(as<float>(c.lines[l])), c.sizes[l].first, c.sizes[l].second});
+    if (!with_gradients) continue;
+    float* g_space = hold(static_cast<int64_t>(c.space[l].size()));
+    grads.push_back({g_space, hold(static_cast<int64_t>(c.lines[l].size()))});
+  }
+  const HexPlane<float> planes{levels, c.channels, c.time};
+  Memory<double> value(1);
+  Memory<char> workspace(cuda::plane_penalty_workspace(planes));
+  cuda::plane_penalty(planes, kWeights, grads, value.get(), {workspace.get(), workspace.count()}, nullptr);
+  Penalty r{value.values()[0], {}, {}};
+  for (size_t l = 0; l < c.sizes.size() && with_gradients; ++l) {
+    r.g_space.push_back(as<double>(arrays[4 * l + 2]->values()));
+    r.g_time.push_back(as<double>(arrays[4 * l + 3]->values()));
+  }
+  return r;
+}
+
+void test_penalty(const PlaneCase& c) {
+  const Penalty card = penalty_on_card(c, true), cpu = penalty_on_cpu(c);
+  const std::string what = "planes of " + std::to_string(c.sizes[0].first);
+  expect_close("penalty, " + what, Values{card.value}, Values{cpu.value}, 2e-6);
+  for (size_t l = 0; l < c.sizes.size(); ++l) {
+    if (c.sizes[l].first > 2)
+      expect_close("gradient of the penalty, space, " + what, card.g_space[l], cpu.g_space[l], 2e-5);
+    expect_close("gradient of the penalty, time, " + what, card.g_time[l], cpu.g_time[l], 2e-5);
+  }
+  expect(penalty_on_card(c, false).value == card.value, "the penalty without its gradient, " + what);
+  in_other_orders([&] {
+    const Penalty again = penalty_on_card(c, true);
+    expect(again.value == card.value && again.g_time == card.g_time, "the penalty in another order, " + what);
+  });
+}
+
 // Offsets -------------------------------------------------------------------------------------------------------------
 
 // Adds offsets to the rows `rows`, or the first ones; `parts`: which offsets there are, bit by bit.
@@ -177,6 +344,11 @@ int main() {
   skip_without_card();
   test_skinning(5, 3, 40, 3), test_skinning(300, 7, 500, 4), test_skinning(2, 0, 300, 1);
   test_far_points();
+  test_planes("two levels", plane_case(5, 150, 0.37, {{7, 4}, {17, 3}}));
+  test_planes("more channels than a warp has lanes", plane_case(40, 60, 1, {{4, 5}}));
+  test_planes("one sample", plane_case(3, 30, 0, {{1, 1}, {2, 2}}));
+  test_no_points();
+  test_penalty(plane_case(5, 1, 0, {{9, 6}, {4, 2}})), test_penalty(plane_case(3, 1, 0, {{2, 1}, {1, 3}}));
   for (const bool picked : {false, true})
     for (const unsigned parts : {0u, 1u, 2u, 4u, 8u, 15u}) test_offsets(picked, parts);
   for (const bool normals : {false, true})
