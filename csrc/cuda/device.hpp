@@ -73,11 +73,6 @@ void launch(const char* name, const LaunchGrid& grid, Stream stream, void (*kern
   check(cudaGetLastError(), name);
 }
 
-// Sets bytes of the device's memory to zero.
-inline void clear(void* memory, int64_t bytes, Stream stream) {
-  check(cudaMemsetAsync(memory, 0, bytes, static_cast<cudaStream_t>(stream)), "clearing memory");
-}
-
 // Copies to the host and waits for it: the only way in which this library synchronises.
 inline void read_back(void* to, const void* from, int64_t bytes, Stream stream) {
   check(cudaMemcpyAsync(to, from, bytes, cudaMemcpyDeviceToHost, static_cast<cudaStream_t>(stream)), "reading back");
@@ -94,12 +89,6 @@ template <class... Parameters, class... Arguments>
 void launch(const char* name, const LaunchGrid& grid, Stream, void (*kernel)(Parameters...),
             const Arguments&... arguments) {
   emulated::machine.run(name, {grid.blocks, grid.threads, grid.shared_bytes}, [&] { kernel(arguments...); });
-}
-
-inline void clear(void* memory, int64_t bytes, Stream) {
-  if (bytes == 0) return;
-  std::memset(memory, 0, bytes);
-  emulated::regions().find(memory)->know_values();
 }
 
 inline void read_back(void* to, const void* from, int64_t bytes, Stream) {

@@ -64,7 +64,7 @@ void expect_close(const std::string& what, const std::vector<A>& got, const std:
 
 template <class T>
 void expect_same_bits(const std::string& what, const std::vector<T>& a, const std::vector<T>& b) {
-  expect(a.size() == b.size() && std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) == 0, what);
+  expect(a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) == 0), what);
 }
 
 // `gradient` is that of `scalar` at x: `count` entries of it, spread over the array, against central differences with

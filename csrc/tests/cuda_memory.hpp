@@ -127,7 +127,6 @@ class Region {
   char* begin() const { return begin_; }
   int64_t bytes() const { return bytes_; }
   void forget_values() { known_.assign(known_.size(), false); }
-  void know_values() { known_.assign(known_.size(), true); }
 
   // The address of `size` bytes at `offset`, after all checks.
   char* access(int64_t offset, int64_t size, int64_t alignment, Shadow::Kind kind) {

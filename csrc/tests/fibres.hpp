@@ -91,8 +91,8 @@ class Fibres {
   Main main_ = nullptr;
   std::vector<Context> contexts_;
   Context caller_;
-  const void* caller_stack_ = nullptr;
-  size_t caller_bytes_ = 0;
+  [[maybe_unused]] const void* caller_stack_ = nullptr;  // for AddressSanitizer
+  [[maybe_unused]] size_t caller_bytes_ = 0;
 
   static void begin() {
 #if defined(DYNGS_ASAN)

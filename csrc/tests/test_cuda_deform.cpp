@@ -318,8 +318,8 @@ void test_shading(bool normals, bool timed, bool posed) {
   const Values means = uniforms(3 * n, -3, 3), quats = uniforms(4 * n, -1, 1), scales = uniforms(3 * n, -3, 0);
   const Values base = uniforms(3 * m, 0, 1), eye = uniforms(3, 4, 5), box = uniforms(6, 1, 2);
   const Values places = uniforms(3 * n, -3, 3), turn{0, -1, 0, 1, 0, 0, 0, 0, 1};
-  std::vector<int64_t> picked;
-  for (int64_t i = 0; i < m; ++i) picked.push_back((37 * i) % n);
+  std::vector<int64_t> picked(m);
+  for (int64_t i = 0; i < m; ++i) picked[i] = (37 * i) % n;
   Shading<double> in{m,          picked.data(), means.data(), quats.data(), scales.data(), base.data(), eye.data(),
                      box.data(), nullptr,       nullptr,      normals,      timed,         0.25,        1};
   if (posed) in.places = places.data(), in.turn = turn.data();
