@@ -3,7 +3,7 @@
 //   Array<T>, global(pointer)                arrays whose accesses the emulation checks; plain pointers for nvcc
 //   atomic_add(array, index, value)
 //   DYNGS_SHARED(T, name, count), DYNGS_DYNAMIC_SHARED(T, name)   arrays in shared memory
-//   launch(name, grid, stream, kernel)(arguments)
+//   launch(name, grid, stream, kernel, arguments...)
 // `auto x = array[i]` would name the place, not the value: write the type.
 #pragma once
 
