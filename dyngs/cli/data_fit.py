@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import data_section
 from dyngs.cli.progress_bar import ProgressBar
+
+if TYPE_CHECKING:
+    from dyngs.human.fit.inputs import KnownAvatar
 
 _GIVEN = ("keypoints", "masks", "background", "joints", "body", "person")
 
@@ -47,7 +51,8 @@ def add_parser(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         "--person",
         type=Path,
         metavar="PATH",
-        help="a fitted capture of the same person, or the run of their avatar: the shape is kept, poses are found",
+        help="a fitted capture of the same person, or the run of their avatar: the shape is kept, poses are found, by "
+        "the avatar's silhouette if there is one",
     )
     parser.add_argument("overrides", nargs="*", default=[], metavar="data.key=value", help="keys of data")
     parser.set_defaults(run=run_fit)
@@ -59,9 +64,24 @@ def run_fit(arguments: argparse.Namespace) -> int:
     from dyngs.human.fit.inputs import FitInputs
 
     options = data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
-    given = FitInputs(**{name: getattr(arguments, name) for name in _GIVEN})
+    given = FitInputs(**{name: getattr(arguments, name) for name in _GIVEN}, avatar=_avatar_in(arguments.person))
     with ProgressBar() as report:
         result = write_fitted_capture(options, arguments.out, report, given)
     print(result.summary())
     print(f"next: dyngs train human data.root={result.root}")
     return 0
+
+
+def _avatar_in(person: Path | None) -> KnownAvatar | None:
+    """Return the avatar of a run, None of anything else."""
+    from dyngs.config.io import RESOLVED_NAME
+
+    if person is None or not (person / RESOLVED_NAME).is_file():
+        return None
+    from dyngs.human.avatar.scene import avatar_of
+    from dyngs.human.fit.inputs import KnownAvatar
+    from dyngs.runs.checkpoint import load_run
+
+    run = load_run(person)
+    scene = avatar_of(run.scene)
+    return None if scene is None else KnownAvatar(scene, run.config.data.longest_side)

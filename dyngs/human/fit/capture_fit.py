@@ -204,15 +204,18 @@ def fit_capture(
     if known.guessed_lens:
         candidate, lens = _with_lens(tried[-1], motion.clip, surface, seen, known.learned, report, effort)
         tried = (*tried, candidate)
-    chosen = tried[-1] if known.guessed_lens else simplest_of_the_best(tried)
+    chosen = tried[-1] if known.guessed_lens else simplest_of_the_best(tried, GAIN if known.shape else GAIN_OF_SHAPE)
     return CaptureFit(body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, not given, lens)
 
 
-def simplest_of_the_best(tried: Sequence[Candidate]) -> Candidate:
-    """Return the candidate after which none is clearly better: ``tried`` is ordered from simple to complex."""
+def simplest_of_the_best(tried: Sequence[Candidate], first_gain: float = GAIN_OF_SHAPE) -> Candidate:
+    """Return the candidate after which none is clearly better: ``tried`` is ordered from simple to complex.
+
+    ``first_gain`` is the gain of IoU for which given poses are touched at all.
+    """
     best = tried[0]
     for candidate in tried[1:]:
-        wanted = GAIN_OF_SHAPE if best is tried[0] else GAIN
+        wanted = first_gain if best is tried[0] else GAIN
         best = candidate if candidate.iou > best.iou + wanted else best
     return best
 

@@ -24,8 +24,17 @@ from dyngs.files.write import write_image, write_text
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, Known, fit_capture
 from dyngs.human.fit.clips import FittedClip, fitted_clips
-from dyngs.human.fit.inputs import NOTHING_ELSE, FitInputs, has_guessed_lens, joints_of, read_person, with_lens
+from dyngs.human.fit.inputs import (
+    NOTHING_ELSE,
+    FitInputs,
+    KnownAvatar,
+    has_guessed_lens,
+    joints_of,
+    read_person,
+    with_lens,
+)
 from dyngs.human.fit.keypoints import read_keypoints
+from dyngs.human.fit.known_avatar import AvatarPoses, posed_by_avatar
 from dyngs.human.fit.known_person import known_shape, shape_of, with_shape
 from dyngs.human.fit.new_clip import NewClip, placed_clip
 from dyngs.human.fit.overlays import FITTED, GIVEN, overlay, side_by_side
@@ -43,11 +52,12 @@ _SHOWN, _COLUMNS, _SHOWN_SIDE, _SHOWN_RESOLUTION = 8, 4, 400, 72
 
 @dataclass(frozen=True)
 class FittedCapture:
-    """Result of ``write_fitted_capture``: the new capture's folder, and the fit."""
+    """Result of ``write_fitted_capture``: the new capture's folder, the fit, and the clips that an avatar posed."""
 
     root: Path
     found: CaptureFit
     new_poses: NewClip | None = None
+    by_avatar: tuple[AvatarPoses, ...] = ()
 
     def summary(self) -> str:
         """Return lines for people: how good the fit is."""
@@ -56,11 +66,12 @@ class FittedCapture:
         worst = int(np.nanargmin(found.chosen.per_frame))
         tried = ", ".join(f"{candidate.iou:.3f} with {candidate.name}" for candidate in found.tried)
         lens = "" if found.lens is None else f"\n{found.lens.summary()}"
-        other = "" if self.new_poses is None else f"\n{self.new_poses.summary()}"
+        others = [x.summary() for x in (self.new_poses, *self.by_avatar) if x is not None]
         return (
             f"{frames} frames; overlap of silhouettes (IoU) on {where}: {tried}\n"
             f"taken: {found.chosen.name}; worst frame {found.motion.frames[worst]} with "
-            f"{found.chosen.per_frame[worst]:.3f}; look at {self.root / OVERLAYS_NAME}{lens}{other}"
+            f"{found.chosen.per_frame[worst]:.3f}; look at {self.root / OVERLAYS_NAME}{lens}"
+            + "".join(f"\n{line}" for line in others)
         )
 
 
@@ -103,24 +114,37 @@ def _fitted(
         capture = with_lens(capture, found.lens)
         new_poses = placed_clip(capture, options, shaped, found, report)
         clips = fitted_clips(capture, shaped, found, new_poses)
+        by_avatar = () if given.avatar is None else _posed(given.avatar, capture, options, clips)
         if with_pictures:
             _write_pictures(folder, capture, options, clips)
             for split, clip in clips.items():
                 clips[split] = replace(clip, frames=tuple(range(len(clip.frames))))
         _write_bodies(folder, capture, clips, found.fit.betas)
         write_image(folder / OVERLAYS_NAME, _overlays(capture, options, body, found))
-        write_text(folder / REPORT_NAME, json.dumps(_report(found, new_poses), indent=1) + "\n")
+        write_text(folder / REPORT_NAME, json.dumps(_report(found, new_poses, by_avatar), indent=1) + "\n")
         shutil.rmtree(masks, ignore_errors=True)
         folder.replace(out)  # also where ``out`` is an empty folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    return FittedCapture(out, found, new_poses)
+    return FittedCapture(out, found, new_poses, by_avatar)
+
+
+def _posed(
+    avatar: KnownAvatar, capture: Capture, options: DataConfig, clips: dict[Split, FittedClip]
+) -> tuple[AvatarPoses, ...]:
+    """Give the clips the poses in which the avatar has their silhouettes; return what came out, clip by clip."""
+    found: list[AvatarPoses] = []
+    for split, clip in clips.items():
+        found.append(posed_by_avatar(avatar, capture.splits[split], options, clip))
+        clips[split] = found[-1].clip
+    return tuple(found)
 
 
 def _write_bodies(out: Path, capture: Capture, clips: Mapping[Split, FittedClip], betas: Tensor) -> None:
     """Write the clips, rows named by their frame numbers."""
     for split, found in clips.items():
-        write_body(out / f"body_{split}.npz", found.clip, betas.numpy(), capture.world_offset, found.frames)
+        path = out / f"body_{split}.npz"
+        write_body(path, found.clip, betas.numpy(), capture.world_offset, found.frames, capture.fps)
 
 
 def _write_pictures(out: Path, capture: Capture, options: DataConfig, clips: Mapping[Split, FittedClip]) -> None:
@@ -147,7 +171,7 @@ def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: 
     return side_by_side(sheets, _COLUMNS)
 
 
-def _report(found: CaptureFit, new_poses: NewClip | None) -> dict[str, object]:
+def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: tuple[AvatarPoses, ...]) -> dict[str, object]:
     """Return the report as JSON values."""
     fit, chosen = found.fit, found.chosen
     turns = np.degrees(fit.shared.turns.norm(dim=1).double().numpy())
@@ -158,6 +182,9 @@ def _report(found: CaptureFit, new_poses: NewClip | None) -> dict[str, object]:
         "iou": {candidate.name: round(candidate.iou, 4) for candidate in found.tried},
         "views_left_out": found.held_out,
         "new_poses": None if new_poses is None else {"iou": new_poses.iou, "iou_moved": new_poses.iou_moved},
+        "by_avatar": [
+            {"iou": x.before, "iou_posed": x.after, "views_left_out": x.left_out, "taken": x.taken} for x in by_avatar
+        ],
         "iou_per_frame": {
             str(frame): round(iou, 4)
             for frame, iou in zip(found.motion.frames, chosen.per_frame, strict=False)

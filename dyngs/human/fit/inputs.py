@@ -13,6 +13,7 @@ from dyngs.data.prepare.background_masks import with_background_masks
 from dyngs.data.prepare.standing_camera import FORMAT, is_plain_clip, read_standing_camera, silhouettes_of, zoomed
 from dyngs.data.read import is_capture, read_capture
 from dyngs.errors import DyngsError
+from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.fit.joints3d import Joints3D, read_joints
 from dyngs.human.fit.lens_fit import LensFit
 from dyngs.human.template.body_reader import read_body
@@ -23,8 +24,16 @@ _LOOKED_AT, _PRESENT = 128, 0.2
 
 
 @dataclass(frozen=True)
+class KnownAvatar:
+    """The avatar of a person, and the longest side of the pictures it was trained on, px; None: as they are."""
+
+    scene: HumanScene
+    longest_side: int | None
+
+
+@dataclass(frozen=True)
 class FitInputs:
-    """What is given beside the capture; all paths may be None.
+    """What is given beside the capture; everything may be None.
 
     Attributes:
         keypoints: folder or file of 2D key points.
@@ -33,6 +42,7 @@ class FitInputs:
         joints: file or folder of 3D joints or posed vertices, see ``read_joints``.
         body: body file whose vertices these are; None: the free template.
         person: capture or run of the same person, whose shape is kept.
+        avatar: of the same person, if that run has one: its silhouette decides the poses in the end.
     """
 
     keypoints: Path | None = None
@@ -41,6 +51,7 @@ class FitInputs:
     joints: Path | None = None
     body: Path | None = None
     person: Path | None = None
+    avatar: KnownAvatar | None = None
 
 
 NOTHING_ELSE = FitInputs()

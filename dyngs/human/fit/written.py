@@ -19,13 +19,21 @@ from dyngs.data.pictures.images import straight_uint8
 from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.motion.clip import MotionClip
 
+FRAME_RATE = 30.0
+"""Frames per second of a clip whose capture does not say."""
+
 
 def write_body(
-    path: Path, clip: MotionClip, betas: np.ndarray, world_offset: np.ndarray, frames: Sequence[int] | None = None
+    path: Path,
+    clip: MotionClip,
+    betas: np.ndarray,
+    world_offset: np.ndarray,
+    frames: Sequence[int],
+    fps: float | None = None,
 ) -> None:
-    """Write the body parameters of a clip, one row per frame, with betas (B,) of the free template's shape space.
+    """Write the body parameters of a clip, also readable as a motion: one row for each of the numbers ``frames``.
 
-    ``frames`` are the numbers of the rows; None: 0, 1, ...
+    ``betas`` (B,) are of the free template's shape space; ``fps`` frames per second, None where nobody knows.
     """
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(
@@ -37,7 +45,8 @@ def write_body(
             surface_model_type="anny",
             gender="neutral",
             up_axis="y",
-            frames=np.arange(len(clip)) if frames is None else np.asarray(frames, dtype=np.int64),
+            frames=np.asarray(frames, dtype=np.int64),
+            mocap_frame_rate=np.float64(FRAME_RATE if fps is None else fps),
         )
 
 

@@ -13,7 +13,7 @@ from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.human.fit import start
-from dyngs.human.fit.capture_fit import CaptureFit, FitEffort, fit_capture, simplest_of_the_best, split_views
+from dyngs.human.fit.capture_fit import GAIN, CaptureFit, FitEffort, fit_capture, simplest_of_the_best, split_views
 from dyngs.human.fit.clips import fitted_clips
 from dyngs.human.motion.captured import captured_motion
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
@@ -86,6 +86,12 @@ def test_more_is_learned_only_where_it_pays(
     given = found(wrong[1].root).tried[0]
     tried = [replace(given, iou=iou) for iou in ious]
     assert simplest_of_the_best(tried) is tried[wanted]
+
+
+def test_poses_of_a_person_whose_shape_is_known_are_changed_for_less(wrong: tuple[Capture, Capture]) -> None:
+    tried = [replace(found(wrong[1].root).tried[0], iou=iou) for iou in (0.9, 0.912)]
+    assert simplest_of_the_best(tried) is tried[0]
+    assert simplest_of_the_best(tried, GAIN) is tried[1]
 
 
 def test_one_view_of_each_frame_is_left_out(wrong: tuple[Capture, Capture]) -> None:

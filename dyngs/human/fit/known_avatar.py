@@ -1,0 +1,141 @@
+"""Poses of a new clip of a person whose avatar was trained: those in which the avatar's outline is that of the masks.
+
+The template's outline differs from the person's by clothes, hair and proportions; the avatar's does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from dyngs.config import DataConfig
+from dyngs.data.capture import View
+from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.loader import PictureLoader
+from dyngs.human.avatar.pose_comparison import SILHOUETTES
+from dyngs.human.avatar.pose_fit import fitted_to_pictures
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.fit.clips import FittedClip
+from dyngs.human.fit.inputs import KnownAvatar
+from dyngs.human.motion.clip import MotionClip
+
+LONGEST_SIDE = 320
+"""Of the pictures whose silhouettes are looked at, px, at most; an avatar trained on smaller ones is compared at that
+size, since its edges are those of its pictures."""
+CHECKED = 3
+"""Moments, at most, at which a view is left out to see what the fit is worth."""
+_FEWEST_VIEWS = 3
+"""Of a moment, so that one of them can be left out."""
+
+
+@dataclass(frozen=True)
+class AvatarPoses:
+    """Poses that an avatar found.
+
+    Attributes:
+        clip: of all frames; as it was where ``taken`` is false.
+        before, after: overlap of silhouettes (IoU) at some moments, of the avatar in both.
+        left_out: number of views, which were left out of the fit, that this was measured on; 0: on those fitted to.
+    """
+
+    clip: FittedClip
+    before: float
+    after: float
+    left_out: int
+
+    @property
+    def taken(self) -> bool:
+        """Whether these poses are better than those before."""
+        return self.after > self.before
+
+    def summary(self) -> str:
+        """Return a line for people."""
+        where = f"{self.left_out} views left out of the fit" if self.left_out else "the views fitted to"
+        what = "taken" if self.taken else "not taken"
+        return (
+            f"poses by the silhouette of the person's avatar: {what}; overlap on {where} {self.before:.3f} -> "
+            f"{self.after:.3f}"
+        )
+
+
+def posed_by_avatar(avatar: KnownAvatar, views: Sequence[View], options: DataConfig, start: FittedClip) -> AvatarPoses:
+    """Return the poses of a clip in which the avatar has the silhouettes of its pictures, where that is better.
+
+    The size is that of ``start``, or that of the clip of training where the silhouettes show that the world has the
+    same unit.
+
+    Args:
+        avatar: of the person; plays ``start`` as it plays the clip of training.
+        views: the pictures of the clip, with silhouettes.
+        options: how pictures are read.
+        start: poses of the frames to begin with; frames without a picture keep them.
+    """
+    times = start.clip.times.tolist()
+    shown = [replace(x, time=times[start.rows[-1 if x.frame is None else x.frame]]) for x in views]
+    side = min(LONGEST_SIDE, options.longest_side or LONGEST_SIDE, avatar.longest_side or LONGEST_SIDE)
+    small = options.model_copy(update={"longest_side": side, "downscale": 1})
+    left_out, others = _left_out(shown)
+    tested, pictures = PictureLoader(left_out or others, small), PictureLoader(others, small)
+    scene = avatar.scene
+    players = [scene.playing(start.clip), scene.playing(_in_size(scene, start.clip))]
+    tried = [(_overlap(_fitted(player, pictures), tested), player) for player in players]
+    before, (after, best) = _overlap(players[0], tested), max(tried, key=lambda x: x[0])
+    clip = start.clip
+    if after > before:
+        found = _fitted(best, PictureLoader(shown, small)).played
+        clip = clip if found is None else _with_rows(best.played or clip, found)
+    return AvatarPoses(replace(start, clip=clip), before, after, len(left_out))
+
+
+def _in_size(avatar: HumanScene, clip: MotionClip) -> MotionClip:
+    """Return the clip of a person as large as in the clip of training, with the pelvis where it was."""
+    scale = torch.full_like(clip.scale, float(avatar.clip.scale.mean()))
+    return replace(clip, scale=scale, trans=clip.trans + (clip.scale - scale)[:, None] * avatar.skeleton.joints[0])
+
+
+def _fitted(player: HumanScene, pictures: PictureLoader) -> HumanScene:
+    """Return the person in the poses that have the silhouettes of ``pictures``."""
+    nothing = player.gaussians.means.new_zeros(3)
+    return fitted_to_pictures(player, pictures, nothing, player.options, SILHOUETTES).scene
+
+
+def _left_out(views: Sequence[View]) -> tuple[list[View], list[View]]:
+    """Return one view of each of some moments, and the others of these moments to fit to.
+
+    Moments with too few views lose none.
+    """
+    groups: dict[float | None, list[View]] = {}
+    for view in views:
+        groups.setdefault(view.time, []).append(view)
+    enough = [group for group in groups.values() if len(group) >= _FEWEST_VIEWS]
+    some = enough or list(groups.values())
+    chosen = [some[i] for i in evenly_spaced(len(some), CHECKED)]
+    apart = [group[-1] for group in chosen] if enough else []
+    return apart, [view for group in chosen for view in group if view not in apart]
+
+
+@torch.no_grad()
+def _overlap(scene: HumanScene, pictures: PictureLoader) -> float:
+    """Return the mean intersection over union of the silhouettes of the person and of pictures."""
+    found = []
+    for picture in (pictures[i] for i in range(len(pictures))):
+        drawn = scene.render(picture.cameras, picture.time, options=scene.options).alpha[0] > 0.5
+        truth = drawn if picture.alpha is None else picture.alpha > 0.5
+        found.append(float((drawn & truth).sum() / (drawn | truth).sum().clamp_min(1)))
+    return fmean(found)
+
+
+def _with_rows(clip: MotionClip, found: MotionClip) -> MotionClip:
+    """Return the clip with the rows of ``found`` at the times that are in both."""
+    rows = torch.searchsorted(clip.times, found.times).clamp_max(len(clip) - 1)
+
+    def put(before: Tensor, after: Tensor) -> Tensor:
+        return before.index_copy(0, rows, after.to(before))
+
+    return MotionClip(
+        clip.times, put(clip.poses, found.poses), put(clip.trans, found.trans), put(clip.scale, found.scale)
+    )
