@@ -18,7 +18,7 @@ class _OnTemplate(SceneModel):
     uv: Path | None = Field(default=None, description=".obj with the texture coordinates of body; null: its own")
     resolution: int = Field(default=128, ge=8, le=1024, description="texels per side of the template's texture atlas")
     scaffold_heights: tuple[float, ...] = Field(
-        default=(0.0, 0.02),
+        default=(0.0,),
         min_length=1,
         description="heights above the skin, m, at which copies of its surface carry one Gaussian per texel (the "
         "multi-scaffold of GHG)",
