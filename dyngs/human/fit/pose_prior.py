@@ -6,6 +6,7 @@ clip and its mirror image.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -18,6 +19,8 @@ NUM_TURNED = 22
 """Joints that are turned: those of the body. Fingers, jaw and eyes do not show in silhouettes."""
 _GIVEN = 0.05
 """Expected error of given poses, rad."""
+_LIMIT = 3.0
+"""Standard deviations of usual poses beyond which joints would be dislocated."""
 _LEAST = 8.0
 """Least spread, degrees: a few clips do not show how far a joint can go."""
 _DEGREES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
@@ -44,10 +47,12 @@ class PosePrior:
     Attributes:
         centre: (F, 22, 3) mean.
         spread: (22, 3) standard deviation.
+        limit: of these from the centre, beyond which nobody is expected to turn a joint.
     """
 
     centre: Tensor
     spread: Tensor
+    limit: float = math.inf
 
 
 def near_given(clip: MotionClip) -> PosePrior:
@@ -58,7 +63,7 @@ def near_given(clip: MotionClip) -> PosePrior:
 def usual(clip: MotionClip) -> PosePrior:
     """Return the prior that corrected poses are usual ones; rotations add as vectors, which holds for small ones."""
     spread = usual_spread(NUM_TURNED).to(clip.poses)
-    return PosePrior(usual_pose(NUM_TURNED).to(clip.poses) - clip.poses[:, :NUM_TURNED], spread)
+    return PosePrior(usual_pose(NUM_TURNED).to(clip.poses) - clip.poses[:, :NUM_TURNED], spread, _LIMIT)
 
 
 def usual_pose(joints: int) -> Tensor:

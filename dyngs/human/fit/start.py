@@ -15,18 +15,27 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.pictures.silhouettes import silhouette_box
+from dyngs.human.fit.headings import (
+    MOST_ANCHORS,
+    NUM_HEADINGS,
+    angle_between,
+    heading,
+    likely_path,
+    roots_between,
+)
 from dyngs.human.fit.observed import ObservedFrame
 from dyngs.human.fit.pose_prior import NUM_TURNED, usual, usual_pose
-from dyngs.human.fit.solve import Observations, Stage, frame_error, new_fit, run_stage
+from dyngs.human.fit.solve import Observations, Stage, frame_error, new_fit, prior, run_stage
 from dyngs.human.fit.surface import Surface
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
 
-HEADINGS = 8
-"""Directions that a person may face in the first frame, all of which are tried."""
 STEPS = 40
-"""Steps of Adam for each of them, and for each frame from the pose of the one before."""
+"""Steps of Adam for each heading of an anchor, and, at each size, for each frame from the pose of the one before."""
+OFF_COURSE = math.radians(30)
+"""Rotation of the root away from the path of headings from which a frame is begun on that path instead."""
 ARMS = (((0, 0, -75), (0, 0, 0)), ((0, 0, 0), (0, 0, 0)), ((0, -30, -60), (0, -90, 0)))
 """Rotations of the left shoulder and elbow, degrees, that are tried: hanging, spread, bent forward."""
 MOMENTUM = 0.8
@@ -42,8 +51,9 @@ def first_poses(
 ) -> MotionClip:
     """Return poses of a person in F frames, found in the silhouettes of ``observed`` (per row) alone.
 
-    In the first frame every heading is tried; each later frame starts from the pose of the one before. The two best
-    headings are followed through the clip, and the better of them is taken.
+    In some frames, the anchors, every heading is tried; the likely path through them says which way the person faces
+    (``dyngs.human.fit.headings``). Each frame starts from the pose of the one before, and where that has left the path
+    from the heading of the path: single frames would rather be explained by a twisted body.
 
     Raises:
         ValueError: nobody is seen in the first frame.
@@ -52,20 +62,43 @@ def first_poses(
     if seen is None:
         raise ValueError("nobody is seen in the first frame")
     standing, up = standing_clip(times, surface, observed), up_of(seen)
-    tried = []
-    for turn in range(HEADINGS):
-        clip = turned(standing, 2 * math.pi * turn / HEADINGS, up)
-        tried.append(_followed(clip, surface, observed, [0], tick))
-    rows, followed = range(1, len(times)), []
-    for i in sorted(range(HEADINGS), key=lambda i: tried[i][1])[:2]:
-        clip = _with_better_arms(tried[i][0], tried[i][1], surface, seen)
-        followed.append(_followed(clip, surface, observed, rows, tick))
-    return min(followed, key=lambda found: found[1])[0]
+    anchors = [row for row in anchors_of(len(times)) if observed(row) is not None]
+    tried = [_all_headings(standing, row, up, surface, observed, tick) for row in anchors]
+    path = likely_path([[error for _, _, error in own] for own in tried])
+    roots = torch.stack([own[heading][0][0] for own, heading in zip(tried, path, strict=True)])
+    pose, trans, error = _found_from(standing, *tried[0][path[0]][:2], 0, surface, seen)
+    first = _with_better_arms(_with_row(standing, 0, pose, trans), error, surface, seen)
+    return _followed(first, roots_between(anchors, roots, len(times)), surface, observed, tick)
+
+
+def anchors_of(frames: int) -> list[int]:
+    """Return the frames of a clip of so many in which all headings are tried."""
+    return evenly_spaced(frames, MOST_ANCHORS)
 
 
 def num_ticks(frames: int) -> int:
     """Return how often ``first_poses`` calls ``tick`` for a clip of so many frames."""
-    return HEADINGS + 2 * (frames - 1)
+    return NUM_HEADINGS * len(anchors_of(frames)) + frames - 1
+
+
+def _all_headings(
+    clip: MotionClip, row: int, up: Tensor, surface: Surface, observed: Observations, tick: Callable[[], None]
+) -> list[tuple[Tensor, Tensor, float]]:
+    """Return pose, translation and error of a frame as found from each heading, at half the size."""
+    seen, found = observed(row), []
+    for index in range(NUM_HEADINGS):
+        start = turned(clip, heading(index), up)
+        if seen is not None:
+            found.append(_found_from(start, start.poses[row], start.trans[row], row, surface, seen, levels=(2,)))
+        tick()
+    return found
+
+
+def _with_row(clip: MotionClip, row: int, pose: Tensor, trans: Tensor) -> MotionClip:
+    """Return the clip with another pose (J, 3) and translation (3,) in a frame."""
+    poses, places = clip.poses.clone(), clip.trans.clone()
+    poses[row], places[row] = pose, trans
+    return replace(clip, poses=poses, trans=places)
 
 
 def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> MotionClip:
@@ -139,24 +172,22 @@ def _ray(camera: Cameras, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor] | None
 
 
 def _followed(
-    clip: MotionClip,
-    surface: Surface,
-    observed: Observations,
-    rows: range | list[int],
-    tick: Callable[[], None],
-) -> tuple[MotionClip, float]:
-    """Return the clip with the poses of ``rows`` found one after the other, and the mean error of what is seen."""
-    poses, trans, errors = clip.poses.clone(), clip.trans.clone(), []
-    for row in rows:
+    clip: MotionClip, roots: Tensor, surface: Surface, observed: Observations, tick: Callable[[], None]
+) -> MotionClip:
+    """Return the clip with the poses after the first frame found one by one, near the path ``roots`` (F, 3)."""
+    poses, trans = clip.poses.clone(), clip.trans.clone()
+    for row in range(1, len(poses)):
         seen = observed(row)
-        if row > 0:
-            poses[row] = _extrapolated(poses, row)
-            trans[row] = trans[row - 1] + clip.trans[row] - clip.trans[row - 1]
+        poses[row] = _extrapolated(poses, row)
+        trans[row] = trans[row - 1] + clip.trans[row] - clip.trans[row - 1]
         if seen is not None:
-            poses[row], trans[row], error = _found_from(clip, poses[row], trans[row], row, surface, seen)
-            errors.append(error)
+            starts = [poses[row]]
+            if angle_between(poses[row, 0], roots[row]) > OFF_COURSE:
+                starts = [torch.cat([roots[row : row + 1], others[1:]]) for others in (poses[row], clip.poses[row])]
+            found = [_found_from(clip, start, trans[row], row, surface, seen) for start in starts]
+            poses[row], trans[row], _ = min(found, key=lambda x: x[2])
         tick()
-    return replace(clip, poses=poses, trans=trans), sum(errors) / max(len(errors), 1)
+    return replace(clip, poses=poses, trans=trans)
 
 
 def _with_better_arms(clip: MotionClip, error: float, surface: Surface, seen: ObservedFrame) -> MotionClip:
@@ -172,24 +203,31 @@ def _with_better_arms(clip: MotionClip, error: float, surface: Surface, seen: Ob
                 pose[JOINT_NAMES.index(f"{side}_{name}")] = torch.deg2rad(turn)
             pose, trans, found = _found_from(clip, pose, clip.trans[0], 0, surface, seen)
             if found < error:
-                error, poses, places = found, clip.poses.clone(), clip.trans.clone()
-                poses[0], places[0] = pose, trans
-                clip = replace(clip, poses=poses, trans=places)
+                error, clip = found, _with_row(clip, 0, pose, trans)
     return clip
 
 
 def _found_from(
-    clip: MotionClip, pose: Tensor, trans: Tensor, row: int, surface: Surface, seen: ObservedFrame
+    clip: MotionClip,
+    pose: Tensor,
+    trans: Tensor,
+    row: int,
+    surface: Surface,
+    seen: ObservedFrame,
+    levels: tuple[int, ...] = (2, 1),
 ) -> tuple[Tensor, Tensor, float]:
-    """Return pose (J, 3), translation and error of one frame, found from a start."""
+    """Return pose (J, 3), translation and error of one frame, found from a start; unusual poses add to the error.
+
+    ``levels`` are the factors by which what is seen is made smaller, one after the other.
+    """
     one = MotionClip(clip.times[row : row + 1], pose[None], trans[None], clip.scale[row : row + 1])
     learned = new_fit(one, surface)
-    for level in (2, 1):
+    for level in levels:
         shown = seen.shrunk(level)
         stage = Stage(STEPS, 1, ("poses", "trans"))
         learned = run_stage(learned, stage, one, surface, lambda _, at=shown: at, usual(one))
     with torch.no_grad():
-        error = float(frame_error(learned, one, surface, 0, seen))
+        error = float(frame_error(learned, one, surface, 0, seen) + prior(learned, usual(one)))
     own = Rotation.from_rotvec(learned["poses"][0].detach().numpy())
     given = Rotation.from_rotvec(pose[:NUM_TURNED].numpy())
     found = pose.clone()
@@ -198,8 +236,11 @@ def _found_from(
 
 
 def _extrapolated(poses: Tensor, row: int) -> Tensor:
-    """Return the pose (J, 3) expected in frame ``row``: that before it, turned on as it turned before."""
-    if row < 2:
+    """Return the pose (J, 3) expected in frame ``row``: that before it, turned on as it turned before.
+
+    What was put on the path of headings was no motion.
+    """
+    if row < 2 or angle_between(poses[row - 2, 0], poses[row - 1, 0]) > OFF_COURSE:
         return poses[row - 1].clone()
     before, last = (Rotation.from_rotvec(x.numpy()) for x in (poses[row - 2], poses[row - 1]))
     on = Rotation.from_rotvec(MOMENTUM * (before.inv() * last).as_rotvec())

@@ -1,15 +1,17 @@
 """Errors and stages of the fit: known values, and key points that lead a pose."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from dyngs.camera import Cameras
 from dyngs.human.fit.observed import ObservedFrame
-from dyngs.human.fit.pose_prior import near_given
+from dyngs.human.fit.pose_prior import PosePrior, near_given, usual
 from dyngs.human.fit.solve import (
     KEYPOINT,
+    LIMIT_WEIGHT,
     PLACE,
     Stage,
     drawn_frame,
@@ -17,6 +19,7 @@ from dyngs.human.fit.solve import (
     new_fit,
     place_error,
     posed_joints,
+    prior,
     refined,
     run_stage,
     silhouette_error,
@@ -27,6 +30,7 @@ from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.human.template.load import default_template
+from dyngs.parameters import Parameters
 
 SIZE = 32
 
@@ -130,3 +134,20 @@ def test_a_longer_lens_from_further_away_shows_the_same_size(surface: Surface) -
     assert torch.allclose(100 * factor / (4.0 + shown.cam_from_world[0, 2, 3]), torch.tensor(100 / 4.0))
     assert shown.intrinsics[0, :2, 2].tolist() == [32, 32]
     assert refined(shown, new_fit(clip(), surface)) is shown
+
+
+def test_joints_beyond_what_anybody_does_cost_much_more(surface: Surface) -> None:
+    clip = MotionClip(torch.zeros(1, dtype=torch.float64), torch.zeros(1, 55, 3), torch.zeros(1, 3), torch.ones(1))
+    expected, row = usual(clip), JOINT_NAMES.index("left_collar")
+
+    def cost(deviations: float, prior_of_poses: PosePrior) -> float:
+        learned = new_fit(clip, surface).values()
+        learned["poses"] = expected.centre.clone()
+        learned["poses"][0, row, 1] += deviations * expected.spread[row, 1]
+        return float(prior(Parameters(learned, {}, 1.0), prior_of_poses).detach())
+
+    share = 1 / (21 * 3)
+    unlimited = replace(expected, limit=math.inf)
+    assert cost(2.9, expected) == pytest.approx(cost(2.9, unlimited), abs=1e-8)
+    assert cost(5.0, expected) - cost(5.0, unlimited) == pytest.approx(LIMIT_WEIGHT * 2.0**2 * share, rel=1e-4)
+    assert near_given(clip).limit == math.inf, "given poses may be as they like"

@@ -1,6 +1,7 @@
 """First poses from silhouettes: place, size and heading of a person of whom nothing else is known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.camera import Cameras
 from dyngs.human.fit.observed import ObservedFrame
 from dyngs.human.fit.pose_prior import usual_pose
-from dyngs.human.fit.solve import drawn_frame, new_fit
+from dyngs.human.fit.solve import drawn_frame, new_fit, posed_joints
 from dyngs.human.fit.start import PELVIS_SHARE, STATURE, first_poses, num_ticks, place_and_height, standing_clip, up_of
 from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.clip import MotionClip
@@ -82,7 +83,7 @@ def test_nobody_has_the_place_of_the_frame_before(surface: Surface) -> None:
 
 
 def test_the_heading_is_found(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 12)
+    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 30)
     monkeypatch.setattr("dyngs.human.fit.start.ARMS", ())
     place, heading = torch.tensor([0.0, 1.0, 0.0]), 2.0
     seen = seen_by(surface, standing(place, heading), ring(3, place))
@@ -96,3 +97,25 @@ def test_the_heading_is_found(surface: Surface, monkeypatch: pytest.MonkeyPatch)
 def test_nobody_at_all_is_an_error(surface: Surface) -> None:
     with pytest.raises(ValueError, match="nobody is seen"):
         first_poses(torch.zeros(1, dtype=torch.float64), surface, lambda _: None)
+
+
+def test_who_turns_before_one_camera_is_followed(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From frame to frame a body would rather twist than turn: outlines of front and back are alike."""
+    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 20)
+    monkeypatch.setattr("dyngs.human.fit.start.ARMS", ())
+    place, camera = torch.tensor([0.0, 1.0, 0.0]), ring(1, torch.tensor([0.0, 1.0, 0.0]))
+    turns = [0.4 * math.pi + x for x in (0.1, 1.6, 3.1)]  # towards the camera, then sideways, then away from it
+    seen = [with_joints(surface, standing(place, turn), camera) for turn in turns]
+    clip = first_poses(torch.linspace(0, 1, 3, dtype=torch.float64), surface, seen.__getitem__)
+    for root, turn in zip(clip.poses[:, 0], turns, strict=True):
+        facing = Rotation.from_rotvec(root.double().numpy()).apply([0.0, 0.0, 1.0])
+        assert facing @ np.array([math.sin(turn), 0.0, math.cos(turn)]) > 0.8
+
+
+def with_joints(surface: Surface, clip: MotionClip, cameras: Cameras) -> ObservedFrame:
+    """What is seen, and the joints as key points."""
+    seen, joints = seen_by(surface, clip, cameras), posed_joints(new_fit(clip, surface), clip, surface, 0)
+    local = joints @ cameras.cam_from_world[0, :3, :3].T + cameras.cam_from_world[0, :3, 3]
+    pixels = local @ cameras.intrinsics[0].T
+    marked = torch.cat([pixels[:, :2] / pixels[:, 2:] / SIZE, torch.ones(len(joints), 1)], 1)
+    return replace(seen, joints=marked[None].detach())
