@@ -203,15 +203,16 @@ def fit_capture(
     lens = None
     if known.guessed_lens:
         candidate, lens = _with_lens(tried[-1], motion.clip, surface, seen, known.learned, report, effort)
-        tried = (*tried, candidate)
-    chosen = tried[-1] if known.guessed_lens else simplest_of_the_best(tried, GAIN if known.shape else GAIN_OF_SHAPE)
+        tried = (*tried, candidate) if lens.taken else tried
+    first_gain = 0.0 if not given else GAIN if known.shape else GAIN_OF_SHAPE
+    chosen = tried[-1] if lens is not None and lens.taken else simplest_of_the_best(tried, first_gain)
     return CaptureFit(body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, not given, lens)
 
 
 def simplest_of_the_best(tried: Sequence[Candidate], first_gain: float = GAIN_OF_SHAPE) -> Candidate:
     """Return the candidate after which none is clearly better: ``tried`` is ordered from simple to complex.
 
-    ``first_gain`` is the gain of IoU for which given poses are touched at all.
+    ``first_gain`` is the gain of IoU for which the first one is left: given poses are touched for much only.
     """
     best = tried[0]
     for candidate in tried[1:]:
@@ -352,8 +353,7 @@ def _with_lens(
     tick = ticker("focal length", report, num_lens_ticks(steps))
     args = (start.learned, shape, clip, surface, look, usual(clip), steps, tick)
     found, lens = fit_lens(*args)
-    name = f"the focal length {'refined' if lens.taken else 'as guessed'}"
-    return measured(name, found, clip, surface, seen), lens
+    return measured("the focal length refined", found, clip, surface, seen), lens
 
 
 def ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]:

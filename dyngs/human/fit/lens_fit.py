@@ -88,13 +88,13 @@ def fit_lens(
     steps: int,
     tick: Callable[[], None] = lambda: None,
 ) -> tuple[Parameters, LensFit]:
-    """Return the fit of shape, poses and, where it pays, focal length to the frames of one camera at the origin.
+    """Return the fit of shape, poses and focal length to the frames of one camera at the origin; ``start`` if it stays.
 
     Both are fitted to three of four frames, with the focal length as guessed and refined. Then shape and focal length
     are kept, and poses of the other frames are fitted: where these agree better, the refined one is taken.
 
     Args:
-        start: poses that were found with the guessed focal length.
+        start: shape and poses that were found with the guessed focal length.
         shape: names of what is the same in all frames.
         clip: the given poses, F frames.
         surface: of the template.
@@ -114,7 +114,6 @@ def fit_lens(
     both = [task.run(found, own, apart) for found in (guessed, refined)]
     errors = (task.error(both[0], apart), task.error(both[1], apart))
     taken = errors[1] < (1 - GAIN) * errors[0]
-    names = (*shape, *own, "log_focal") if taken else (*shape, *own)
-    found = task.run(both[taken], names, rows)
+    found = task.run(both[1], (*shape, *own, "log_focal"), rows) if taken else start
     last = found if taken else refined
     return found, LensFit(float(last["log_focal"].detach().exp()), distance, errors, taken)

@@ -7,7 +7,7 @@ from dyngs.human.fit.lens_fit import fit_lens, num_ticks
 from dyngs.human.fit.observed import ObservedFrame
 from dyngs.human.fit.pose_prior import near_given
 from dyngs.human.fit.solve import drawn_frame, new_fit, with_lens
-from dyngs.human.fit.surface import surface_of
+from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.human.template.load import default_template
@@ -15,7 +15,8 @@ from dyngs.human.template.load import default_template
 SIZE, FRAMES, STEPS, DISTANCE = 32, 4, 12, 2.2
 
 
-def test_a_wrong_guess_is_corrected() -> None:
+def filmed(log_focal: float) -> tuple[Surface, MotionClip, list[ObservedFrame]]:
+    """Who turns before a camera whose focal length is not the guessed one, by that logarithm."""
     surface = surface_of(default_template(), 16)
     intrinsics = torch.tensor([[0.9 * SIZE, 0, SIZE / 2], [0, 0.9 * SIZE, SIZE / 2], [0, 0, 1]])
     camera = Cameras(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None], intrinsics[None], SIZE, SIZE)
@@ -27,9 +28,14 @@ def test_a_wrong_guess_is_corrected() -> None:
     clip = MotionClip(times, poses, trans, torch.ones(FRAMES))
     true = with_lens(new_fit(clip, surface), DISTANCE)
     with torch.no_grad():
-        true["log_focal"].add_(-0.3)
+        true["log_focal"].add_(log_focal)
         known = torch.ones(1, SIZE, SIZE)
         seen = [ObservedFrame(camera, drawn_frame(true, clip, surface, row, camera), known) for row in range(FRAMES)]
+    return surface, clip, seen
+
+
+def test_a_wrong_guess_is_corrected() -> None:
+    surface, clip, seen = filmed(-0.3)
     ticks: list[int] = []
     start = new_fit(clip, surface)
     args = (start, (), clip, surface, seen.__getitem__, near_given(clip), STEPS, lambda: ticks.append(1))
@@ -41,3 +47,12 @@ def test_a_wrong_guess_is_corrected() -> None:
     assert len(ticks) == num_ticks(STEPS)
     assert "taken" in lens.summary()
     assert float(start["poses"].detach().abs().max()) == 0
+
+
+def test_where_the_guess_stays_nothing_is_fitted_again() -> None:
+    surface, clip, seen = filmed(0.0)
+    start = new_fit(clip, surface)
+    found, lens = fit_lens(start, (), clip, surface, seen.__getitem__, near_given(clip), STEPS)
+    assert not lens.taken
+    assert found is start
+    assert "the guess stays" in lens.summary()
