@@ -48,6 +48,11 @@ class Parameters:
         return name in self._tensors
 
     @property
+    def leaves(self) -> list[Tensor]:
+        """The tensors, in a fixed order."""
+        return list(self._tensors.values())
+
+    @property
     def num_values(self) -> int:
         """Number of values in all tensors."""
         return sum(x.numel() for x in self._tensors.values())

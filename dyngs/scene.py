@@ -22,6 +22,7 @@ from dyngs.config import SceneModel
 from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.parameters import Parameters
 from dyngs.rendering import Rendering, RenderOptions, Shader, render
 from dyngs.state import Role, State, fields_moved_to, prefixed, with_role
 from dyngs.visibility import VisibilityMasks
@@ -262,6 +263,10 @@ class SceneTraining(Protocol[S]):
         Returns:
             the number of rows left out because their gradient was not finite.
         """
+        ...
+
+    def learned(self, scene: S) -> Parameters | None:
+        """Return what the scene learns beside its Gaussians and colours; None: nothing."""
         ...
 
     def after_step(self, scene: S, step: int, edited: bool) -> S:

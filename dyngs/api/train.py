@@ -5,14 +5,16 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 from torch import Tensor
 
 from dyngs.api import still_choices, still_first
+from dyngs.api.following import Leader
 from dyngs.api.still_first import StillComparison
 from dyngs.budget.cost import CostMeter
 from dyngs.budget.count import count_limit
@@ -57,10 +59,11 @@ from dyngs.runs.log import RunLog
 from dyngs.runs.progress import Progress
 from dyngs.training.events import Evaluated, Event, Listener, Saved, StepDone
 from dyngs.training.interrupt import Interrupts
-from dyngs.training.limits import require_possible
+from dyngs.training.limits import require_possible, shared
 from dyngs.training.longer import told, with_length
 from dyngs.training.loop import Loop, Stopwatch
 from dyngs.training.memory import memory_forecast
+from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
 
 _COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"
@@ -81,7 +84,13 @@ class Limit(Protocol):
         ...
 
 
-def train(config: Config, *, resume_from: Path | None = None, listeners: Sequence[Listener] = ()) -> Path:
+def train(
+    config: Config,
+    *,
+    resume_from: Path | None = None,
+    listeners: Sequence[Listener] = (),
+    processes: Processes | None = None,
+) -> Path:
     """Train and return the run folder.
 
     Args:
@@ -90,6 +99,7 @@ def train(config: Config, *, resume_from: Path | None = None, listeners: Sequenc
         resume_from: a run folder to go on with, from its newest checkpoint, or from the beginning where it was stopped
             before its first: the result has the same bytes as if the run had never stopped.
         listeners: are told everything that happens, see ``dyngs.training.events``.
+        processes: that this one, the first of them, leads; None: it is alone.
 
     Raises:
         DyngsError: bad input, a run folder that already holds a run or that another process writes into, a budget that
@@ -97,12 +107,15 @@ def train(config: Config, *, resume_from: Path | None = None, listeners: Sequenc
         KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how to go on.
     """
     folder = resume_from or config.run.dir or default_folder(config.run.name)
+    processes = processes or Processes()
+    config = shared(config, processes)
     require_possible(config)
     if resume_from is not None and (not folder.is_dir() or _is_done_and_read_only(config, folder)):
         latest_checkpoint(folder)
         return folder
     keep_freed_memory()
-    with writing(folder) as is_sole_writer, kernel_threads(config.run.threads or num_cores()):
+    threads = config.run.threads or max(1, num_cores() // processes.local_size)
+    with writing(folder) as is_sole_writer, kernel_threads(threads):
         tidy(folder, sole_writer=is_sole_writer)
         if resume_from is None and is_done(folder, config) and not _owes_file(config, folder):
             print(_told_again(config, folder), flush=True)
@@ -114,20 +127,22 @@ def train(config: Config, *, resume_from: Path | None = None, listeners: Sequenc
             print(f"{folder}: all {config.total_steps:,} steps are done; train.steps=N goes on to more", flush=True)
             return folder
         asked = asked_for(folder) if resume_from is not None else config
+        new_run = partial(_Run, processes=processes, threads=threads)
         if resumed is None:
-            config = _chosen(config, folder)
-        if not _Run(config, folder, resumed, asked).run(listeners):
-            _Run(still_choices.decided(still_first.still_instead(folder, config)), folder, None, asked).run(listeners)
+            config = _chosen(config, folder, partial(_train_still, new_run))
+        if not new_run(config, folder, resumed, asked).run(listeners):
+            still = still_choices.decided(still_first.still_instead(folder, config))
+            new_run(still, folder, None, asked).run(listeners)
         note_asked(folder, asked)
     return folder
 
 
-def _chosen(config: Config, folder: Path) -> Config:
+def _chosen(config: Config, folder: Path, train_still: Callable[[Config, Path], None]) -> Config:
     """Return the configuration with everything decided that is to be found out before the run.
 
     What holds for still and moving scenes comes first, as the comparison of the two builds on it.
     """
-    return still_choices.decided(still_first.start(still_choices.decided(config), folder, _train_still))
+    return still_choices.decided(still_first.start(still_choices.decided(config), folder, train_still))
 
 
 def _told_again(config: Config, folder: Path) -> str:
@@ -139,13 +154,13 @@ def _told_again(config: Config, folder: Path) -> str:
     )
 
 
-def _train_still(config: Config, folder: Path) -> None:
+def _train_still(new_run: Callable[[Config, Path, Checkpoint | None], _Run], config: Config, folder: Path) -> None:
     """Train the still model that a moving one is compared with, or go on with it, to its end."""
     resumed = latest_checkpoint(folder) if checkpoint_paths(folder) else None
     if resumed is not None and resumed.info.step >= config.total_steps:
         return
     try:
-        _Run(config, folder, resumed).run(())
+        new_run(config, folder, resumed).run(())
     except KeyboardInterrupt as stopped:
         again = f"stopped before anything moves; go on with: dyngs train --resume {folder.parent}"
         raise KeyboardInterrupt(again if stopped.args else "") from None
@@ -159,13 +174,26 @@ class _Run:
         folder: of the run.
         resumed: what it goes on from; None: it begins.
         asked: the configuration that was asked for, from which this one was chosen; None: this one.
+        processes: that this one leads.
+        threads: of the kernels in each of them.
     """
 
-    def __init__(self, config: Config, folder: Path, resumed: Checkpoint | None, asked: Config | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        folder: Path,
+        resumed: Checkpoint | None,
+        asked: Config | None = None,
+        *,
+        processes: Processes,
+        threads: int,
+    ) -> None:
         watch = Stopwatch()
         built = build(config, restored=resumed is not None)
         self.folder, self.limits = folder, dict[str, Limit]()
         self.loop = Loop(built.trainer, config.total_steps, watch, lambda: last_good(folder))
+        self._leader = Leader(processes, config, threads)
+        self.loop.before_step = self._leader.before_step
         if resumed is not None:
             built.trainer.restore(resumed)
             watch.pause(-seconds_at(folder, resumed.info.step))
@@ -204,7 +232,9 @@ class _Run:
             limited, comparison = self.limited, None
             if limited is not None:
                 loop.subscribe(FloaterRemoval(loop, lambda: limited.trainer))
-            loop.subscribe(*measures, *self.limits.values(), log, progress, *listeners, self._save_and_evaluate)
+            loop.subscribe(
+                self._leader, *measures, *self.limits.values(), log, progress, *listeners, self._save_and_evaluate
+            )
             if limited is not None:
                 comparison = StillComparison(self.folder, lambda: limited.trainer, loop)
                 loop.subscribe(PruneStage(loop, lambda: limited.trainer), comparison)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +16,7 @@ from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
     from dyngs.config import Config
+    from dyngs.training.processes import Processes
     from dyngs.view.training import TrainingView
 
 _EPILOG = """\
@@ -23,6 +26,7 @@ examples:
   dyngs train --resume runs/bench
   dyngs train --resume runs/bench train.steps=60000
   dyngs train configs/static.yaml data.root=scans/bench --view
+  torchrun --nproc-per-node 4 -m dyngs train configs/static.yaml data.root=scans/bench
 
 CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip, dynamic,
 human, human_predictor.
@@ -65,7 +69,16 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train and print the next commands."""
+    """Train and print the next commands; with others, where ``torchrun`` has started several processes."""
+    if os.environ.get("WORLD_SIZE", "1") == "1":
+        return _run(arguments)
+    from dyngs.api.following import together
+
+    return together(partial(_run, arguments))
+
+
+def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> int:
+    """Train as the first of ``processes``, or alone."""
     config = parse_config(arguments.overrides, arguments.resume)
     if arguments.port is not None and not arguments.view:
         raise DyngsError("--port goes with --view")
@@ -75,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
         listeners = [stack.enter_context(_view(arguments, config))] if arguments.view else []
         if arguments.resume is None:
             config = _with_poses(config)
-        folder = train(config, resume_from=arguments.resume, listeners=listeners)
+        folder = train(config, resume_from=arguments.resume, listeners=listeners, processes=processes)
     for line in _about_motion(folder, config):
         print(line)
     print(f"trained: {folder}\n{_next(folder, config)}")

@@ -72,6 +72,11 @@ class ColourTraining:
         """The colour network; None where the harmonics give the colours."""
         return None
 
+    @property
+    def learned(self) -> Parameters | None:
+        """What ``optimize`` updates; None: nothing."""
+        return None
+
     def penalties(self, gaussians: Gaussians) -> dict[str, Tensor]:
         """Return differentiable regularizers, weighted, by name."""
         if self.entropy_weight == 0:
@@ -135,6 +140,10 @@ class NetworkTraining(ColourTraining):
         count = self.options.depth + 1
         layers = (Layer(self.parameters[f"weight{i}"], self.parameters[f"bias{i}"]) for i in range(count))
         return ColourNetwork(tuple(layers), self.box, self.sees_time, self.options.normals)
+
+    @property
+    def learned(self) -> Parameters:
+        return self.parameters
 
     def optimize(self, step: int) -> int:
         return self.parameters.update(step, rate_factor(step, self.steps, self.options.warm_up))

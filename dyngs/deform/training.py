@@ -28,6 +28,7 @@ from dyngs.deform.standing.start import FirstMotion, first_motion
 from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.parameters import Parameters
 from dyngs.scene import Moment, Scene, Variant
 from dyngs.state import Role, State, with_role
 from dyngs.static.filters import FILTER_VARIANCE, filter_std
@@ -149,6 +150,10 @@ class DynamicTraining:
             return 0
         progress = self.schedule.rates.progress(step, since=self.schedule.decays)
         return scene.field.parameters.step(step - self.schedule.fine, progress)
+
+    def learned(self, scene: DynamicScene) -> Parameters | None:
+        """Return what the field learns."""
+        return None if scene.field is None else scene.field.parameters
 
     def after_step(self, scene: DynamicScene, step: int, edited: bool) -> DynamicScene:
         """Return the scene with its filter up to date, the field extended to new times, still Gaussians frozen."""

@@ -62,6 +62,10 @@ class Densifier(Protocol):
         """Take in the probe's gradient (V, N, 4) and radii (V, N, 2) of pictures of ``size`` (width, height)."""
         ...
 
+    def tallies(self, step: int, count: int) -> list[Tensor]:
+        """Return what ``step`` has taken in of N = ``count`` Gaussians; processes that share it sum it in place."""
+        ...
+
     def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
         """Return the edit after ``step``; None if nothing changes."""
         ...
@@ -101,6 +105,7 @@ class DefaultDensifier:
         self.options, self.schedule, self.extent = options, schedule, extent
         self.grad_sum = torch.zeros(0, device="cpu")
         self.seen = torch.zeros(0, device="cpu")
+        self._step_grad_sum, self._step_seen = self.grad_sum, self.seen
 
     def wants_signal(self, step: int) -> bool:
         return step < self.schedule.stop
@@ -108,17 +113,22 @@ class DefaultDensifier:
     def after_backward(self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]) -> None:
         if not self.wants_signal(step):
             return
-        if len(self.seen) != probe_grad.shape[1]:
-            self.grad_sum = torch.zeros(probe_grad.shape[1], device=probe_grad.device)
-            self.seen = torch.zeros(probe_grad.shape[1], device=probe_grad.device)
+        self._begin_step(probe_grad.shape[1], probe_grad.device)
         grad = probe_grad[..., 2:] if self.options.absgrad else probe_grad[..., :2]
         x, y = grad[..., 0] * (0.5 * size[0]), grad[..., 1] * (0.5 * size[1])
         length = torch.hypot(x, y)
         counts = (radii > 0).all(-1) & length.isfinite()  # a view without a usable gradient says nothing
-        self.grad_sum += torch.where(counts, length, 0.0).sum(0)
-        self.seen += counts.sum(0)
+        self._step_grad_sum += torch.where(counts, length, 0.0).sum(0)
+        self._step_seen += counts.sum(0)
+
+    def tallies(self, step: int, count: int) -> list[Tensor]:
+        if not self.wants_signal(step):
+            return []
+        self._begin_step(count, self._step_seen.device)
+        return [self._step_grad_sum, self._step_seen]
 
     def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
+        self._take_in_step()
         resets = step in self.schedule.resets
         parameters = parameters.detach()
         if self.schedule.densifies_at(step) and len(self.seen) == len(parameters):
@@ -140,11 +150,27 @@ class DefaultDensifier:
         self.options = self.options.model_copy(update={"max_gaussians": max_gaussians})
 
     def state(self) -> dict[str, Tensor]:
+        self._take_in_step()
         return {"grad_sum": self.grad_sum, "seen": self.seen}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         count = len(state["seen"])
         self.grad_sum, self.seen = (require_tensor(x, state[x], (count,)).clone() for x in ("grad_sum", "seen"))
+        self._step_grad_sum, self._step_seen = (torch.zeros(0, device=self.seen.device) for _ in range(2))
+
+    def _begin_step(self, count: int, device: torch.device) -> None:
+        if len(self._step_seen) != count:
+            self._step_grad_sum, self._step_seen = (torch.zeros(count, device=device) for _ in range(2))
+
+    def _take_in_step(self) -> None:
+        """Add what the views of a step have said to what those before it have."""
+        if not len(self._step_seen):
+            return
+        if len(self.seen) != len(self._step_seen):
+            self.grad_sum, self.seen = (torch.zeros_like(self._step_seen) for _ in range(2))
+        self.grad_sum += self._step_grad_sum
+        self.seen += self._step_seen
+        self._step_grad_sum, self._step_seen = (torch.zeros(0, device=self.seen.device) for _ in range(2))
 
     def _densify(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
         max_scale = PRUNE_SCALE * self.extent if step > self.schedule.prune_scale_after else math.inf

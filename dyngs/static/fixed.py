@@ -19,6 +19,9 @@ class FixedDensifier:
     def after_backward(self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]) -> None:
         return None
 
+    def tallies(self, step: int, count: int) -> list[Tensor]:
+        return []
+
     def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
         return None
 

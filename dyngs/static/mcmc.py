@@ -38,6 +38,9 @@ class McmcDensifier:
     def after_backward(self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]) -> None:
         return None
 
+    def tallies(self, step: int, count: int) -> list[Tensor]:
+        return []
+
     def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
         if not self.schedule.densifies_at(step):
             return None

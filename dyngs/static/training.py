@@ -65,6 +65,9 @@ class StaticTraining:
         """Return 0: the scene learns nothing beside its Gaussians."""
         return 0
 
+    def learned(self, scene: Scene) -> None:
+        """Return None, as ``optimize`` says."""
+
     def after_step(self, scene: StaticScene, step: int, edited: bool) -> StaticScene:
         if self._update.is_due(step, edited):
             return replace(scene, filter_std=self._update.of(scene.gaussians))

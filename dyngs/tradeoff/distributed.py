@@ -5,7 +5,6 @@ They may run on several machines that share a file system: they exchange results
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta
@@ -13,8 +12,8 @@ from datetime import timedelta
 import torch
 
 from dyngs.api.train import num_cores
-from dyngs.errors import DyngsError
 from dyngs.tradeoff.variants import Variant
+from dyngs.training.processes import numbers_of_torchrun
 
 TIMEOUT = timedelta(days=30)
 """A process may have to wait while others train."""
@@ -41,13 +40,8 @@ class ProcessGroup:
         Raises:
             DyngsError: one of the variables is not a number.
         """
-        names = ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")
-        if any(name not in os.environ for name in (*names, "MASTER_ADDR", "MASTER_PORT")):
-            return SINGLE_PROCESS
-        try:
-            return ProcessGroup(*(int(os.environ[name]) for name in names))
-        except ValueError:
-            raise DyngsError(f"{', '.join(names)} must be numbers, as torchrun sets them") from None
+        numbers = numbers_of_torchrun()
+        return SINGLE_PROCESS if numbers is None else ProcessGroup(*numbers)
 
     @property
     def is_first(self) -> bool:

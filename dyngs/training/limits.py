@@ -14,6 +14,7 @@ from dyngs.conventions import num_sh_terms
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.errors import DyngsError
+from dyngs.training.processes import Processes
 
 RANDOM_SHARE = 0.1
 """Share of the limit that is kept free for the random Gaussians with which motion begins."""
@@ -32,6 +33,7 @@ def require_possible(config: Config) -> None:
             raise DyngsError("camera.refine: cameras of people are not refined, their poses are; leave it out")
         case _:
             pass
+    _require_batch(config)
     budget = config.budget
     given = [name for name, value in budget.model_dump().items() if value is not None]
     if given and network_of(config) is not None:
@@ -43,6 +45,40 @@ def require_possible(config: Config) -> None:
             "train.minutes: how long the stage of prune.* takes cannot be foreseen; leave that out and run "
             "`dyngs prune` afterwards"
         )
+
+
+def shared(config: Config, processes: Processes) -> Config:
+    """Return ``config`` for so many processes: with one view for each of them where one per step was asked for.
+
+    Raises:
+        DyngsError: what is asked for needs one process, or the views of a step cannot be shared evenly.
+    """
+    if processes.size == 1:
+        return config
+    for key, value in {"train.minutes": config.train.minutes, "budget.min_fps": config.budget.min_fps}.items():
+        if value is not None:
+            raise DyngsError(f"{key}={value:g}: is measured with one process; leave it out, or start without torchrun")
+    if config.train.batch_size == 1:
+        config = config.model_copy(update={"train": config.train.model_copy(update={"batch_size": processes.size})})
+    processes.share(config.train.batch_size)
+    return config
+
+
+def _require_batch(config: Config) -> None:
+    """Raise where several views per step are asked for, and something that follows single pictures."""
+    if config.train.batch_size == 1:
+        return
+    asked = f"train.batch_size={config.train.batch_size}"
+    if network_of(config) is not None:
+        raise DyngsError(f"{asked}: a network is trained on one person per step, by one process; leave it out")
+    single = {
+        "train.robust": config.train.robust,
+        "train.exposure": config.train.exposure,
+        "camera.refine": config.camera.refine,
+    }
+    for key, value in single.items():
+        if value != "never":
+            raise DyngsError(f"{asked}: {key}={value} follows one picture per step; give {key}=never, or one process")
 
 
 def within_cap(config: Config, num_times: int) -> Config:

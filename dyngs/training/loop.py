@@ -77,6 +77,7 @@ class Loop:
 
     Attributes:
         trainer: a listener may exchange it for one on other schedules.
+        before_step: is told the trainer of each step that is about to begin.
     """
 
     def __init__(
@@ -84,6 +85,7 @@ class Loop:
     ) -> None:
         self.trainer, self.total, self.watch = trainer, total, watch
         self._advice = advice
+        self.before_step: Callable[[Trainable], None] = lambda _: None
         self._listeners: list[Listener] = []
 
     def subscribe(self, *listeners: Listener) -> None:
@@ -111,6 +113,7 @@ class Loop:
 
     def _step(self) -> StepReport:
         try:
+            self.before_step(self.trainer)
             return self.trainer.step()
         except DyngsError as error:
             if self._advice is None:

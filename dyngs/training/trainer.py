@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -32,6 +33,7 @@ from dyngs.training.camera_refinement import CameraRefinement, watched
 from dyngs.training.events import StepReport
 from dyngs.training.exposure import ViewExposures
 from dyngs.training.priors.used import StepView, UsedPriors
+from dyngs.training.processes import Processes
 from dyngs.training.robust import RobustMasks
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.schedule import active_sh_degree, means_rate, picture_divisor, rates_of
@@ -59,6 +61,7 @@ class Trainer:
         bad_gradients: how often a Gaussian was left out of a step because its gradient was not finite.
         held_out: indices of the training views that are not trained on up to ``held_out_until``.
         held_out_until: the last step without them.
+        processes: that take a share of the views of each step; one: this.
     """
 
     config: Config
@@ -84,6 +87,7 @@ class Trainer:
     bad_gradients: int = 0
     held_out: frozenset[int] = frozenset()
     held_out_until: float = math.inf
+    processes: Processes = field(default_factory=Processes)
 
     @property
     def num_gaussians(self) -> int:
@@ -94,14 +98,51 @@ class Trainer:
         return self.scene.num_moving
 
     def step(self) -> StepReport:
-        """Train on one picture.
+        """Train on this process's share of the pictures of a step; the report is of the first of them.
 
         Raises:
-            DyngsError: the loss is not finite; says which term, and leaves the parameters as they were.
+            DyngsError: the loss is not finite; says which term, and leaves the parameters as they were. Other processes
+                have come to other Gaussians.
         """
-        config, step, scene = self.config, self.done + 1, self.scene
+        step, before = self.done + 1, self.optimizer.parameters
+        report, losses = None, []
+        for index, seed in self._next_views(step):
+            with _random_numbers(self.generator, seed):
+                last = self._backward(step, index)
+            report = last if report is None else report
+            losses.append(last.loss)
+        assert report is not None, "every process has a share"
+        loss = self._averaged(step, losses)
+        found = (self.alpha.finding if step == 1 else None, self._update(step))
+        variant = self.training.variant(self.scene, step)
+        if variant is not None:
+            found = (*found, decide(self, variant))
+        if self.optimizer.parameters is not before:
+            self.processes.require_same(tensors_of(self.scene.state()), f"after step {step}")
+        finding = "; ".join(text for text in found if text is not None) or None
+        return replace(report, loss=loss, finding=finding)
+
+    def _averaged(self, step: int, losses: Sequence[float]) -> float:
+        """Return the mean loss over the views of a step, and average their gradients, too."""
+        batch = self.config.train.batch_size
+        if batch == 1:
+            return losses[0]
+        leaves = [*self.optimizer.parameters.tensors().values()]
+        for learned in (self.colours.learned, self.training.learned(self.scene)):
+            leaves += [] if learned is None else learned.leaves
+        loss = torch.tensor([sum(losses)], device=leaves[0].device)
+        self.processes.sum_gradients_(leaves, loss)
+        self.processes.sum_(self.densifier.tallies(step, self.num_gaussians))
+        for x in leaves:
+            if x.grad is not None:
+                x.grad /= batch
+        return float(loss) / batch
+
+    def _backward(self, step: int, index: int) -> StepReport:
+        """Add the gradients of the picture of view ``index`` to those that are there, and return how it was drawn."""
+        config, scene = self.config, self.scene
         divisor = picture_divisor(config.train, step)
-        index, picture = self._next_picture(step, divisor)
+        picture = self._picture(index, step, divisor)
         background = background_colour(self.background, self.generator)
         moment = self.training.moment(scene, picture, step)
         probe = (
@@ -142,12 +183,7 @@ class Trainer:
             self.bad_gradients += self.exposures.optimize(index, step)
         if self.refinement is not None:
             self.bad_gradients += self.refinement.optimize(step, index, picture.cameras)
-        found = (self.alpha.finding if step == 1 else None, self._update(step))
-        variant = self.training.variant(self.scene, step)
-        if variant is not None:
-            found = (*found, decide(self, variant))
-        finding = "; ".join(text for text in found if text is not None) or None
-        return StepReport(step, loss, picture, rendered.detach(), truth, finding)
+        return StepReport(step, loss, picture, rendered.detach(), truth)
 
     def holds_out(self, index: int, step: int) -> bool:
         """Return whether the view ``index`` is held out in ``step``."""
@@ -214,16 +250,29 @@ class Trainer:
         options = replace(self.options, depth="expected", absgrad=False)
         return partial(self.scene.render, options=options, background=background)
 
-    def _next_picture(self, step: int, divisor: int) -> tuple[int, Picture]:
-        """Return the index and the picture of the view that ``step`` trains on; those after it begin to be decoded."""
-        wanted = self._wanted(step)
-        index = self.sampler.next(self.generator, wanted)
+    def _next_views(self, step: int) -> list[tuple[int, int | None]]:
+        """Return the indices of the views that ``step`` trains on here, each with the seed of its random numbers.
+
+        Without a seed they are those of the run. All processes draw the same views and seeds, and take their share.
+        """
+        batch, wanted = self.config.train.batch_size, self._wanted(step)
+        drawn = [self.sampler.next(self.generator, wanted) for _ in range(batch)]
+        share = self.processes.share(batch)
+        if batch == 1:
+            return [(drawn[0], None)]
+        seeds = torch.randint(2**62, (batch,), generator=self.generator, device="cpu").tolist()
+        return [(drawn[i], seeds[i]) for i in share]
+
+    def _picture(self, index: int, step: int, divisor: int) -> Picture:
+        """Return the picture of view ``index`` for ``step``; those after it begin to be decoded."""
         picture = self.pictures.shrunk(index, divisor)
         if self.pictures.decoded_ahead:
-            self.pictures.expect(self.sampler.coming(self.pictures.decoded_ahead, wanted))
+            batch, count = self.config.train.batch_size, self.pictures.decoded_ahead * self.processes.size
+            share, coming = self.processes.share(batch), self.sampler.coming(count, self._wanted(step))
+            self.pictures.expect([view for i, view in enumerate(coming) if i % batch in share])
         if self.refinement is not None:
             picture = replace(picture, cameras=watched(picture.cameras))
-        return index, picture
+        return picture
 
     def _options(self, step: int) -> RenderOptions:
         """Return how pictures are drawn in ``step``."""
@@ -299,6 +348,20 @@ class Trainer:
             return may_train(index) and not self.colours.holds_out(index, step) and not self.holds_out(index, step)
 
         return is_wanted if any(is_wanted(i) for i in range(len(self.pictures))) else may_train
+
+
+@contextmanager
+def _random_numbers(generator: torch.Generator, seed: int | None) -> Iterator[None]:
+    """Let ``generator`` draw the numbers of ``seed`` for a while; None: its own."""
+    if seed is None:
+        yield
+        return
+    own = generator.get_state()
+    generator.manual_seed(seed)
+    try:
+        yield
+    finally:
+        generator.set_state(own)
 
 
 def _finite_sum(terms: dict[str, Tensor], step: int, picture: Picture) -> float:

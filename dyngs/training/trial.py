@@ -32,7 +32,7 @@ def decide(trainer: Trainer, variant: Variant[Scene]) -> str:
     trainer.scene = variant.scene
     changed = _copied(trainer.checkpoint())
     before, after = (_mean_psnr(trainer, start, variant.steps) for start in (plain, changed))
-    wins = after > before
+    wins = trainer.processes.agreed(after > before)  # each process has seen pictures of its own
     trainer.restore(changed if wins else plain)
     trainer.bad_gradients = bad_gradients
     verdict = "taken" if wins else "not taken"

@@ -14,6 +14,7 @@ from dyngs.build import assemble
 from dyngs.config import Config, ControlNodesField
 from dyngs.scene import Variant
 from dyngs.training import trial
+from dyngs.training.processes import Processes
 from dyngs.training.state import Checkpoint, CheckpointInfo
 from dyngs.training.trainer import Trainer
 from dyngs.training.trial import decide
@@ -27,6 +28,7 @@ class Runner:
     def __init__(self) -> None:
         self.scene, self.done, self.bad_gradients = torch.tensor([20.0]), 7, 3
         self.seen: list[int] = []
+        self.processes = Processes()
 
     def checkpoint(self) -> Checkpoint:
         info = CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), "white", "classic")

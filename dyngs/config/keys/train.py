@@ -19,6 +19,12 @@ class TrainConfig(Section):
         description="longest time of training on this machine, min; fewer than train.steps are done if need be, with "
         "schedules to match, and a line at the end says what all would cost; 1 is a preview; null: no limit",
     )
+    batch_size: int = Field(
+        default=1,
+        ge=1,
+        description="views per step, whose gradients are averaged; processes that torchrun starts share them "
+        "(docs/several_processes.md), and 1 means one for each process there",
+    )
     initial_downscale: Literal[1, 2, 4, 8, 16] = Field(
         default=1, description="sides of the training pictures are divided by this at first; 1: full resolution"
     )

@@ -22,6 +22,7 @@ from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.subject import Subject
 from dyngs.human.avatar.unseen import HARDLY, filled, mirror_images, sightings, trust_in
+from dyngs.parameters import Parameters
 from dyngs.scene import Moment, Scene
 from dyngs.state import Role, State, StateTensor
 from dyngs.static.rates import Rates
@@ -113,6 +114,10 @@ class HumanTraining:
             for name in OF_FRAMES:
                 scene.learned[name].grad = None
         return scene.learned.step(step - self.refines_from, progress)
+
+    def learned(self, scene: HumanScene) -> Parameters:
+        """Return the corrections."""
+        return scene.learned
 
     def after_step(self, scene: HumanScene, step: int, edited: bool) -> HumanScene:
         return scene

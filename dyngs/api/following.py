@@ -1,0 +1,161 @@
+"""A run in several processes: the first one leads, the others do what it says.
+
+The first process reads what was asked for, chooses, limits, prunes, evaluates and writes, as if it were alone. Before
+each step it tells the others to do the same step, and where it has changed the scene outside of one it sends them all
+that a checkpoint holds. So the others need no run folder, and write nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import asdict
+from enum import IntEnum
+
+import torch
+from safetensors.torch import load, save
+
+from dyngs.build import build
+from dyngs.config import Config
+from dyngs.errors import DyngsError
+from dyngs.ops.memory import keep_freed_memory
+from dyngs.ops.native import kernel_threads
+from dyngs.training.events import Event, TopologyChanged
+from dyngs.training.interrupt import Interrupts
+from dyngs.training.loop import Trainable
+from dyngs.training.processes import Processes
+from dyngs.training.state import Checkpoint, CheckpointInfo
+from dyngs.training.trainer import Trainer
+
+
+class Order(IntEnum):
+    """What the first process tells the others to do."""
+
+    BUILD = 1
+    """Build the trainer of the configuration that follows."""
+    RESTORE = 2
+    """Take over the checkpoint that follows."""
+    STEP = 3
+    END = 4
+
+
+class Leader:
+    """The first process of a run: a listener, and what is to be called before each step of the loop.
+
+    Args:
+        processes: of the run.
+        config: that the trainer was built of.
+        threads: of the kernels in each process.
+    """
+
+    def __init__(self, processes: Processes, config: Config, threads: int) -> None:
+        self.processes, self._trainer, self._is_stale = processes, None, True
+        self._config = config.model_copy(update={"run": config.run.model_copy(update={"threads": threads})})
+
+    def __call__(self, event: Event) -> None:
+        match event:
+            case TopologyChanged():
+                self._is_stale = True
+
+    def before_step(self, trainer: Trainable) -> None:
+        """Let the others begin the step that ``trainer`` is about to do."""
+        if self.processes.size == 1 or not isinstance(trainer, Trainer):
+            return
+        if trainer is not self._trainer:
+            _tell(self.processes, Order.BUILD, json.dumps(self._config.model_dump(mode="json")).encode())
+            self._trainer, self._is_stale = trainer, True
+            trainer.processes = self.processes
+        if self._is_stale:
+            _tell(self.processes, Order.RESTORE, _packed(trainer.checkpoint()))
+            self._is_stale = False
+        _tell(self.processes, Order.STEP)
+
+
+def together(lead: Callable[[Processes], int]) -> int:
+    """Return the exit code of the processes that ``torchrun`` has started: the first calls ``lead``, the others follow.
+
+    Raises:
+        DyngsError: in the process that failed.
+        SystemExit: in the others.
+    """
+    with Processes.of_torchrun() as processes:
+        if not processes.is_first:
+            follow(processes)
+            return 0
+        try:
+            code = lead(processes)
+        except KeyboardInterrupt as stopped:
+            if stopped.args:  # between two steps, where the others wait to be told
+                _tell(processes, Order.END)
+            raise
+        _tell(processes, Order.END)
+    return code
+
+
+def follow(processes: Processes) -> None:
+    """Do what the first process says until it says that all is done; nothing is printed.
+
+    Raises:
+        DyngsError: a step failed here.
+    """
+    keep_freed_memory()
+    with (
+        open(os.devnull, "w", encoding="utf-8") as nowhere,
+        redirect_stdout(nowhere),
+        redirect_stderr(nowhere),
+        Interrupts(),  # the first process hears them, too, and says when to end
+    ):
+        order, payload = _heard(processes)
+        while order is Order.BUILD:
+            order, payload = _follow_run(processes, Config.model_validate(json.loads(payload)))
+
+
+def _follow_run(processes: Processes, config: Config) -> tuple[Order, bytes]:
+    """Follow a run to its end, and return what is to be done after it."""
+    with kernel_threads(config.run.threads or 1):
+        trainer = build(config, restored=True).scene_trainer
+        if trainer is None:
+            raise DyngsError("a network is trained by one process; start it without torchrun")
+        trainer.processes = processes
+        while True:
+            order, payload = _heard(processes)
+            match order:
+                case Order.RESTORE:
+                    trainer.restore(_unpacked(payload))
+                case Order.STEP:
+                    trainer.step()
+                case _:
+                    trainer.pictures.rest()
+                    return order, payload
+
+
+def _tell(processes: Processes, order: Order, payload: bytes = b"") -> None:
+    if processes.size == 1:
+        return
+    processes.send_(torch.tensor([order, len(payload)], dtype=torch.int64, device="cpu"))
+    if payload:
+        processes.send_(torch.frombuffer(bytearray(payload), dtype=torch.uint8))
+
+
+def _heard(processes: Processes) -> tuple[Order, bytes]:
+    head = torch.zeros(2, dtype=torch.int64, device="cpu")
+    processes.send_(head)
+    order, length = head.tolist()
+    payload = torch.zeros(length, dtype=torch.uint8, device="cpu")
+    if length:
+        processes.send_(payload)
+    return Order(order), payload.numpy().tobytes()
+
+
+def _packed(checkpoint: Checkpoint) -> bytes:
+    tensors = {name: x.detach().cpu().contiguous().clone() for name, x in checkpoint.tensors.items()}
+    return save(tensors, {"info": json.dumps(asdict(checkpoint.info))})
+
+
+def _unpacked(payload: bytes) -> Checkpoint:
+    header = json.loads(payload[8 : 8 + int.from_bytes(payload[:8], "little")])
+    info = json.loads(header["__metadata__"]["info"])
+    info["world_offset"] = tuple(info["world_offset"])
+    return Checkpoint(CheckpointInfo(**info), load(payload))

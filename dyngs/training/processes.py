@@ -1,0 +1,241 @@
+"""The processes that train one scene together, as ``torchrun`` starts them: each takes its share of a step's views.
+
+All hold the same scene and make the same changes to it, from gradients that are summed over them. Sums are formed in
+the order of the processes, whatever arrives first: a run repeats byte by byte, and where each process takes one view,
+the bytes are those of one process that takes them all.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+from types import TracebackType
+
+import torch
+from torch import Tensor, distributed
+from torch.distributed.distributed_c10d import PrefixStore, Store
+from torch.distributed.rendezvous import rendezvous
+
+from dyngs.errors import DyngsError
+
+TIMEOUT = timedelta(days=30)
+"""The others wait while the first one reads, evaluates, or tries settings in small runs."""
+CHUNK = 2**22
+"""Most values that are summed at once: the memory that a sum takes for a while, twice."""
+FAILED = "dyngs/failed"
+"""Key of the store that counts the processes that have said why they end."""
+EXIT_FAILED = 2
+"""Exit code of a process that ends because another one has failed, which has said why."""
+_NAMES = ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")
+
+
+def numbers_of_torchrun() -> tuple[int, int, int] | None:
+    """Return rank, number of processes, and number of those on this machine; None where ``torchrun`` did not start us.
+
+    Raises:
+        DyngsError: one of the variables is not a number.
+    """
+    if any(name not in os.environ for name in (*_NAMES, "MASTER_ADDR", "MASTER_PORT")):
+        return None
+    try:
+        rank, size, local_size = (int(os.environ[name]) for name in _NAMES)
+    except ValueError:
+        raise DyngsError(f"{', '.join(_NAMES)} must be numbers, as torchrun sets them") from None
+    return rank, size, local_size
+
+
+class Processes:
+    """This process and those that it trains with; a context in which they are connected.
+
+    Whoever fails first says why; the others then end with ``EXIT_FAILED`` and without a word.
+
+    Args:
+        rank: number of this process, from 0.
+        size: number of processes; 1: nothing is exchanged.
+        local_size: number of those on this machine.
+    """
+
+    def __init__(self, rank: int = 0, size: int = 1, local_size: int = 1) -> None:
+        self.rank, self.size, self.local_size = rank, size, local_size
+        self._store: Store | None = None
+
+    @staticmethod
+    def of_torchrun() -> Processes:
+        """Return the processes that ``torchrun`` has started, this one alone without it. Raises DyngsError."""
+        return Processes(*(numbers_of_torchrun() or (0, 1, 1)))
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this is the process that reads what was asked for, writes files, and speaks."""
+        return self.rank == 0
+
+    def __enter__(self) -> Processes:
+        """Connect the processes.
+
+        Raises:
+            DyngsError: the others cannot be reached.
+        """
+        if self.size == 1:
+            return self
+        backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and distributed.is_nccl_available() else "gloo"
+        try:
+            store, _, _ = next(iter(rendezvous("env://", timeout=TIMEOUT)))
+            self._store = PrefixStore("dyngs", store)
+            distributed.init_process_group(backend, store=store, rank=self.rank, world_size=self.size, timeout=TIMEOUT)
+        except (RuntimeError, ValueError) as error:
+            raise DyngsError(f"the {self.size} processes cannot reach each other: {error}") from None
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the others; raise SystemExit instead of an error where another process has told one already."""
+        if self.size == 1:
+            return
+        if isinstance(error, Exception) and not self._speaks_first():
+            raise SystemExit(EXIT_FAILED) from None
+        if error is None:
+            distributed.destroy_process_group()
+
+    def share(self, batch: int) -> range:
+        """Return which of the ``batch`` views of a step this process takes.
+
+        Raises:
+            DyngsError: they cannot be shared evenly.
+        """
+        each, rest = divmod(batch, self.size)
+        if rest or not each:
+            raise DyngsError(
+                f"train.batch_size={batch} views cannot be shared evenly among {self.size} processes; give a multiple "
+                f"of {self.size}, or start another number of processes"
+            )
+        return range(self.rank * each, (self.rank + 1) * each)
+
+    def sum_(self, tensors: Sequence[Tensor]) -> None:
+        """Replace float32 tensors, of the same shapes in all processes, by their sums over the processes."""
+        if self.size == 1:
+            return
+        for bucket in _buckets(tensors):
+            flat = bucket[0].reshape(-1) if len(bucket) == 1 else torch.cat([x.reshape(-1) for x in bucket])
+            for chunk in flat.split(CHUNK):
+                chunk.copy_(self._summed(chunk))
+            for x, values in zip(bucket, flat.split([x.numel() for x in bucket]), strict=True):
+                if values.data_ptr() != x.data_ptr():
+                    x.copy_(values.view_as(x))
+
+    def sum_gradients_(self, leaves: Sequence[Tensor], report: Tensor) -> None:
+        """Replace the gradients of ``leaves`` and the values of ``report`` (R,), in place, by their sums.
+
+        A leaf without a gradient in all processes keeps none.
+        """
+        if self.size == 1:
+            return
+        counts = torch.tensor([float(x.grad is not None) for x in leaves], device=report.device)
+        head = torch.cat([report, counts])
+        self.sum_([head])
+        report.copy_(head[: len(report)])
+        used = [x for x, count in zip(leaves, head[len(report) :].tolist(), strict=True) if count > 0]
+        for x in used:
+            x.grad = torch.zeros_like(x) if x.grad is None else x.grad.contiguous()
+        self.sum_([x.grad for x in used if x.grad is not None])
+
+    def agreed(self, choice: bool) -> bool:
+        """Return the choice of the first process."""
+        if self.size == 1:
+            return choice
+        said = torch.tensor([int(choice)], device="cpu")
+        self.send_(said)
+        return bool(said)
+
+    def send_(self, values: Tensor) -> None:
+        """Replace the values of a tensor by those of the first process."""
+        if self.size > 1:
+            with self._connected():
+                distributed.broadcast(values, 0)
+
+    def require_same(self, tensors: Mapping[str, Tensor], when: str) -> None:
+        """Raise unless the tensors have the same bytes in all processes.
+
+        Args:
+            tensors: name to value.
+            when: begins the message.
+
+        Raises:
+            DyngsError: one has others than the first.
+        """
+        if self.size == 1:
+            return
+        own = torch.tensor([_checksum(tensors)], dtype=torch.int64, device="cpu")
+        sums = [torch.zeros_like(own) for _ in range(self.size)]
+        with self._connected():
+            distributed.all_gather(sums, own)
+        others = [rank for rank, x in enumerate(sums) if int(x) != int(sums[0])]
+        if others:
+            raise DyngsError(
+                f"{when}: process {others[0]} has come to other Gaussians than process 0; start all on machines of one "
+                "kind, with the same version and the same files, or give all of them one DYNGS_ISA"
+            )
+
+    def _summed(self, x: Tensor) -> Tensor:
+        """Return the sum (n,) over the processes: each sums a part of the values, in the order of the processes."""
+        length = -(-len(x) // self.size)
+        own = torch.nn.functional.pad(x, (0, self.size * length - len(x)))
+        parts = torch.empty_like(own)
+        with self._connected():
+            distributed.all_to_all_single(parts, own)
+            total, *others = parts.view(self.size, length)
+            for part in others:
+                total += part
+            distributed.all_gather(list(own.view(self.size, length)), total.contiguous())
+        return own[: len(x)]
+
+    @contextmanager
+    def _connected(self) -> Iterator[None]:
+        """Turn the error of a broken connection into the end of this process."""
+        try:
+            yield
+        except RuntimeError:
+            if self._said() > 0:
+                raise SystemExit(EXIT_FAILED) from None
+            raise DyngsError(
+                f"process {self.rank} of {self.size} has lost the others: one has ended without a word (too little "
+                "memory?)"
+            ) from None
+
+    def _speaks_first(self) -> bool:
+        return self._store is None or self._store.add(FAILED, 1) == 1
+
+    def _said(self) -> int:
+        """Return how many processes have said why they end."""
+        try:
+            return 0 if self._store is None else self._store.add(FAILED, 0)
+        except RuntimeError:  # who kept the store has ended
+            return 0
+
+
+def _checksum(tensors: Mapping[str, Tensor]) -> int:
+    """Return a number that changes with any bit of the tensors."""
+    total = 0
+    for name, x in sorted(tensors.items()):
+        values = x.detach().contiguous().reshape(-1)
+        values = values.view(torch.int32) if values.dtype is torch.float32 else values.long()
+        found = len(name) * 31 + x.dim()
+        for start, chunk in enumerate(values.split(CHUNK)):
+            places = torch.arange(1, len(chunk) + 1, device=chunk.device)
+            found += (start + 1) * int((chunk.long() * (2 * places + 1)).sum())
+        total = (total * 1_000_003 + found) % 2**63
+    return total
+
+
+def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
+    """Yield the tensors in order, small ones together, up to ``CHUNK`` values."""
+    bucket: list[Tensor] = []
+    for x in (x for x in tensors if x.numel()):
+        if bucket and sum(y.numel() for y in bucket) + x.numel() > CHUNK:
+            yield bucket
+            bucket = []
+        bucket.append(x)
+    if bucket:
+        yield bucket

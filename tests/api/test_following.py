@@ -1,0 +1,149 @@
+"""Runs in several processes: the bytes of one process, one writer, one line where one fails."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import several_processes as do
+import torch
+from several_processes import run_in
+from tiny_fields import busy_config
+
+from dyngs.api.train import train
+from dyngs.config import (
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    HumanModel,
+    RandomInit,
+    RunConfig,
+    StaticModel,
+    TrainConfig,
+)
+from dyngs.errors import DyngsError
+from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint
+from dyngs.training.processes import Processes
+
+BUSY = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150)
+
+
+def _still(capture: Path, run: Path, **options: object) -> Config:
+    return Config(
+        data=DataConfig(root=capture, background="random"),
+        model=StaticModel(sh_degree=1),
+        init=RandomInit(num_random=60),
+        strategy=BUSY,
+        train=TrainConfig.model_validate({"steps": 12, "log_every": 1, "remove_floaters": False, **options}),
+        run=RunConfig(dir=run, threads=1),
+    )
+
+
+def _moving(capture: Path, run: Path, batch: int) -> Config:
+    config = busy_config(capture, run, "control_nodes", compare_with_still=False)
+    return config.model_copy(update={"train": TrainConfig(steps=24, log_every=1, batch_size=batch)})
+
+
+def _person(capture: Path, run: Path, batch: int) -> Config:
+    return Config(
+        data=DataConfig(root=capture),
+        model=HumanModel(resolution=16, sh_degree=0, refine_from=0.2),
+        strategy=BUSY.model_copy(update={"grow": False, "prune_opacity": 0.09}),
+        train=TrainConfig(steps=8, batch_size=batch),
+        run=RunConfig(dir=run, threads=1),
+    )
+
+
+def _require_same_bytes(one: Path, other: Path) -> None:
+    first, second = latest_checkpoint(one), latest_checkpoint(other)
+    assert first.info == second.info
+    assert first.tensors.keys() == second.tensors.keys()
+    assert [name for name, x in first.tensors.items() if not torch.equal(x, second.tensors[name])] == []
+
+
+@pytest.fixture(scope="module")
+def small_person(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    options = HumanOptions(size=32, num_frames=3, num_new=1, num_cameras=2, num_test=1, samples=1)
+    return write_human_capture(tmp_path_factory.mktemp("person"), options)
+
+
+def test_two_processes_end_with_the_bytes_of_one(moving: Path, still: Path, small_person: Path, tmp_path: Path) -> None:
+    def configs(folder: str) -> list[Config]:
+        return [
+            _still(still, tmp_path / folder / "still", batch_size=2),
+            _moving(moving, tmp_path / folder / "moving", 2),
+            _person(small_person, tmp_path / folder / "person", 2),
+        ]
+
+    codes, said = run_in(2, do.trained, tmp_path, configs("two"))
+    assert codes == [0, 0], said
+    assert said[1] == ""
+    for config in configs("one"):
+        train(config)
+        assert config.run.dir is not None
+        _require_same_bytes(config.run.dir, tmp_path / "two" / config.run.dir.name)
+    counts = {line.split(" Gaussians")[0].split()[-1] for line in said[0].splitlines() if line.startswith("step ")}
+    assert len(counts) > 3, "the set of Gaussians changes"
+
+
+def test_four_do_so_too_and_write_one_run(moving: Path, still: Path, tmp_path: Path) -> None:
+    four = [_still(still, tmp_path / "four"), _moving(moving, tmp_path / "four_m", 4)]
+    codes, said = run_in(4, do.trained, tmp_path, four)
+    assert codes == [0] * 4, said
+    assert said[1:] == ["", "", ""]
+    train(_still(still, tmp_path / "one", batch_size=4))  # one view for each process is what four take
+    train(_moving(moving, tmp_path / "one_m", 4))
+    _require_same_bytes(tmp_path / "one", tmp_path / "four")
+    _require_same_bytes(tmp_path / "one_m", tmp_path / "four_m")
+    assert sorted(path.name for path in (tmp_path / "four").iterdir()) == sorted(
+        path.name for path in (tmp_path / "one").iterdir()
+    )
+
+
+def test_two_views_for_each_process_differ_by_rounding(still: Path, tmp_path: Path) -> None:
+    few = {"batch_size": 4, "steps": 3}
+    codes, said = run_in(2, do.trained, tmp_path, [_still(still, tmp_path / "two", **few)])
+    assert codes == [0, 0], said
+    train(_still(still, tmp_path / "one", **few))
+    one, two = (latest_checkpoint(tmp_path / name).part("gaussians") for name in ("one", "two"))
+    for name, x in one.items():
+        torch.testing.assert_close(x, two[name], rtol=1e-4, atol=1e-5)
+
+
+def test_a_run_goes_on_in_another_number_of_processes(still: Path, tmp_path: Path) -> None:
+    whole, parted = (_still(still, tmp_path / name, batch_size=2, save_every=5) for name in ("whole", "parted"))
+    train(whole)
+    train(parted)
+    for path in checkpoint_paths(tmp_path / "parted")[-1:]:
+        path.unlink()
+    assert latest_checkpoint(tmp_path / "parted").info.step < 12
+    codes, said = run_in(2, do.resumed, tmp_path, tmp_path / "parted")
+    assert codes == [0, 0], said
+    _require_same_bytes(tmp_path / "whole", tmp_path / "parted")
+
+
+@pytest.mark.parametrize(
+    ("fails", "line"),
+    [
+        ("step", "dyngs: error: picture 3 is damaged"),
+        ("weights", "after step 5: process 1 has come to other Gaussians than process 0"),
+        ("death", "has lost the others: one has ended without a word"),
+    ],
+)
+def test_where_one_fails_all_end_with_one_line(fails: str, line: str, still: Path, tmp_path: Path) -> None:
+    codes, said = run_in(2, do.trained, tmp_path, [_still(still, tmp_path / "run")], fails)
+    assert codes == [2, 9 if fails == "death" else 2]
+    errors = [x for text in said for x in text.splitlines() if not x.startswith(("memory:", "step "))]
+    assert len(errors) == 1
+    assert line in errors[0]
+
+
+def test_what_needs_one_process_says_so(still: Path, tmp_path: Path) -> None:
+    two = Processes(0, 2)
+    with pytest.raises(DyngsError, match="minutes=1: is measured with one process; leave it out, or start without"):
+        train(_still(still, tmp_path / "run", minutes=1), processes=two)
+    with pytest.raises(DyngsError, match=r"batch_size=2: train[.]robust=always follows one picture per step"):
+        train(_still(still, tmp_path / "run", robust="always"), processes=two)
+    with pytest.raises(DyngsError, match="batch_size=5 views cannot be shared evenly among 2"):
+        train(_still(still, tmp_path / "run", batch_size=5), processes=two)

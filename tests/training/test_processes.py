@@ -1,0 +1,68 @@
+"""Several processes: sums in their order, one choice for all, and an error where they have come apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from several_processes import run_in, summed
+
+from dyngs.errors import DyngsError
+from dyngs.training.processes import Processes, _checksum, numbers_of_torchrun
+
+
+def test_views_are_shared_evenly_in_order_and_each_once() -> None:
+    for size, batch in ((1, 1), (1, 5), (2, 2), (4, 12)):
+        shares = [Processes(rank, size).share(batch) for rank in range(size)]
+        assert [view for share in shares for view in share] == list(range(batch))
+        assert len({len(share) for share in shares}) == 1
+    with pytest.raises(DyngsError, match="batch_size=3 views cannot be shared evenly among 2 processes; give a mult"):
+        Processes(0, 2).share(3)
+    with pytest.raises(DyngsError, match="cannot be shared"):
+        Processes(0, 2).share(0)
+
+
+def test_alone_nothing_is_exchanged() -> None:
+    alone, x = Processes(), torch.ones(3, requires_grad=True)
+    with alone:
+        alone.sum_([x])
+        alone.sum_gradients_([x], torch.ones(1))
+        alone.require_same({"x": x}, "now")
+        assert alone.agreed(True)
+        assert not alone.agreed(False)
+    assert x.tolist() == [1, 1, 1]
+    assert x.grad is None
+    assert alone.is_first
+
+
+def test_what_torchrun_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = {"RANK": "1", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "here", "MASTER_PORT": "1"}
+    for name, value in names.items():
+        monkeypatch.delenv(name, raising=False)
+        assert numbers_of_torchrun() is None
+        monkeypatch.setenv(name, value)
+    assert numbers_of_torchrun() == (1, 4, 2)
+    monkeypatch.setenv("WORLD_SIZE", "many")
+    with pytest.raises(DyngsError, match="must be numbers, as torchrun sets them"):
+        Processes.of_torchrun()
+
+
+@pytest.mark.parametrize("changed", [0, 1, 5])
+def test_the_checksum_sees_every_bit_and_place(changed: int) -> None:
+    x = torch.tensor([0.0, 1.0, -2.5, 1e-30, 7.0, 8.0])
+    before = _checksum({"x": x, "flags": x > 0})
+    assert _checksum({"flags": x > 0, "x": x.clone()}) == before
+    other = x.clone()
+    other.view(torch.int32)[changed] += 1
+    assert _checksum({"x": other, "flags": x > 0}) != before
+    assert _checksum({"x": x.flip(0), "flags": x > 0}) != before
+    assert _checksum({"x": x, "flags": x > 5}) != before
+
+
+def test_sums_are_those_of_a_loop_and_what_differs_is_an_error_of_one_line(tmp_path: Path) -> None:
+    codes, said = run_in(3, summed, tmp_path)
+    assert codes == [2, 2, 2]
+    lines = [line for text in said for line in text.splitlines()]
+    assert len(lines) == 1, "one tells it, the others end without a word"
+    assert "after step 8: process 1 has come to other Gaussians than process 0" in lines[0]
