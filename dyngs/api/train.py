@@ -62,7 +62,7 @@ from dyngs.training.interrupt import Interrupts
 from dyngs.training.limits import require_possible, shared
 from dyngs.training.longer import told, with_length
 from dyngs.training.loop import Loop, Stopwatch
-from dyngs.training.memory import memory_forecast
+from dyngs.training.memory import memory_forecast, require_room
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
 
@@ -189,6 +189,8 @@ class _Run:
         threads: int,
     ) -> None:
         watch = Stopwatch()
+        if resumed is None:
+            require_room(config)
         built = build(config, restored=resumed is not None)
         self.folder, self.limits = folder, dict[str, Limit]()
         self.loop = Loop(built.trainer, config.total_steps, watch, lambda: last_good(folder))
@@ -202,7 +204,7 @@ class _Run:
         )
         self._config, self._saved = config, self.loop.trainer.done
         if self.limited is not None and asked is not None:
-            _tell_memory(self.limited.trainer)
+            _tell_memory(self.limited.trainer, processes.local_size)
         self._meter: CostMeter | None = None
         if self.limited is not None:
             self._set_limits(self.limited, resumed)
@@ -341,10 +343,15 @@ class _Run:
             yield self.limits[_SPEED].reached()
 
 
-def _tell_memory(trainer: Trainer) -> None:
-    """Print how much memory a run will take, and a warning where that is more than is there."""
-    forecast = memory_forecast(trainer)
+def _tell_memory(trainer: Trainer, processes: int) -> None:
+    """Print how much memory a run will take, and a warning where that is likely to be more than is there.
+
+    Raises:
+        DyngsError: it is certain to be more than this machine can give.
+    """
+    forecast = memory_forecast(trainer, processes)
     print(forecast, flush=True)
+    forecast.require_possible()
     warning = forecast.warning()
     if warning is not None:
         print(f"dyngs: warning: {warning}", file=sys.stderr, flush=True)

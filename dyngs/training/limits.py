@@ -127,7 +127,7 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
     fixed, moves_by = 0.0, field_of(config)
     each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(stored_sh_degree(config)) - 1)
     if moves_by is not None and num_times > 1:
-        one, two = (_field_values(moves_by, num_times, count) for count in (1, 2))
+        one, two = (num_field_values(moves_by, num_times, count) for count in (1, 2))
         fixed, each = FIELD_BYTES * (2 * one - two), each + FIELD_BYTES * (two - one)
     found = int((1e6 * megabytes - fixed) / each)
     if found < FEWEST:
@@ -139,7 +139,7 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
     return found
 
 
-def _field_values(options: DeformField, num_times: int, num_moving: int) -> int:
+def num_field_values(options: DeformField, num_times: int, num_moving: int) -> int:
     """Return the number of values that a field learns."""
     setup = FieldSetup(torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0)
     return new_field(options, setup, torch.Generator()).parameters.num_values

@@ -8,26 +8,60 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from dyngs.config import Config, DefaultStrategy, FixedStrategy, McmcStrategy
-from dyngs.config.kinds import stored_sh_degree
+from typing_extensions import assert_never
+
+from dyngs.config import (
+    Config,
+    ControlNodesField,
+    DefaultStrategy,
+    FixedStrategy,
+    HexplaneField,
+    McmcStrategy,
+    MlpField,
+    RandomInit,
+    TrajectoryField,
+)
+from dyngs.config.kinds import added_for_motion, field_of, person_of, stored_sh_degree
 from dyngs.conventions import num_sh_terms
-from dyngs.training.schedule import densify_schedule
+from dyngs.errors import DyngsError
+from dyngs.training.limits import num_field_values
+from dyngs.training.schedule import densify_schedule, growth_per_change
 from dyngs.training.trainer import Trainer
 
 COPIES = 7
 """Float32 copies of the values of a Gaussian: value, gradient, two moments, and room for three more when their set
 changes. Measured: 1.65 kB per Gaussian with harmonics of degree 3, whose 59 values take 0.24 kB."""
+NEEDED_COPIES = 4
+"""Of these, what is there in every step: value, gradient, two moments."""
+POSING_BYTES = 2600
+"""Bytes of a Gaussian of a person beside that, where the body fit is refined: its anchor, weights of joints, their
+gradients, and the Gaussian in a pose."""
+MOVING_BYTES = 200
+"""Bytes beside that of a Gaussian that control nodes or its own trajectory move: the Gaussian at a time."""
+LOOKUP_COPIES = 12
+"""Float32 copies of the features that a Gaussian takes from space-time grids: six planes, twice."""
+ACTIVATION_COPIES = 3
+"""Float32 copies of the neurons of a network that moves Gaussians: before and behind, and a gradient."""
+FIELD_COPIES = 5
+"""Float32 copies of what all Gaussians of a field share: value, gradient, two moments, and one for the penalties."""
+FEW_TIMES = 100
+"""Distinct times for which the values of a field are counted where their number does not matter."""
 SHAPE_VALUES = 11
 """Values of a Gaussian beside its harmonics: position, rotation, sizes, opacity."""
 DRAWING_BYTES = 200
 """Bytes per pixel of the largest picture that a step takes beside them: rendering, truth, windows of SSIM."""
+STEP_BYTES = 30_000_000
+"""Bytes of any step: code and buffers that the first one touches."""
 DECODING_BYTES = 45
 """Bytes per pixel of the file that decoding takes for a while: floats for shrinking and undistorting. Measured, as that
 above, on photos of 12 megapixels."""
 USUAL_GAUSSIANS, USUAL_CHANGES = 250_000, 34
 """Gaussians that photos led to in 7,000 steps (fox 268,000, cup 204,000, lego 173,000: docs/benchmarks.md), in which
-their set changes so often."""
+their set changes so often; fewer in proportion in shorter runs."""
+USUAL_SIDE = 400
+"""Longest side of the pictures, px, from which on that holds; below it goes with the root of the side."""
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+_SWAP = "/sys/fs/cgroup/memory.swap.max"
 _USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
 
 
@@ -39,70 +73,223 @@ class MemoryForecast:
         program: taken already.
         pictures: that decoded ones will take, in the cache or on their way to it.
         drawing: for a step.
-        gaussians: for ``count`` of them, those that may be expected.
+        field: of what all Gaussians share: grids and networks of a deformation field.
+        count: Gaussians that may be expected.
         most: Gaussians that the strategy allows.
+        least: Gaussians that there will certainly be at some time.
         each: bytes of a Gaussian.
+        least_each: bytes that a Gaussian certainly takes.
         free: of this machine and this process's limits, beside what is taken already; None: not known.
+        whole: of this machine with its swap, or the limit of its container; None: not known.
         all_kept: every picture has its place in the cache.
+        processes: on this machine that take as much.
+        longest_side: of the pictures, px.
+        limits: key that limits the number of Gaussians, and its value at ``count`` of them.
     """
 
     program: int
     pictures: int
     drawing: int
+    field: int
     count: int
     most: int
+    least: int
     each: int
+    least_each: int
     free: int | None
+    whole: int | None
     all_kept: bool
+    processes: int = 1
+    longest_side: int = 0
+    limits: tuple[str, int] = ("strategy.max_gaussians", 0)
 
     @property
     def total(self) -> int:
-        return self.program + self.pictures + self.drawing + self.count * self.each
+        """Of a process."""
+        return self.program + self.pictures + self.drawing + self.field + self.count * self.each
+
+    @property
+    def certain(self) -> int:
+        """What a process takes at least: without the room that an allocator needs, and whatever is drawn."""
+        return self.program + self.pictures + self.least * self.least_each
 
     def __str__(self) -> str:
         kept = "all kept" if self.all_kept else "as many as data.cache_mb keeps"
         parts = f"{_gb(self.program)} program, {_gb(self.pictures)} pictures ({kept}), {_gb(self.drawing)} drawing, "
+        parts += f"{_gb(self.field)} field, " if self.field else ""
         parts += f"{_gb(self.count * self.each)} for some {self.count:,} Gaussians"
         if self.most > 2 * self.count:
             parts += f"; {_gb(self.most * self.each)} for the {self.most:,} that strategy.max_gaussians allows"
-        free = "" if self.free is None else f" ({_gb(self.free + self.program)} are there)"
-        return f"memory: about {_gb(self.total)} GB{free}: {parts}"
+            room = self._gaussians_that_fit()
+            if room is not None and self.count <= room < self.most:
+                parts += f", of which {room:,} fit"
+        there = "" if self.free is None else f" ({_gb(self.free + self.program)} are there)"
+        each = f" in each of {self.processes} processes" if self.processes > 1 else ""
+        return f"memory: about {_gb(self.total)} GB{each}{there}: {parts}"
 
     def warning(self) -> str | None:
-        """Return a line where that is more than is there; what to do is in it."""
-        if self.free is None or self.total - self.program <= self.free:
+        """Return a line where that is likely to be more than is there; what to set to which value is in it."""
+        if self.free is None or self._growth <= self.free:
             return None
-        room = max(self.free - (self.total - self.program - self.pictures), 0)
-        advice = ["data.longest_side=N (smaller pictures)", "strategy.max_gaussians=N"]
-        if self.pictures > 0.2 * self.total:
-            advice.insert(0, f"data.cache_mb={0.8e-6 * room:.0f} (pictures are then decoded again and again)")
-        return (
-            f"about {_gb(self.total)} GB of memory are needed, and {_gb(self.free + self.program)} are there: give "
-            f"{', '.join(advice)}"
+        needed = self.program + self._growth
+        return f"about {_gb(needed)} GB of memory are needed, and {self._there}: give {self._advice()}"
+
+    def require_possible(self) -> None:
+        """Raise where the run certainly needs more than this machine, or its container, can ever give it.
+
+        Raises:
+            DyngsError: says what to set to which value.
+        """
+        needed = self.program + self.processes * (self.certain - self.program)
+        if self.whole is None or needed <= self.whole:
+            return
+        raise DyngsError(
+            f"at least {_gb(needed)} GB of memory are needed, and this machine gives {_gb(self.whole)}: give "
+            f"{self._advice()}"
         )
 
+    @property
+    def _growth(self) -> int:
+        """Bytes that all processes on this machine will still take."""
+        return self.processes * (self.total - self.program)
 
-def memory_forecast(trainer: Trainer) -> MemoryForecast:
-    """Return the memory that the run of ``trainer``, which has not begun to step, is expected to take."""
+    @property
+    def _there(self) -> str:
+        return f"{_gb((self.free or 0) + self.program)} are there"
+
+    @property
+    def _share(self) -> int:
+        """Bytes that this process may still take."""
+        return min(x for x in (self.free, self.whole) if x is not None) // self.processes
+
+    def _gaussians_that_fit(self) -> int | None:
+        """Return how many Gaussians there is room for beside the rest; None: not known."""
+        if self.free is None:
+            return None
+        return max(self._share - (self.total - self.program - self.count * self.each), 0) // self.each
+
+    def _advice(self) -> str:
+        """Return the keys to lower, with values that make the run fit, the least that does first."""
+        rest = self.total - self.program - self.pictures
+        room, gaussians = 0.95 * self._share, self.count * self.each
+        if rest < room:
+            return f"data.cache_mb={1e-6 * (room - rest):.0f} (pictures are then decoded again and again)"
+        found, left = [], room - 0.2 * room
+        if self.pictures > 0.2 * room:
+            found.append(f"data.cache_mb={0.2e-6 * room:.0f}")
+        else:
+            left = room - self.pictures
+        fixed = self.drawing + self.field
+        if fixed > 0.5 * left and self.drawing and self.longest_side:
+            allowed = max(0.5 * left - self.field, 0.05 * left)
+            side = int(self.longest_side * (min(allowed / self.drawing, 1.0)) ** 0.5)
+            found.append(f"data.longest_side={max(side, 16)}")
+            fixed = min(fixed, round(allowed) + self.field)
+        if gaussians > left - fixed:
+            found.append(self._limit(int(max(left - fixed, 0.05 * left) / self.each)))
+        return ", ".join(found) + (" and fewer processes" if self.processes > 1 else "")
+
+    def _limit(self, count: int) -> str:
+        """Return the key with the value that makes it ``count`` Gaussians."""
+        key, value = self.limits
+        if key == "model.resolution":
+            return f"{key}={max(int(value * (count / self.count) ** 0.5), 16)}"
+        return f"{key}={max(count, 1)}"
+
+
+def memory_forecast(trainer: Trainer, processes: int = 1) -> MemoryForecast:
+    """Return the memory that the run of ``trainer``, which has not begun to step, is expected to take.
+
+    Args:
+        trainer: of the run.
+        processes: on this machine that train it together.
+    """
     pictures, config = trainer.pictures, trainer.config
     pixels = max((width * height for width, height in pictures.sizes), default=0)
     files = max((view.width * view.height for view in pictures.views), default=0)
     waiting = (pictures.decoded_ahead // 2 or 1) * DECODING_BYTES * files
+    now, side = trainer.num_gaussians, max((max(size) for size in pictures.sizes), default=0)
     return MemoryForecast(
         program=resident_memory(),
         pictures=pictures.bytes_to_come + waiting,
-        drawing=DRAWING_BYTES * pixels,
-        count=expected_gaussians(config, trainer.num_gaussians),
-        most=max(config.strategy.growth_limit, trainer.num_gaussians),
+        drawing=STEP_BYTES + DRAWING_BYTES * pixels,
+        field=field_bytes(config, len(set(pictures.times))),
+        count=expected_gaussians(config, now, side),
+        most=max(config.strategy.growth_limit, now),
+        least=now,
         each=gaussian_bytes(config),
+        least_each=4 * NEEDED_COPIES * stored_values(config),
         free=free_memory(),
+        whole=whole_memory(),
         all_kept=pictures.keeps_all,
+        processes=processes,
+        longest_side=side,
+        limits=_limit_of_gaussians(config),
     )
 
 
+def _limit_of_gaussians(config: Config) -> tuple[str, int]:
+    """Return the key that limits the number of Gaussians, and its value."""
+    person = person_of(config)
+    if person is not None:
+        return "model.resolution", person.resolution
+    match config.strategy:
+        case DefaultStrategy() | McmcStrategy():
+            return "strategy.max_gaussians", config.strategy.max_gaussians
+        case FixedStrategy():
+            return "init.num_random", config.init.num_random
+        case _:
+            assert_never(config.strategy)
+
+
+def require_room(config: Config) -> None:
+    """Raise where the random Gaussians that a run is to begin with cannot fit on this machine.
+
+    Raises:
+        DyngsError: says how many can.
+    """
+    whole, each = whole_memory(), 4 * NEEDED_COPIES * stored_values(config)
+    match config.init:
+        case RandomInit() if whole is not None and config.init.num_random * each > whole:
+            raise DyngsError(
+                f"init.num_random={config.init.num_random}: at least {_gb(config.init.num_random * each)} GB of memory "
+                f"are needed, and this machine gives {_gb(whole)}: give init.num_random={whole // (2 * each)}"
+            )
+        case _:
+            pass
+
+
+def stored_values(config: Config) -> int:
+    """Return the number of values of a Gaussian that are trained, beside those of a field."""
+    return SHAPE_VALUES + 3 * num_sh_terms(stored_sh_degree(config))
+
+
 def gaussian_bytes(config: Config) -> int:
-    """Return the bytes of memory that a Gaussian takes in training."""
-    return 4 * COPIES * (SHAPE_VALUES + 3 * num_sh_terms(stored_sh_degree(config)))
+    """Return the bytes of memory that a Gaussian takes in training, where it moves if anything may."""
+    each, field = 4 * COPIES * stored_values(config), field_of(config)
+    if person_of(config) is not None:
+        return each + POSING_BYTES
+    match field:
+        case None:
+            return each
+        case HexplaneField():
+            return each + 4 * LOOKUP_COPIES * field.channels * len(field.levels)
+        case MlpField():
+            return each + 4 * ACTIVATION_COPIES * field.depth * field.width
+        case ControlNodesField() | TrajectoryField():
+            one, two = (num_field_values(field, FEW_TIMES, count) for count in (1, 2))
+            return each + MOVING_BYTES + 4 * COPIES * (two - one)
+        case _:
+            assert_never(field)
+
+
+def field_bytes(config: Config, num_times: int) -> int:
+    """Return the bytes of memory of what a deformation field learns beside its Gaussians; 0 where there is none."""
+    field = field_of(config)
+    if field is None or num_times < 2:
+        return 0
+    one, two = (num_field_values(field, num_times, count) for count in (1, 2))
+    return 4 * FIELD_COPIES * (2 * one - two)
 
 
 def num_changes(config: Config, steps: int | None = None) -> int:
@@ -116,14 +303,28 @@ def num_changes(config: Config, steps: int | None = None) -> int:
             return 0
 
 
-def expected_gaussians(config: Config, now: int) -> int:
-    """Return the Gaussians that a run which begins with ``now`` may end with: roughly, before anything is seen."""
+def expected_gaussians(config: Config, now: int, longest_side: int = USUAL_SIDE) -> int:
+    """Return the Gaussians that a run which begins with ``now`` may end with: roughly, before anything is seen.
+
+    Args:
+        config: of the run.
+        now: Gaussians at its beginning.
+        longest_side: of its pictures, px.
+    """
     match config.strategy:
         case McmcStrategy():
-            return max(config.strategy.max_gaussians, now)
+            return _mcmc_gaussians(config, config.strategy, now)
         case _:
-            usual = round(USUAL_GAUSSIANS * min(num_changes(config) / USUAL_CHANGES, 4.0) ** 0.5)
-            return max(now, min(usual, config.strategy.growth_limit))
+            changes = num_changes(config) / USUAL_CHANGES
+            detail = min(longest_side / USUAL_SIDE, 1.0) ** 0.5
+            usual = round(USUAL_GAUSSIANS * detail * (changes if changes < 1 else min(changes, 4.0) ** 0.5))
+            return max(now, min(usual, config.strategy.growth_limit)) + added_for_motion(config)
+
+
+def _mcmc_gaussians(config: Config, strategy: McmcStrategy, now: int) -> int:
+    """Return how many Gaussians the strategy ends with: each change adds the same share, up to the cap."""
+    grown = now * (1 + growth_per_change(strategy, config.train.steps)) ** min(num_changes(config), 200)
+    return max(int(min(strategy.max_gaussians, grown)), now)
 
 
 def resident_memory() -> int:
@@ -140,6 +341,18 @@ def peak_memory() -> int:
 
     unit = 1 if sys.platform == "darwin" else 1024
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def whole_memory() -> int | None:
+    """Return the bytes of memory and swap that this machine, or its container, has at all; None: not known."""
+    found = []
+    memory, swap = (re.search(rf"{x}:\s+(\d+) kB", _text("/proc/meminfo")) for x in ("MemTotal", "SwapTotal"))
+    if memory and swap:
+        found.append(1024 * (int(memory[1]) + int(swap[1])))
+    limits = [_text(_LIMITS[0]).strip(), _text(_SWAP).strip()]
+    if all(text.isdigit() for text in limits):
+        found.append(sum(int(text) for text in limits))
+    return min(found, default=None)
 
 
 def free_memory() -> int | None:
