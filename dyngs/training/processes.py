@@ -79,7 +79,10 @@ class Processes:
         """
         if self.size == 1:
             return self
-        backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and distributed.is_nccl_available() else "gloo"
+        backend = "gloo"
+        if torch.cuda.is_available() and distributed.is_nccl_available():
+            backend = "cpu:gloo,cuda:nccl"
+            torch.cuda.set_device(self.rank % self.local_size % torch.cuda.device_count())
         try:
             store, _, _ = next(iter(rendezvous("env://", timeout=TIMEOUT)))
             self._store = PrefixStore("dyngs", store)
@@ -205,7 +208,14 @@ class Processes:
             ) from None
 
     def _speaks_first(self) -> bool:
-        return self._store is None or self._store.add(FAILED, 1) == 1
+        """Return whether no other process has said yet why it ends.
+
+        Without torchrun's agent the first process keeps the store: if it is gone, that process has ended before.
+        """
+        try:
+            return self._store is None or self._store.add(FAILED, 1) == 1
+        except RuntimeError:
+            return False
 
     def _said(self) -> int:
         """Return how many processes have said why they end."""

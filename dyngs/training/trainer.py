@@ -105,14 +105,11 @@ class Trainer:
                 have come to other Gaussians.
         """
         step, before = self.done + 1, self.optimizer.parameters
-        report, losses = None, []
+        reports = []
         for index, seed in self._next_views(step):
             with _random_numbers(self.generator, seed):
-                last = self._backward(step, index)
-            report = last if report is None else report
-            losses.append(last.loss)
-        assert report is not None, "every process has a share"
-        loss = self._averaged(step, losses)
+                reports.append(self._backward(step, index))
+        loss = self._averaged(step, [report.loss for report in reports])
         found = (self.alpha.finding if step == 1 else None, self._update(step))
         variant = self.training.variant(self.scene, step)
         if variant is not None:
@@ -120,7 +117,7 @@ class Trainer:
         if self.optimizer.parameters is not before:
             self.processes.require_same(tensors_of(self.scene.state()), f"after step {step}")
         finding = "; ".join(text for text in found if text is not None) or None
-        return replace(report, loss=loss, finding=finding)
+        return replace(reports[0], loss=loss, finding=finding)
 
     def _averaged(self, step: int, losses: Sequence[float]) -> float:
         """Return the mean loss over the views of a step, and average their gradients, too."""
