@@ -470,3 +470,19 @@ def test_what_is_transparent_is_trained_on_as_background(capture: Path, tmp_path
     )
     assert all(torch.equal(x, light[name]) for name, x in dark.items())
     assert not torch.equal(dark["sh"], opaque["sh"])
+
+
+def test_two_equal_views_in_a_step_are_one_seen_twice(tmp_path: Path) -> None:
+    """The mean of two equal gradients has the bytes of either; densification counts both views."""
+    write_still_capture(tmp_path, StillOptions(size=16, num_train=1, num_test=1, samples=1))
+    states = []
+    for batch in (1, 2):
+        trainer = _trainer(tmp_path)
+        trainer.config = trainer.config.model_copy(update={"train": TrainConfig(steps=100, batch_size=batch)})
+        losses = [trainer.step().loss for _ in range(4)]
+        states.append((trainer.scene.gaussians.detach().tensors(), trainer.densifier.state(), losses))
+    (one, seen, losses), (two, twice, others) = states
+    assert all(torch.equal(x, two[name]) for name, x in one.items())
+    assert torch.equal(2 * seen["seen"], twice["seen"])
+    torch.testing.assert_close(2 * seen["grad_sum"], twice["grad_sum"])
+    assert losses == pytest.approx(others, rel=1e-6)
