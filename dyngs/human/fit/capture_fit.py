@@ -196,7 +196,7 @@ def fit_capture(
     if given:
         tried = _from_given(motion.clip, surface, seen, known.learned, report, effort)
     else:
-        tick = ticker("first poses", report, num_ticks(len(motion.clip)))
+        tick = ticker("first poses", report, num_ticks(len(motion.clip), marked=bool(keypoints)))
         clip = first_poses(motion.clip.times, surface, seen.used.__getitem__, tick)
         motion = CapturedMotion(clip, motion.frames)
         tried = _from_silhouettes(clip, surface, seen, known.learned, report, effort)

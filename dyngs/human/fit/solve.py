@@ -37,7 +37,7 @@ TURN, STEP = 0.25, 0.1
 TURN_WEIGHT, POSE_WEIGHT, STEP_WEIGHT = 3e-2, 1e-3, 1e-3
 """Of their mean squares. What silhouettes do not show, such as a limb turned about itself, follows the noise of Adam's
 steps where these are much smaller: renders of new poses then lose 1 to 3 dB, while the silhouettes look as good."""
-LIMIT_WEIGHT = 0.3
+LIMIT_WEIGHT = 2e-2
 """Of the mean square of what lies beyond the limit of a joint, in standard deviations."""
 KEYPOINT, KEYPOINT_WEIGHT = 0.02, 0.1
 """Expected error of a key point, as a share of the square's side, and the weight of their robust mean."""

@@ -38,6 +38,8 @@ OFF_COURSE = math.radians(30)
 """Rotation of the root away from the path of headings from which a frame is begun on that path instead."""
 ARMS = (((0, 0, -75), (0, 0, 0)), ((0, 0, 0), (0, 0, 0)), ((0, -30, -60), (0, -90, 0)))
 """Rotations of the left shoulder and elbow, degrees, that are tried: hanging, spread, bent forward."""
+_WITHOUT_PATH = 2
+"""Headings of the first frame from which clips without key points are followed without the path, too."""
 MOMENTUM = 0.8
 """Share of the last rotation that is expected again, so that legs which pass each other are not exchanged."""
 STATURE = 1.70
@@ -53,7 +55,9 @@ def first_poses(
 
     In some frames, the anchors, every heading is tried; the likely path through them says which way the person faces
     (``dyngs.human.fit.headings``). Each frame starts from the pose of the one before, and where that has left the path
-    from the heading of the path: single frames would rather be explained by a twisted body.
+    from the heading of the path: single frames would rather be explained by a twisted body. Without key points the
+    path may be that of somebody who faces the other way: clips that start with the best headings of the first frame
+    and never look at the path are compared with it.
 
     Raises:
         ValueError: nobody is seen in the first frame.
@@ -66,9 +70,16 @@ def first_poses(
     tried = [_all_headings(standing, row, up, surface, observed, tick) for row in anchors]
     path = likely_path([[error for _, _, error in own] for own in tried])
     roots = torch.stack([own[heading][0][0] for own, heading in zip(tried, path, strict=True)])
-    pose, trans, error = _found_from(standing, *tried[0][path[0]][:2], 0, surface, seen)
-    first = _with_better_arms(_with_row(standing, 0, pose, trans), error, surface, seen)
-    return _followed(first, roots_between(anchors, roots, len(times)), surface, observed, tick)
+    ways: list[tuple[int, Tensor | None]] = [(path[0], roots_between(anchors, roots, len(times)))]
+    if seen.joints is None:
+        best = sorted(range(NUM_HEADINGS), key=lambda i: tried[0][i][2])
+        ways += [(index, None) for index in best[:_WITHOUT_PATH]]
+    followed = []
+    for index, along in ways:
+        pose, trans, error = tried[0][index]
+        first = _with_better_arms(_with_row(standing, 0, pose, trans), error, surface, seen)
+        followed.append(_followed(first, along, surface, observed, tick))
+    return min(followed, key=lambda found: found[1])[0]
 
 
 def anchors_of(frames: int) -> list[int]:
@@ -76,20 +87,21 @@ def anchors_of(frames: int) -> list[int]:
     return evenly_spaced(frames, MOST_ANCHORS)
 
 
-def num_ticks(frames: int) -> int:
-    """Return how often ``first_poses`` calls ``tick`` for a clip of so many frames."""
-    return NUM_HEADINGS * len(anchors_of(frames)) + frames - 1
+def num_ticks(frames: int, *, marked: bool) -> int:
+    """Return how often ``first_poses`` calls ``tick`` for a clip of so many frames, with or without key points."""
+    return NUM_HEADINGS * len(anchors_of(frames)) + (frames - 1) * (1 if marked else 1 + _WITHOUT_PATH)
 
 
 def _all_headings(
     clip: MotionClip, row: int, up: Tensor, surface: Surface, observed: Observations, tick: Callable[[], None]
 ) -> list[tuple[Tensor, Tensor, float]]:
-    """Return pose, translation and error of a frame as found from each heading, at half the size."""
+    """Return pose, translation and error of a frame as found from each heading; after the first at half the size."""
     seen, found = observed(row), []
     for index in range(NUM_HEADINGS):
         start = turned(clip, heading(index), up)
         if seen is not None:
-            found.append(_found_from(start, start.poses[row], start.trans[row], row, surface, seen, levels=(2,)))
+            levels = (2, 1) if row == 0 else (2,)
+            found.append(_found_from(start, start.poses[row], start.trans[row], row, surface, seen, levels))
         tick()
     return found
 
@@ -172,22 +184,26 @@ def _ray(camera: Cameras, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor] | None
 
 
 def _followed(
-    clip: MotionClip, roots: Tensor, surface: Surface, observed: Observations, tick: Callable[[], None]
-) -> MotionClip:
-    """Return the clip with the poses after the first frame found one by one, near the path ``roots`` (F, 3)."""
-    poses, trans = clip.poses.clone(), clip.trans.clone()
+    clip: MotionClip, roots: Tensor | None, surface: Surface, observed: Observations, tick: Callable[[], None]
+) -> tuple[MotionClip, float]:
+    """Return the clip with the poses after the first frame found one by one, and the mean error of what is seen.
+
+    ``roots`` (F, 3) is a path of headings to stay near; None: there is none.
+    """
+    poses, trans, errors = clip.poses.clone(), clip.trans.clone(), []
     for row in range(1, len(poses)):
         seen = observed(row)
         poses[row] = _extrapolated(poses, row)
         trans[row] = trans[row - 1] + clip.trans[row] - clip.trans[row - 1]
         if seen is not None:
             starts = [poses[row]]
-            if angle_between(poses[row, 0], roots[row]) > OFF_COURSE:
+            if roots is not None and angle_between(poses[row, 0], roots[row]) > OFF_COURSE:
                 starts = [torch.cat([roots[row : row + 1], others[1:]]) for others in (poses[row], clip.poses[row])]
             found = [_found_from(clip, start, trans[row], row, surface, seen) for start in starts]
-            poses[row], trans[row], _ = min(found, key=lambda x: x[2])
+            poses[row], trans[row], error = min(found, key=lambda x: x[2])
+            errors.append(error)
         tick()
-    return replace(clip, poses=poses, trans=trans)
+    return replace(clip, poses=poses, trans=trans), sum(errors) / max(len(errors), 1)
 
 
 def _with_better_arms(clip: MotionClip, error: float, surface: Surface, seen: ObservedFrame) -> MotionClip:

@@ -91,7 +91,7 @@ def test_the_heading_is_found(surface: Surface, monkeypatch: pytest.MonkeyPatch)
     clip = first_poses(torch.zeros(1, dtype=torch.float64), surface, lambda _: seen, lambda: ticks.append(1))
     facing = Rotation.from_rotvec(clip.poses[0, 0].double().numpy()).apply([0.0, 0.0, 1.0])
     assert facing @ np.array([math.sin(heading), 0.0, math.cos(heading)]) > 0.8  # few steps, from 45 degrees apart
-    assert len(ticks) == num_ticks(1)
+    assert len(ticks) == num_ticks(1, marked=False)
 
 
 def test_nobody_at_all_is_an_error(surface: Surface) -> None:
