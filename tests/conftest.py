@@ -32,7 +32,6 @@ from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.ops.native import core
 
 SHARED = Path(__file__).parents[1] / "../shared/data"
-OPS_WITH_A_CORE = ("projection", "harmonics", "rasterization", "finite", "offsets", "shading")
 
 FEW, MANY = 100, 1000  # examples of a test that does not say how many
 # No deadlines: whether a busy machine is slow says nothing about what is tested.
@@ -77,8 +76,7 @@ def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     if request.param > core.best_isa():
         pytest.skip(f"this processor has no {request.param}")
     module = import_module(f"dyngs.ops._core_{request.param}")
-    for name in OPS_WITH_A_CORE:
-        monkeypatch.setattr(f"dyngs.ops.{name}.core", module)
+    monkeypatch.setattr("dyngs.ops.native.core", module)
     return request.param
 
 

@@ -35,6 +35,7 @@ MANY_PARAMETERS = {
 HEAVY = ("pycolmap", "trimesh", "kornia", "OpenImageIO", "skimage", "av", "rich", "tensorboard", "lpips")
 WITHOUT_MIRROR = {
     "test_devices.py": "about all that poses an avatar",
+    "test_emulated_card.py": "about all ops at once, on another core",
     "test_docs.py": "about README.md and docs/*.md",
     "test_fuzz.py": "about all readers, by the folder fuzz beside the tests",
     "test_layout.py": "about the repository, not one module",

@@ -37,8 +37,9 @@ void add(const std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, Array<S>>& gau
   if (by_means.ndim() != 2) throw nb::value_error("offsets: arrays of different sizes");
   const int64_t n = logit_opacities.size(), count = by_means.shape(0);
   const auto wrong = [n](int64_t row) { return row < 0 || row >= n; };
-  if (rows ? std::any_of(rows->data(), rows->data() + rows->size(), wrong) : count > n)
-    throw nb::index_error("offsets: no such Gaussian");
+  const bool all_exist =
+      rows ? !kReadable || std::none_of(rows->data(), rows->data() + rows->size(), wrong) : count <= n;
+  if (!all_exist) throw nb::index_error("offsets: no such Gaussian");
   const RowOffsets<S> from{count,
                            checked(rows, count),
                            checked(by_means, 3 * count),

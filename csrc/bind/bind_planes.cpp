@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "bind/arrays.hpp"
+#include "bind/results.hpp"
 #include "core/api.hpp"
 
 namespace nb = nanobind;
@@ -89,7 +90,7 @@ void hexplane_backward_arrays(const Array<const S, nb::shape<-1, 3>>& coords, co
       (g_coords && g_coords->shape(0) != coords.shape(0)) || g_features.shape(1) != levels.size() * planes.channels)
     throw nb::value_error("hexplane_backward: arrays of different sizes");
   const auto missing = [&points](int32_t i) { return i < 0 || i >= points.count; };
-  if (std::any_of(order.data(), order.data() + points.count, missing))
+  if (kReadable && std::any_of(order.data(), order.data() + points.count, missing))
     throw nb::index_error("hexplane_backward: no such point");
   nb::gil_scoped_release release;
   hexplane_backward<S>(planes, points, order.data(), g_features.data(), grads, g_coords ? g_coords->data() : nullptr,
@@ -97,14 +98,15 @@ void hexplane_backward_arrays(const Array<const S, nb::shape<-1, 3>>& coords, co
 }
 
 template <class S>
-double plane_penalty_arrays(const Levels<const S>& levels, const std::optional<Levels<S>>& g_levels,
-                            const std::tuple<double, double, double>& weights, int threads) {
+void plane_penalty_arrays(const Levels<const S>& levels, const std::optional<Levels<S>>& g_levels,
+                          const std::tuple<double, double, double>& weights, const Array<double, nb::shape<1>>& penalty,
+                          int threads) {
   const auto inputs = levels_input<S>(levels);
   const HexPlane<S> planes = hexplane_input<S>(levels, inputs, 0.0);
   const auto grads = g_levels ? grads_output<S>(levels, *g_levels) : std::vector<PlaneGrads<S>>{};
   const auto [space, time, one] = weights;
   nb::gil_scoped_release release;
-  return plane_penalty<S>(planes, PenaltyWeights{space, time, one}, grads, threads);
+  write_plane_penalty<S>(planes, PenaltyWeights{space, time, one}, grads, penalty.data(), threads);
 }
 
 template <class S>
@@ -118,8 +120,9 @@ void bind_planes_of(nb::module_& module) {
              nb::arg("g_features").noconvert(), nb::arg("g_levels").noconvert(), nb::arg("g_coords").noconvert().none(),
              nb::arg("num_threads"), "Writes the gradients by the planes and, unless None, by the coordinates.");
   module.def("plane_penalty", plane_penalty_arrays<S>, nb::arg("levels").noconvert(),
-             nb::arg("g_levels").noconvert().none(), nb::arg("weights"), nb::arg("num_threads"),
-             "Weighted sum of the penalties of all planes; writes its gradient unless that is None.");
+             nb::arg("g_levels").noconvert().none(), nb::arg("weights"), nb::arg("penalty").noconvert(),
+             nb::arg("num_threads"),
+             "Writes the weighted sum of the penalties of all planes, and its gradient unless that is None.");
 }
 
 }  // namespace

@@ -12,6 +12,7 @@
 #include <tuple>
 
 #include "bind/arrays.hpp"
+#include "bind/results.hpp"
 #include "core/api.hpp"
 #include "cpu/memory.hpp"
 
@@ -218,14 +219,6 @@ struct SplatArrays {
   }
 };
 
-// Hands a vector to Python without copying it.
-template <class T>
-nb::ndarray<nb::numpy, T, nb::ndim<1>> release_vector(std::vector<T>&& vector) {
-  auto* owner = new std::vector<T>(std::move(vector));
-  nb::capsule free(owner, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
-  return {owner->data(), {owner->size()}, free};
-}
-
 using EntryArrays = std::tuple<Array<const int64_t>, Array<const int32_t>, Array<const int32_t>, Array<const int32_t>>;
 
 // Whether all of `count` indices are in [0, bound).
@@ -253,6 +246,7 @@ Entries checked_entries(const EntryArrays& arrays, const Splats<S>& s) {
   expect(tile_offsets, tiles + 1, "tile_offsets"), expect(slot_ranges, 2 * splats, "slot_ranges");
   expect(slots, count, "slots");
   const Entries entries{tile_offsets.data(), slot_ranges.data(), gaussians.data(), slots.data(), count};
+  if (!kReadable) return entries;
   if (!in_order(entries, tiles, splats))
     throw nb::value_error("tile_offsets or slot_ranges name entries that are not there");
   if (!all_within(entries.gaussians, count, splats)) throw nb::value_error("gaussians name splats that are not there");
@@ -266,20 +260,13 @@ void bind_binning(nb::module_& module, const char* arrays_name) {
   nb::class_<Arrays>(module, arrays_name)
       .def(nb::init<Array<const S>, Array<const S>, Array<const S>, Array<const int32_t>>(), nb::arg().noconvert(),
            nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert());
-  module.def(
-      "bin_tiles", [](const Arrays& in, Array<const S> depths, const BlendSettings& settings, int64_t max_entries) {
-        Splats<S> s = in.splats(settings);
-        expect(depths, s.num_views * s.num_gaussians, "depths");
-        s.depths = depths.data();
-        Binning binning;
-        {
-          nb::gil_scoped_release release;
-          binning = bin_tiles(s, max_entries);
-        }
-        return std::make_tuple(release_vector(std::move(binning.tile_offsets)),
-                               release_vector(std::move(binning.slot_ranges)),
-                               release_vector(std::move(binning.gaussians)), release_vector(std::move(binning.slots)));
-      });
+  module.def("bin_tiles",
+             [](const Arrays& in, Array<const S> depths, const BlendSettings& settings, int64_t max_entries) {
+               Splats<S> s = in.splats(settings);
+               expect(depths, s.num_views * s.num_gaussians, "depths");
+               s.depths = depths.data();
+               return binned(s, max_entries);
+             });
 }
 
 template <class S>
@@ -361,13 +348,15 @@ void bind_rasterizer(nb::module_& module) {
   module.def(
       "available_memory", [](const std::string& root) { return available_memory(root); }, nb::arg("root") = "",
       "Bytes that this process can still take; `root` stands before /proc and /sys.");
-  module.def("count_nonfinite", [](Array<const float> x, int threads) {
+  module.def("count_nonfinite", [](Array<const float> x, Array<int32_t> count, int threads) {
+    expect(count, 1, "count");
     nb::gil_scoped_release release;
-    return count_nonfinite(x.data(), static_cast<int64_t>(x.size()), threads);
+    write_count_nonfinite(x.data(), static_cast<int64_t>(x.size()), count.data(), threads);
   });
-  module.def("count_nonfinite", [](Array<const double> x, int threads) {
+  module.def("count_nonfinite", [](Array<const double> x, Array<int32_t> count, int threads) {
+    expect(count, 1, "count");
     nb::gil_scoped_release release;
-    return count_nonfinite(x.data(), static_cast<int64_t>(x.size()), threads);
+    write_count_nonfinite(x.data(), static_cast<int64_t>(x.size()), count.data(), threads);
   });
 }
 

@@ -40,7 +40,7 @@ template <class S>
 SkinPoints<S> points_input(const PointArrays<S>& arrays, int64_t num_nodes) {
   const auto& [coords, followed] = arrays;
   require_shape(coords, followed.shape(0), 3);
-  if (!follow_within(followed.data(), static_cast<int64_t>(followed.size()), num_nodes))
+  if (kReadable && !follow_within(followed.data(), static_cast<int64_t>(followed.size()), num_nodes))
     throw nb::index_error("skinning: a point follows a node that does not exist");
   return {coords.data(), followed.data(), static_cast<int64_t>(followed.shape(0)),
           static_cast<int64_t>(followed.shape(1))};

@@ -11,6 +11,7 @@
 #endif
 
 #include "bind/arrays.hpp"
+#include "bind/results.hpp"
 #include "core/api.hpp"
 
 namespace nb = nanobind;
@@ -18,10 +19,10 @@ namespace nb = nanobind;
 namespace dyngs {
 namespace {
 
-double l1_ssim_arrays(Array<const float, nb::shape<-1, -1, 3>> rendered,
-                      Array<const float, nb::shape<-1, -1, 3>> target,
-                      std::optional<Array<const float, nb::ndim<2>>> mask,
-                      std::optional<Array<float, nb::shape<-1, -1, 3>>> gradient, float ssim_weight, int threads) {
+void l1_ssim_arrays(Array<const float, nb::shape<-1, -1, 3>> rendered, Array<const float, nb::shape<-1, -1, 3>> target,
+                    std::optional<Array<const float, nb::ndim<2>>> mask,
+                    std::optional<Array<float, nb::shape<-1, -1, 3>>> gradient, Array<double, nb::shape<1>> loss,
+                    float ssim_weight, int threads) {
   const size_t height = rendered.shape(0), width = rendered.shape(1);
   const auto differs = [=](const auto& array) { return array.shape(0) != height || array.shape(1) != width; };
   if (differs(target) || (mask && differs(*mask)) || (gradient && differs(*gradient)))
@@ -34,15 +35,15 @@ double l1_ssim_arrays(Array<const float, nb::shape<-1, -1, 3>> rendered,
                         ssim_weight};
   float* to = gradient ? gradient->data() : nullptr;
   nb::gil_scoped_release release;
-  return l1_ssim_loss(input, to, threads);
+  write_l1_ssim(input, loss.data(), to, threads);
 }
 
 using AdamOptions = std::tuple<double, double, double, int64_t>;  // beta1, beta2, eps, step
 
-int64_t adam_step_arrays(Array<float, nb::ndim<2>> param, Array<const float, nb::ndim<2>> grad,
-                         Array<float, nb::ndim<2>> exp_avg, Array<float, nb::ndim<2>> exp_avg_sq,
-                         Array<const float, nb::ndim<1>> column_rates,
-                         std::optional<Array<const bool, nb::ndim<1>>> rows, const AdamOptions& options, int threads) {
+void adam_step_arrays(Array<float, nb::ndim<2>> param, Array<const float, nb::ndim<2>> grad,
+                      Array<float, nb::ndim<2>> exp_avg, Array<float, nb::ndim<2>> exp_avg_sq,
+                      Array<const float, nb::ndim<1>> column_rates, std::optional<Array<const bool, nb::ndim<1>>> rows,
+                      Array<int32_t, nb::shape<1>> skipped, const AdamOptions& options, int threads) {
   const size_t num_rows = param.shape(0), row_size = param.shape(1);
   const auto differs = [=](const auto& array) { return array.shape(0) != num_rows || array.shape(1) != row_size; };
   if (differs(grad) || differs(exp_avg) || differs(exp_avg_sq) || column_rates.shape(0) != row_size ||
@@ -57,7 +58,7 @@ int64_t adam_step_arrays(Array<float, nb::ndim<2>> param, Array<const float, nb:
   const auto [beta1, beta2, eps, step] = options;
   const AdamRates rates{column_rates.data(), rows ? rows->data() : nullptr, beta1, beta2, eps, step};
   nb::gil_scoped_release release;
-  return adam_step(state, rates, threads);
+  write_adam_step(state, rates, skipped.data(), threads);
 }
 
 void seen_rows_arrays(Array<const float, nb::ndim<2>> grads, Array<bool, nb::ndim<1>> seen, int threads) {
@@ -84,13 +85,14 @@ bool keep_freed_memory() {
 
 void bind_train(nb::module_& module) {
   module.def("l1_ssim", l1_ssim_arrays, nb::arg("rendered").noconvert(), nb::arg("target").noconvert(),
-             nb::arg("mask").noconvert().none(), nb::arg("gradient").noconvert().none(), nb::arg("ssim_weight"),
-             nb::arg("num_threads"),
-             "Loss of two (H, W, 3) pictures; writes its gradient by `rendered` into `gradient`.");
+             nb::arg("mask").noconvert().none(), nb::arg("gradient").noconvert().none(), nb::arg("loss").noconvert(),
+             nb::arg("ssim_weight"), nb::arg("num_threads"),
+             "Writes the loss of two (H, W, 3) pictures, and its gradient by `rendered` unless that is None.");
   module.def("adam_step", adam_step_arrays, nb::arg("param").noconvert(), nb::arg("grad").noconvert(),
              nb::arg("exp_avg").noconvert(), nb::arg("exp_avg_sq").noconvert(), nb::arg("column_rates").noconvert(),
-             nb::arg("rows").noconvert().none(), nb::arg("options"), nb::arg("num_threads"),
-             "Adam step on (N, C) arrays in place; the number of rows skipped for a non-finite gradient.");
+             nb::arg("rows").noconvert().none(), nb::arg("skipped").noconvert(), nb::arg("options"),
+             nb::arg("num_threads"),
+             "Adam step on (N, C) arrays in place; adds the number of rows skipped for a non-finite gradient.");
   module.def("seen_rows", seen_rows_arrays, nb::arg("grads").noconvert(), nb::arg("seen").noconvert(),
              nb::arg("num_threads"), "Writes which rows of (N, C) gradients have an element other than zero.");
   module.def("keep_freed_memory", keep_freed_memory,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core, num_threads, writable
+from dyngs.ops.native import array, core_for, num_threads, writable
 from dyngs.ops.registration import has_kernel, register
 
 
@@ -25,8 +25,10 @@ def _adam_step(
 ) -> Tensor:
     moments = writable(exp_avg), writable(exp_avg_sq)
     chosen, options = None if rows is None else array(rows), (betas[0], betas[1], eps, step)
-    skipped = core.adam_step(writable(param), array(grad), *moments, array(rates), chosen, options, num_threads())
-    return torch.tensor(skipped, dtype=torch.int64, device="cpu")
+    skipped = param.new_zeros(1, dtype=torch.int32)
+    arrays = writable(param), array(grad), *moments, array(rates), chosen, array(skipped)
+    core_for(param).adam_step(*arrays, options, num_threads())
+    return skipped[0].long()
 
 
 def _fake_adam_step(
@@ -53,8 +55,8 @@ adam_step_op = register(
 
 
 def _seen_rows(grads: Tensor) -> Tensor:
-    seen = torch.empty(len(grads), dtype=torch.bool, device="cpu")
-    core.seen_rows(array(grads), array(seen), num_threads())
+    seen = grads.new_empty(len(grads), dtype=torch.bool)
+    core_for(grads).seen_rows(array(grads), array(seen), num_threads())
     return seen
 
 
@@ -148,9 +150,10 @@ def _torch_adam_step(
 
 def _column_rates(lr: float | Tensor, row_size: int, param: Tensor) -> Tensor:
     """(C,) learning rates in the dtype and on the device of ``param``."""
-    rates = torch.as_tensor(lr, dtype=param.dtype, device=param.device).detach()
-    if not bool(rates.isfinite().all()):
+    is_finite = bool(lr.isfinite().all()) if isinstance(lr, Tensor) else math.isfinite(lr)
+    if not is_finite:
         raise DyngsError("Adam: lr must be finite")
+    rates = torch.as_tensor(lr, dtype=param.dtype, device=param.device).detach()
     if rates.ndim == 0:
         return rates.expand(row_size).contiguous()
     if rates.shape != (row_size,):

@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.native import array, core_for, num_threads
 from dyngs.ops.registration import has_kernel, register
 
 
 def _count_nonfinite(x: Tensor) -> Tensor:
-    return torch.tensor(core.count_nonfinite(array(x), num_threads()), device=x.device)
+    count = x.new_zeros(1, dtype=torch.int32)
+    core_for(x).count_nonfinite(array(x), array(count), num_threads())
+    return count[0].long()
 
 
 def _fake_count_nonfinite(x: Tensor) -> Tensor:

@@ -7,14 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.native import array, core_for, num_threads
 from dyngs.ops.registration import Gradient, register
 
 
 def _harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:
     colors = means.new_empty(centers.shape[0], means.shape[0], 3)
     arrays = (array(x) for x in (means, centers, sh, radii))
-    core.harmonics_forward(*arrays, array(colors), degree, num_threads())
+    core_for(means).harmonics_forward(*arrays, array(colors), degree, num_threads())
     return colors
 
 
@@ -28,7 +28,7 @@ def _harmonics_backward(
     means, centers, sh, _ = inputs
     g_means, g_sh = (torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means, sh))
     g_centers = centers.new_zeros(centers.shape)
-    core.harmonics_backward(
+    core_for(means).harmonics_backward(
         *(array(x) for x in inputs),
         (array(colors), array(grad)),
         (array(g_means), array(g_sh), array(g_centers) if with_centers else None),

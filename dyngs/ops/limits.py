@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from torch import Tensor
+
 from dyngs.errors import DyngsError
 from dyngs.ops.native import core
 
@@ -24,13 +26,15 @@ def check_size(width: int, height: int) -> None:
         raise DyngsError(f"render refused: a picture of {width}x{height} px; its sides can be 1 to {MAX_SIDE} px")
 
 
-def check_memory(size: int, what: str) -> None:
+def check_memory(size: int, what: str, like: Tensor) -> None:
     """Raise an error unless ``size`` bytes for ``what`` fit what machine, control groups and RLIMIT_AS leave free.
+
+    Only where ``like`` lies on the CPU: in a card's memory torch itself refuses what does not fit.
 
     Raises:
         DyngsError: with both figures. (Where the system does not say, more than 16 GiB at once is refused.)
     """
-    if size <= UNASKED:
+    if size <= UNASKED or like.device.type != "cpu":
         return
     available = core.available_memory()
     if size > available:

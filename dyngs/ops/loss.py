@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.native import array, core_for, num_threads
 from dyngs.ops.registration import Gradient, has_kernel, register
 
 SSIM_C1 = 0.01**2
@@ -27,15 +27,17 @@ def _l1_ssim(
     rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, with_gradient: bool
 ) -> tuple[Tensor, Tensor]:
     gradient = torch.empty_like(rendered) if with_gradient else None
-    loss = core.l1_ssim(
+    loss = rendered.new_empty(1, dtype=torch.float64)
+    core_for(rendered).l1_ssim(
         array(rendered),
         array(target),
         None if mask is None else array(mask),
         None if gradient is None else array(gradient),
+        array(loss),
         ssim_weight,
         num_threads(),
     )
-    return rendered.new_tensor(loss), rendered.new_empty(0) if gradient is None else gradient
+    return loss[0].to(rendered.dtype), rendered.new_empty(0) if gradient is None else gradient
 
 
 def _fake_l1_ssim(

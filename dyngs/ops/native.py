@@ -1,7 +1,8 @@
-"""The compiled core for this processor, its number of threads, and tensors passed to it.
+"""The compiled cores for this processor and for CUDA cards, the number of threads, and tensors passed to a core.
 
 The wheel holds one module per x86-64 level; the newest that the processor runs is imported. ``DYNGS_ISA=v2|v3|v4``
-picks an older one, for tests.
+picks an older one, for tests. That for CUDA cards is there if dyngs was built with it (docs/gpu.md), has the same
+functions, and is imported when the first tensor on a card comes.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from importlib import import_module
+from functools import cache
+from importlib import import_module, util
 from types import ModuleType
 
 import torch  # first: its libgomp is then the one that both use
@@ -38,7 +40,42 @@ def _load_core() -> tuple[ModuleType, str]:
     return (baseline if isa == "v2" else import_module(f"dyngs.ops._core_{isa}")), isa
 
 
+_CUDA_CORE = "dyngs.ops._core_cuda"
+
 core, _ISA = _load_core()
+
+
+def has_cuda_core() -> bool:
+    """Return whether dyngs was built with its kernels for CUDA cards."""
+    return util.find_spec(_CUDA_CORE) is not None
+
+
+@cache
+def cuda_core() -> ModuleType:
+    """Return the compiled core for CUDA cards.
+
+    Raises:
+        DyngsError: it was not built, or cannot be loaded.
+    """
+    try:
+        return import_module(_CUDA_CORE)
+    except ImportError as error:
+        advice = "install with `pip install . -C cmake.define.DYNGS_CUDA=ON`, which needs nvcc"
+        raise DyngsError(f"the kernels for CUDA cards are not there ({error}); {advice}") from error
+
+
+def core_for(x: Tensor) -> ModuleType:
+    """Return the compiled core that computes where ``x`` lies; on a card it goes on in torch's current stream there."""
+    if x.device.type == "cpu":
+        return core
+    module = cuda_core()
+    module.use_queue(x.get_device(), torch.cuda.current_stream(x.device).cuda_stream)
+    return module
+
+
+def lend(size: int, device: int) -> Tensor:
+    """Return ``size`` bytes of a card's memory; called by its core, which gives them back when its work is queued."""
+    return torch.empty(size, dtype=torch.uint8, device=f"cuda:{device}")
 
 
 def active_isa() -> str:

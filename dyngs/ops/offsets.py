@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from dyngs.ops.native import array, core, num_threads, writable
+from dyngs.ops.native import array, core_for, num_threads, writable
 from dyngs.ops.registration import register
 
 
@@ -24,7 +24,7 @@ def _add_offsets(
     by_colors: Tensor | None,
 ) -> None:
     offsets = (by_means, by_quats, by_log_scales, by_logit_opacities, by_colors)
-    core.add_offsets(
+    core_for(means).add_offsets(
         tuple(writable(x) for x in (means, quats, log_scales, logit_opacities, sh)),
         None if rows is None else array(rows),
         tuple(None if x is None else array(x) for x in offsets),

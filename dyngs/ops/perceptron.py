@@ -79,6 +79,7 @@ perceptron_backward_op = register(
     "perceptron_backward",
     _perceptron_backward,
     fake=_fake_perceptron_backward,
+    devices=("cpu",),
 )
 """Gradients by x, empty unless asked for, and by the parameters; ``inputs`` are x, params and kept."""
 
@@ -100,6 +101,7 @@ perceptron_op = register(
     "perceptron",
     _perceptron,
     fake=_fake_perceptron,
+    devices=("cpu",),
     gradient=Gradient(_save, _backward),
 )
 """Outputs (M, out), and the activations between the layers in the kernel's layout or an empty tensor. ``params`` holds

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.native import array, core_for, num_threads
 from dyngs.ops.registration import Gradient, register
 
 MAX_POINTS = 2**31 - 1
@@ -45,7 +45,7 @@ def _empty_like(planes: Sequence[Tensor]) -> list[Tensor]:
 
 def _hexplane(coords: Tensor, planes: list[Tensor], time: float) -> tuple[Tensor, Tensor]:
     features, order = _fake_hexplane(coords, planes, time)
-    core.hexplane_forward(array(coords), _pairs(planes), time, array(features), array(order), num_threads())
+    core_for(coords).hexplane_forward(array(coords), _pairs(planes), time, array(features), array(order), num_threads())
     return features, order
 
 
@@ -58,7 +58,7 @@ def _hexplane_backward(
     coords: Tensor, planes: list[Tensor], order: Tensor, grad: Tensor, time: float, with_coords: bool
 ) -> tuple[Tensor, list[Tensor]]:
     g_coords, g_planes = _fake_hexplane_backward(coords, planes, order, grad, time, with_coords)
-    core.hexplane_backward(
+    core_for(coords).hexplane_backward(
         array(coords),
         _pairs(planes),
         time,
@@ -105,8 +105,9 @@ space and those of time of each level in turn."""
 def _plane_penalty(planes: list[Tensor], weights: list[float], with_gradient: bool) -> tuple[Tensor, list[Tensor]]:
     grads = _empty_like(planes) if with_gradient else []
     pairs = _pairs(grads) if with_gradient else None
-    penalty = core.plane_penalty(_pairs(planes), pairs, tuple(weights), num_threads())
-    return planes[0].new_tensor(penalty), grads
+    penalty = planes[0].new_empty(1, dtype=torch.float64)
+    core_for(planes[0]).plane_penalty(_pairs(planes), pairs, tuple(weights), array(penalty), num_threads())
+    return penalty[0].to(planes[0].dtype), grads
 
 
 def _fake_plane_penalty(planes: list[Tensor], weights: list[float], with_gradient: bool) -> tuple[Tensor, list[Tensor]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.ops.limits import check_memory, check_size
-from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.native import array, core_for, num_threads
 from dyngs.ops.options import check_near_and_far, check_number
 from dyngs.ops.registration import Gradient, register
 
@@ -69,13 +70,12 @@ class Projection:
         return torch.stack([u * u, u * w, w * w + v * v], dim=-1)
 
 
-def _settings(width: int, height: int, limits: list[float], antialiased: bool):
-    check_size(width, height)
-    eps2d, near, far, alpha_min, radius_clip = limits
-    return core.ProjectSettings(width, height, eps2d, near, far, alpha_min, radius_clip, antialiased, num_threads())
+def _settings(core: ModuleType, size: list[int], limits: list[float], antialiased: bool):
+    check_size(*size)
+    return core.ProjectSettings(*size, *limits, antialiased, num_threads())
 
 
-def _arrays(*tensors: Tensor):
+def _arrays(core: ModuleType, *tensors: Tensor):
     kind = core.GaussianArraysF32 if tensors[0].dtype == torch.float32 else core.GaussianArraysF64
     return kind(*(array(x) for x in tensors))
 
@@ -92,13 +92,14 @@ def _project(
     antialiased: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     rows = (viewmats.shape[0], means.shape[0])
-    settings = _settings(size[0], size[1], limits, antialiased)
+    core = core_for(means)
+    settings = _settings(core, size, limits, antialiased)
     per_splat = 7 * means.element_size() + 8
-    check_memory(rows[0] * rows[1] * per_splat, f"the splats of {rows[1]} Gaussians in {rows[0]} view(s)")
+    check_memory(rows[0] * rows[1] * per_splat, f"the splats of {rows[1]} Gaussians in {rows[0]} view(s)", means)
     means2d, depths = means.new_empty(*rows, 2), means.new_empty(rows)
     factors, compensations = means.new_empty(*rows, 3), means.new_empty(rows)
     radii = means.new_empty(*rows, 2, dtype=torch.int32)
-    arrays = _arrays(means, quats, scales, opacities, viewmats, intrinsics)
+    arrays = _arrays(core, means, quats, scales, opacities, viewmats, intrinsics)
     core.project_forward(arrays, settings, *(array(x) for x in (means2d, depths, factors, compensations, radii)))
     return means2d, depths, factors, compensations, radii
 
@@ -132,9 +133,10 @@ def _project_backward(
     means, quats, scales, _, viewmats, intrinsics = gaussians
     out = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means, quats, scales)]
     of_cameras = viewmats.new_zeros(viewmats.shape), intrinsics.new_zeros(intrinsics.shape)
-    settings = _settings(size[0], size[1], limits, antialiased)
+    core = core_for(means)
+    settings = _settings(core, size, limits, antialiased)
     core.project_backward(
-        _arrays(*gaussians),
+        _arrays(core, *gaussians),
         settings,
         array(radii),
         tuple(array(g) for g in grads),

@@ -9,6 +9,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError
 from dyngs.ops.limits import REMEDY, check_memory, check_size
-from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.native import array, core_for, num_threads
 from dyngs.ops.options import check_number
 from dyngs.ops.projection import Projection
 from dyngs.ops.registration import Gradient, register
@@ -113,12 +114,12 @@ class Blended:
     transmittance: Tensor
 
 
-def _settings(size: list[int], thresholds: list[float]):
+def _settings(core: ModuleType, size: list[int], thresholds: list[float]):
     check_size(*size)
-    return core.BlendSettings(size[0], size[1], thresholds[0], thresholds[1], thresholds[2], num_threads())
+    return core.BlendSettings(*size, *thresholds, num_threads())
 
 
-def _arrays(means2d: Tensor, factors: Tensor, opacities: Tensor, radii: Tensor):
+def _arrays(core: ModuleType, means2d: Tensor, factors: Tensor, opacities: Tensor, radii: Tensor):
     kind = core.SplatArraysF32 if means2d.dtype == torch.float32 else core.SplatArraysF64
     return kind(*(array(x) for x in (means2d, factors, opacities, radii)))
 
@@ -135,14 +136,16 @@ def _refusals(kernel: str) -> Generator[None]:
 def _bin_tiles(
     splats: list[Tensor], depths: Tensor, size: list[int], thresholds: list[float], max_entries: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    core = core_for(depths)
     try:
         entries = core.bin_tiles(
-            _arrays(*splats), array(depths), _settings(size, thresholds), min(max_entries, MAX_ENTRIES)
+            _arrays(core, *splats), array(depths), _settings(core, size, thresholds), min(max_entries, MAX_ENTRIES)
         )
     except ValueError as error:  # std::length_error
         raise DyngsError(f"render refused: {error}; {REMEDY}") from None
-    tile_offsets, slot_ranges, gaussians, slots = (torch.from_numpy(x) for x in entries)
-    return tile_offsets, slot_ranges, gaussians, slots
+    tile_offsets, slot_ranges, gaussians, slots = (x if isinstance(x, Tensor) else torch.from_numpy(x) for x in entries)
+    slot_ranges, gaussians, slots = (x.view(torch.int32) for x in (slot_ranges, gaussians, slots))
+    return tile_offsets.view(torch.int64), slot_ranges, gaussians, slots
 
 
 def _fake_bin_tiles(
@@ -167,7 +170,7 @@ def _picture(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
     check_size(*size)
     views, channels = colors.shape[0], colors.shape[2]
     needed = views * size[0] * size[1] * ((channels + 1) * colors.element_size() + 4)
-    check_memory(needed, f"{views} picture(s) of {size[0]}x{size[1]} px with {channels} channels")
+    check_memory(needed, f"{views} picture(s) of {size[0]}x{size[1]} px with {channels} channels", colors)
     return _empty_picture(colors, size)
 
 
@@ -193,14 +196,15 @@ def _blend(
     thresholds: list[float],
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
+    core = core_for(colors)
     color, transmittance, stop = _picture(colors, size)
     with _refusals("rasterize"):
         core.rasterize_forward(
-            _arrays(means2d, factors, opacities, radii),
+            _arrays(core, means2d, factors, opacities, radii),
             array(colors),
             None if background is None else array(background),
             tuple(array(x) for x in (tile_offsets, slot_ranges, gaussians, slots)),
-            _settings(size, thresholds),
+            _settings(core, size, thresholds),
             (array(color), array(transmittance), array(stop), None),
             0,
         )
@@ -238,17 +242,18 @@ def _blend_backward(
     with_probe: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     means2d, factors, opacities, colors, radii = splats
+    core = core_for(colors)
     pairs, fields = len(entries[3]), MOMENTS + colors.shape[2] + 2 * absgrad
-    check_memory(pairs * fields * colors.element_size(), f"the gradients of {pairs} (Gaussian, tile) pairs")
+    check_memory(pairs * fields * colors.element_size(), f"the gradients of {pairs} (Gaussian, tile) pairs", colors)
     out = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means2d, factors, opacities, colors)]
     probe = means2d.new_empty(*opacities.shape, 4) if with_probe else means2d.new_empty(0)
     with _refusals("rasterize, backward"):
         core.rasterize_backward(
-            _arrays(means2d, factors, opacities, radii),
+            _arrays(core, means2d, factors, opacities, radii),
             array(colors),
             None if background is None else array(background),
             tuple(array(x) for x in entries),
-            _settings(size, thresholds),
+            _settings(core, size, thresholds),
             tuple(array(x) for x in (*grads, *image)),
             (*(array(x) for x in out), array(probe) if with_probe else None),
             absgrad,
@@ -320,15 +325,16 @@ def _tally(
     thresholds: list[float],
     kind: int,
 ) -> Tensor:
+    core = core_for(colors)
     sums = torch.empty_like(splats[2], memory_format=torch.contiguous_format)
     image = (*_picture(colors, size), sums)
     with _refusals("tally"):
         core.rasterize_forward(
-            _arrays(*splats),
+            _arrays(core, *splats),
             array(colors),
             None if background is None else array(background),
             tuple(array(x) for x in entries),
-            _settings(size, thresholds),
+            _settings(core, size, thresholds),
             tuple(array(x) for x in image),
             kind,
         )

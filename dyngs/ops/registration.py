@@ -1,9 +1,10 @@
 """Registration of the native ops with torch's dispatcher, under the namespace ``dyngs``.
 
-One call of ``register`` holds all that an op is: its implementation on the CPU (whose type hints are the schema), the
-shapes of its results without any data (for ``torch.compile``), and the formula of its gradient. Callers call the op
-and never ask where a tensor lies; the dispatcher picks the implementation. A back end for another device adds its
-implementations with ``implement`` and changes nothing here.
+One call of ``register`` holds all that an op is: its implementation (whose type hints are the schema), the shapes of
+its results without any data (for ``torch.compile``), and the formula of its gradient. Callers call the op and never ask
+where a tensor lies; the dispatcher picks the implementation. The compiled cores for CPU and CUDA have the same
+functions, so that one implementation, which asks ``native.core_for`` for its core, serves both. A back end for another
+device adds its implementations with ``implement`` and changes nothing here.
 
 ``torch.library.custom_op`` would do the same, but imports ``torch._dynamo`` when the first op is made: 2 s.
 """
@@ -21,6 +22,7 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
+from dyngs.ops.native import has_cuda_core
 
 NAMESPACE = "dyngs"
 
@@ -48,9 +50,10 @@ class Gradient:
 
 def register(
     name: str,
-    cpu: Callable[P, R],
+    kernel: Callable[P, R],
     *,
     fake: Callable[P, R],
+    devices: tuple[str, ...] = ("cpu", "cuda"),
     mutates: tuple[str, ...] = (),
     gradient: Gradient | None = None,
 ) -> Callable[P, R]:
@@ -60,18 +63,21 @@ def register(
 
     Args:
         name: of the op.
-        cpu: implementation on the CPU; its type hints give the schema. No result may share memory with an input.
+        kernel: the implementation; its type hints give the schema. No result may share memory with an input.
         fake: results of the right shape, dtype and device for inputs without data.
-        mutates: arguments that ``cpu`` writes to.
+        devices: for whose tensors ``kernel`` is; CUDA counts only where its core was built.
+        mutates: arguments that ``kernel`` writes to.
         gradient: None: not differentiable.
     """
-    schema = torch.library.infer_schema(cpu, mutates_args=mutates)
+    schema = torch.library.infer_schema(kernel, mutates_args=mutates)
     qualified = f"{NAMESPACE}::{name}"
     _LIBRARY.define(name + schema)
     torch.library.register_fake(qualified, fake, lib=_LIBRARY)
     _LIBRARY.impl(name, _refusal(name), "CompositeExplicitAutograd")  # for every device that has none of its own
     _kernels[name] = {"meta"}
-    implement(name, "cpu", cpu)
+    for device in devices:
+        if device != "cuda" or has_cuda_core():
+            implement(name, device, kernel)
     if gradient is not None:
         formula = _first_order(qualified, gradient.backward)
         torch.library.register_autograd(qualified, formula, setup_context=gradient.save, lib=_LIBRARY)

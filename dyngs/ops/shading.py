@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.native import array, core_for, num_threads
 from dyngs.ops.quaternions import rotation_matrices
 from dyngs.ops.registration import Gradient, register
 
@@ -65,7 +65,7 @@ def _shading(
     normals: bool,
 ) -> Tensor:
     out = base.new_empty(len(base), num_inputs(sees_time=time is not None, sees_normals=normals))
-    core.shading_inputs(
+    core_for(base).shading_inputs(
         (array(means), array(quats), array(log_scales)),
         array(rows),
         array(base),

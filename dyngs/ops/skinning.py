@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.native import array, core_for, num_threads
 from dyngs.ops.registration import Gradient, register
 
 
@@ -23,7 +23,7 @@ def _skinning(
     nodes = tuple(array(x) for x in (positions, radii, motion, values))
     outputs = (array(x) for x in (offset, blended, weights))
     try:
-        core.skinning_forward(nodes, (array(points), array(followed)), *outputs, num_threads())
+        core_for(points).skinning_forward(nodes, (array(points), array(followed)), *outputs, num_threads())
     except IndexError:
         raise DyngsError(
             f"blend_skinning: followed must be in [0, {len(positions)}), the nodes there are, "
@@ -43,7 +43,7 @@ def _skinning_backward(
     nodes: list[Tensor], points: Tensor, followed: Tensor, weights: Tensor, grads: list[Tensor], with_points: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     g_points, g_motion, g_values = _fake_skinning_backward(nodes, points, followed, weights, grads, with_points)
-    core.skinning_backward(
+    core_for(points).skinning_backward(
         tuple(array(x) for x in nodes),
         (array(points), array(followed)),
         tuple(array(x) for x in (*grads, weights)),

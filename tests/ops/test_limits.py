@@ -78,11 +78,11 @@ def test_pairs_beyond_counting_are_refused_soon() -> None:
 
 
 def test_memory_that_is_there_is_not_asked_for() -> None:
-    check_memory(10**6, "this")
+    check_memory(10**6, "this", torch.empty(0))
     with pytest.raises(
         DyngsError, match=r"^render refused: this take 1000000000.0 GB; \d+\.\d GB of memory are available"
     ):
-        check_memory(10**18, "this")
+        check_memory(10**18, "this", torch.empty(0))
 
 
 # --- what the system says ---------------------------------------------------------------------------------------------

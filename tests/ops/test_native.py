@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 import torch
+from emulated_card import compiled, compiler, emulated_kernels, session_folder
 
 from dyngs.ops.native import active_isa, array, core, kernel_threads, num_threads
 
@@ -106,39 +105,26 @@ def test_formulas_need_no_library_but_the_mathematical_one() -> None:
 @pytest.mark.parametrize("name", ["test_math", "test_formulas"])
 def test_formulas_in_cpp(tmp_path: Path, name: str) -> None:
     """csrc/tests/*.cpp without kernels, built without Python, as by the CMake option DYNGS_TESTS."""
-    compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
-    if compiler is None:
-        pytest.skip("no C++ compiler here")
     program, source = tmp_path / name, ROOT / f"csrc/tests/{name}.cpp"
     # GNU dialect and contraction as in CMakeLists.txt
     flags = ["-std=gnu++20", "-O1", "-ffp-contract=fast", "-w", f"-I{ROOT / 'csrc'}"]
-    subprocess.run([compiler, *flags, str(source), "-o", str(program)], check=True, timeout=100)
+    subprocess.run([compiler(), *flags, str(source), "-o", str(program)], check=True, timeout=100)
     done = subprocess.run([str(program)], capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stdout
     assert "all passed" in done.stdout
 
 
-def test_cuda_kernels_in_cpp(tmp_path: Path) -> None:
+def test_cuda_kernels_in_cpp(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     """csrc/tests/test_cuda_*.cpp: the kernels of csrc/cuda as plain C++, run by an emulation, against csrc/cpu."""
-    compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
-    if compiler is None:
-        pytest.skip("no C++ compiler here")
-    # nothing contracted, as in CMakeLists.txt; what hardly takes time to run is compiled quickly
-    command = [compiler, "-std=gnu++20", "-ffp-contract=off", "-w", "-fopenmp", f"-I{ROOT / 'csrc'}", "-x", "c++", "-c"]
     tests = [ROOT / f"csrc/tests/test_cuda_{name}.cpp" for name in ("emulator", "render", "train", "deform")]
-    cpu, emulated = sorted((ROOT / "csrc/cpu").glob("*.cpp")), sorted((ROOT / "csrc/cuda").glob("*.cu"))
-    objects = {source: str(tmp_path / f"{source.name}.o") for source in (*emulated, *tests, *cpu)}
-
-    def compiled(source: Path) -> None:
-        level = "-O1" if source in emulated else "-O0"
-        subprocess.run([*command, level, str(source), "-o", objects[source]], check=True, timeout=300)
-
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(compiled, objects))
-    for test in tests:
+    cpu = sorted((ROOT / "csrc/cpu").glob("*.cpp"))
+    # nothing contracted, as in CMakeLists.txt; what hardly takes time to run is compiled quickly
+    objects = compiled(tmp_path, [*tests, *cpu], ["-ffp-contract=off", "-fopenmp", "-O0"])
+    emulated = emulated_kernels(session_folder(tmp_path_factory))
+    for test, own in zip(tests, objects, strict=False):
         program = tmp_path / test.stem
-        parts = [objects[source] for source in (test, *emulated, *cpu)]
-        subprocess.run([compiler, "-fopenmp", *parts, "-o", str(program)], check=True, timeout=300)
+        parts = [own, *emulated, *objects[len(tests) :]]
+        subprocess.run([compiler(), "-fopenmp", *parts, "-o", str(program)], check=True, timeout=300)
         done = subprocess.run([str(program)], capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stdout + done.stderr
         assert "all passed" in done.stdout

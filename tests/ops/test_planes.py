@@ -132,7 +132,7 @@ def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
     """The planes run on the kernels of this instruction set."""
     if request.param > core.best_isa():
         pytest.skip(f"this processor has no {request.param}")
-    monkeypatch.setattr("dyngs.ops.planes.core", import_module(f"dyngs.ops._core_{request.param}"))
+    monkeypatch.setattr("dyngs.ops.native.core", import_module(f"dyngs.ops._core_{request.param}"))
     return request.param
 
 
@@ -389,7 +389,7 @@ def test_the_kernels_refuse_arrays_that_do_not_fit() -> None:
     with pytest.raises(ValueError, match="different sizes"):
         core.hexplane_forward(torch.zeros(7, 3), arrays, 0.5, torch.zeros(6, 5), torch.zeros(7, dtype=torch.int32), 1)
     with pytest.raises(ValueError, match="another size than the planes"):
-        core.plane_penalty(arrays, [(level.time, level.time)], WEIGHTS, 1)
+        core.plane_penalty(arrays, [(level.time, level.time)], WEIGHTS, torch.zeros(1, dtype=torch.float64), 1)
 
 
 @pytest.mark.parametrize("with_coords", [True, False])

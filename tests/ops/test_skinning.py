@@ -102,7 +102,7 @@ def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
     """Skinning runs on the kernels of this instruction set."""
     if request.param > core.best_isa():
         pytest.skip(f"this processor has no {request.param}")
-    monkeypatch.setattr("dyngs.ops.skinning.core", import_module(f"dyngs.ops._core_{request.param}"))
+    monkeypatch.setattr("dyngs.ops.native.core", import_module(f"dyngs.ops._core_{request.param}"))
     return request.param
 
 

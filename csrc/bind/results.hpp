@@ -1,0 +1,24 @@
+// Results that are handed over in another way on a card than on the CPU: numbers are left in its memory, because reading them
+// back would wait for it, and the lists of tile entries are allocated by torch.
+#pragma once
+
+#include <nanobind/nanobind.h>
+
+#include "core/api.hpp"
+
+namespace dyngs {
+
+// The four arrays of bin_tiles, one-dimensional: of NumPy, or on a card tensors of bytes.
+template <class S>
+nanobind::tuple binned(const Splats<S>& splats, int64_t max_entries);
+
+void write_l1_ssim(const LossInput& input, double* loss, float* gradient, int threads);
+template <class S>
+void write_plane_penalty(const HexPlane<S>& planes, const PenaltyWeights& weights, std::span<const PlaneGrads<S>> grads,
+                         double* penalty, int threads);
+// These two add to what is there.
+void write_adam_step(const AdamState& state, const AdamRates& rates, int32_t* skipped, int threads);
+template <class S>
+void write_count_nonfinite(const S* x, int64_t n, int32_t* count, int threads);
+
+}  // namespace dyngs
