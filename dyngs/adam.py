@@ -41,7 +41,9 @@ class AdamState:
         """
         first, second = (
             {
-                name: require_tensor(f"{part}.{name}", stored[f"{part}.{name}"], tuple(x.shape), x.dtype).clone()
+                name: require_tensor(f"{part}.{name}", stored[f"{part}.{name}"], tuple(x.shape), x.dtype)
+                .to(x.device)
+                .clone()
                 for name, x in tensors.items()
             }
             for part in MOMENTS

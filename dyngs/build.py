@@ -58,6 +58,7 @@ from dyngs.human.avatar.subject import Subject, first_look
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.motion.captured import captured_motion
 from dyngs.human.template.load import load_template, rest_shape
+from dyngs.ops.device import device_for
 from dyngs.rendering import RenderOptions, Shader
 from dyngs.scene import Scene, SceneTraining, render_options
 from dyngs.static.densify import DefaultDensifier, Densifier
@@ -130,6 +131,10 @@ def build(config: Config, *, restored: bool = False) -> Built:
     """Return the trainer of a configuration; see ``assemble`` for the arguments and errors."""
     match config.model:
         case HumanPredictorModel():
+            if config.run.device == "cuda":
+                raise DyngsError(
+                    "run.device=cuda: a network that predicts people is trained on the CPU; give auto or cpu"
+                )
             return Built(assemble_network(config, config.model), None)
         case StaticModel() | DynamicModel() | HumanModel():
             trainer = assemble(config, restored=restored)
@@ -148,6 +153,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
     Raises:
         DyngsError: a capture that cannot be read, a budget that is too small.
     """
+    device = device_for(config.run.device)
     capture = read_capture(config.data)
     if not restored:
         capture = with_points(capture, config)
@@ -170,7 +176,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
     )
     x, y, z = (float(value) for value in capture.world_offset)
     refinement = _refinement(config, pictures, extent)  # before what asks the pictures for corrected cameras
-    return Trainer(
+    trainer = Trainer(
         config=config,
         scene=scene,
         training=first.training,
@@ -193,6 +199,8 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         exposures=exposures_of(config.train, pictures),
         refinement=refinement,
     )
+    trainer.place(device)
+    return trainer
 
 
 def _priors(config: Config, capture: Capture, pictures: PictureLoader) -> UsedPriors:

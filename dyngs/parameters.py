@@ -96,7 +96,7 @@ class Parameters:
         return {name: StateTensor(x, self._roles[name]) for name, x in self.values().items()} | self._adam.state()
 
     def restored(self, tensors: Mapping[str, Tensor], rows: Mapping[str, int] | None = None) -> Parameters:
-        """Return what ``state`` returned as parameters like these.
+        """Return what ``state`` returned as parameters like these, on their device.
 
         Where no moments are stored, as in files for drawing, they are 0.
 
@@ -109,7 +109,9 @@ class Parameters:
             ValueError: one has another type or shape, or is not finite.
         """
         values = {
-            name: require_tensor(name, tensors[name], ((rows or {}).get(name, len(x)), *x.shape[1:]), x.dtype).clone()
+            name: require_tensor(name, tensors[name], ((rows or {}).get(name, len(x)), *x.shape[1:]), x.dtype)
+            .to(x.device)
+            .clone()
             for name, x in self._tensors.items()
         }
         found = Parameters(values, self.rates, self.decay, self._roles)

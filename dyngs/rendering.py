@@ -141,7 +141,7 @@ def render(
     if options.nonfinite != "trust":
         colors = _finite_colors(colors, options.nonfinite)
     if background is not None:
-        background = background.to(colors.dtype).expand(len(cameras), 3)
+        background = background.to(colors).expand(len(cameras), 3)
     if options.depth != "none":
         colors, background = _with_depth(colors, projection.depths, background, weights=_needs_weights(options))
     size = (cameras.width, cameras.height)
@@ -205,7 +205,7 @@ def sensitivities(
     projection, opacities = _project(gaussians, cameras, options)
     colors = _colors(gaussians, cameras, projection.radii, options, shader)
     if background is not None:
-        background = background.to(colors.dtype).expand(len(cameras), 3)
+        background = background.to(colors).expand(len(cameras), 3)
     size, kind = (cameras.width, cameras.height), Tally.SQUARED_SLOPES
     return tally(projection, opacities, size, kind, options.blending, colors=colors, background=background)
 

@@ -146,7 +146,7 @@ class Scene(ABC):
         """Return pictures of the scene; differentiable where gradients are enabled.
 
         Args:
-            cameras: V cameras.
+            cameras: V cameras, on any device.
             time: in [0, 1], or the moment itself, so that it is not computed again.
             options: how to draw; None: as the scene wants to be drawn.
             background: (3,) or (V, 3) colour; None: that of the scene.
@@ -157,7 +157,9 @@ class Scene(ABC):
         """
         moment = time if isinstance(time, Moment) else self.moment(time)
         behind = self.background if background is None else background
-        how = self.options if options is None else options
+        how, device = self.options if options is None else options, moment.gaussians.means.device
+        if cameras.cam_from_world.device != device:
+            cameras = cameras.to(device=device)
         return render(moment.gaussians, cameras, how, background=behind, probe=probe, shader=self.shader(moment))
 
     @abstractmethod

@@ -559,3 +559,21 @@ def test_an_error_that_cannot_be_said_has_its_exit_code() -> None:
 
 def test_long_words_are_cut_in_messages(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(error_line(capsys, "render", ".", "--time", "9" * 5000)) < 600
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["train", "static", "data.root=nothing", "--device", "cuda"],
+        ["train", "static", "data.root=nothing", "run.device=cuda"],
+        ["render", "nothing.ply", "--out", "pictures", "--device", "cuda"],
+        ["eval", "nothing", "--device", "cuda"],
+    ],
+)
+def test_a_card_that_is_not_there_is_told_in_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    Path("nothing.ply").touch()
+    assert main(words) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert re.fullmatch(r"dyngs: error: device cuda: .+: .+, or give device cpu\n", printed.err)

@@ -36,6 +36,7 @@ HEAVY = ("pycolmap", "trimesh", "kornia", "OpenImageIO", "skimage", "av", "rich"
 WITHOUT_MIRROR = {
     "test_devices.py": "about all that poses an avatar",
     "test_emulated_card.py": "about all ops at once, on another core",
+    "test_pretend_card.py": "about all that a trainer holds, on another device",
     "test_docs.py": "about README.md and docs/*.md",
     "test_fuzz.py": "about all readers, by the folder fuzz beside the tests",
     "test_layout.py": "about the repository, not one module",

@@ -27,6 +27,7 @@ from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
+from dyngs.ops.device import device_for
 from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FloaterRemoval
@@ -103,13 +104,14 @@ def train(
 
     Raises:
         DyngsError: bad input, a run folder that already holds a run or that another process writes into, a budget that
-            cannot be kept, a loss that is not finite, a full disk.
+            cannot be kept, no card where one is asked for, a loss that is not finite, a full disk.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how to go on.
     """
     folder = resume_from or config.run.dir or default_folder(config.run.name)
     processes = processes or Processes()
     config = shared(config, processes)
     require_possible(config)
+    device_for(config.run.device)
     if resume_from is not None and (not folder.is_dir() or _is_done_and_read_only(config, folder)):
         latest_checkpoint(folder)
         return folder

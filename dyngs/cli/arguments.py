@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
+    import torch
+
     from dyngs.config import DataConfig
 
 MAX_THREADS = 1024
@@ -24,6 +26,30 @@ def threads(text: str) -> int:
             f"{text!r} is not a number of threads; write a whole number up to {MAX_THREADS}, 0 for all cores"
         )
     return int(text)
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    """Add ``--device``."""
+    parser.add_argument(
+        "--device",
+        choices=("auto", "cpu", "cuda"),
+        default="auto",
+        help="what computes (default auto: a CUDA card that can be used, else the CPU)",
+    )
+
+
+def computing_device(choice: str) -> torch.device:
+    """Return the device that ``--device`` or ``run.device`` means; where that may surprise, a line on stderr says why.
+
+    Raises:
+        DyngsError: ``cuda`` where no card can be used.
+    """
+    from dyngs.ops.device import device_for, why_on_cpu
+
+    device, reason = device_for(choice), why_on_cpu(choice)
+    if reason is not None:
+        print(f"dyngs: {reason}", file=sys.stderr)
+    return device
 
 
 def scene_time(text: str) -> float:

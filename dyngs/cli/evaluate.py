@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import threads
+from dyngs.cli.arguments import add_device, computing_device, threads
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -29,6 +29,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--split", choices=("test", "val", "train", "pose"), default="test", help="default test")
     parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
+    add_device(parser)
     parser.add_argument(
         "--refine",
         action="store_true",
@@ -55,6 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         lpips_net=arguments.lpips_net,
         threads=arguments.threads,
         refine_poses=arguments.refine,
+        device=computing_device(arguments.device).type,
     )
     Console().print(report_table(report))
     for note in report.notes:

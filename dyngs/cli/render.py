@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import (
+    add_device,
+    computing_device,
     frame_count,
     image_size,
     is_avatar_file,
@@ -93,6 +96,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "its format)",
     )
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
+    add_device(parser)
     parser.set_defaults(run=run)
 
 
@@ -161,13 +165,17 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
 
     from dyngs.output.image_files import OutputOptions, write_job_images, write_split_images
 
+    device = computing_device(arguments.device)
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)
     output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or 30.0)
     if not (arguments.source.is_file() or arguments.path or _has_fixed_camera(arguments)):
         with ProgressBar() as report:
-            return write_split_images(arguments.source, arguments.split or "test", arguments.out, output, report)
+            return write_split_images(
+                arguments.source, arguments.split or "test", arguments.out, output, report, device
+            )
     job = _job(arguments)
+    job = replace(job, scene=job.scene.to(device))
     print_notes(job.notes, job.path.warnings)
     if not arguments.fps:
         output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, job.path.fps)

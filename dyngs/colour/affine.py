@@ -39,7 +39,9 @@ def recoloured(affine: Tensor, picture: Picture, rendering: Rendering, backgroun
         rendering: of its one view.
         background: (3,) behind the rendering.
     """
-    rgb, matrix, offset = rendering.rgb[0], affine[:, :3], affine[:, 3]
+    rgb = rendering.rgb[0]
+    background, affine = background.to(rgb.device), affine.to(rgb.device)
+    matrix, offset = affine[:, :3], affine[:, 3]
     if picture.alpha is None:
         return torch.addmm(offset, rgb.reshape(-1, 3), matrix.T).reshape(rgb.shape)
     through = rendering.transmittance[0][..., None]

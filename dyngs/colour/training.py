@@ -102,6 +102,9 @@ class ColourTraining:
         """Update what is learned beside the harmonics, and return the number of rows left out for bad gradients."""
         return 0
 
+    def place(self, device: torch.device) -> None:
+        """Go on on ``device``."""
+
     def state(self) -> State:
         """Return the tensors that a checkpoint must hold beside the scene's colours."""
         return {}
@@ -147,6 +150,9 @@ class NetworkTraining(ColourTraining):
 
     def optimize(self, step: int) -> int:
         return self.parameters.update(step, rate_factor(step, self.steps, self.options.warm_up))
+
+    def place(self, device: torch.device) -> None:
+        self.box, self.parameters = self.box.to(device), self.parameters.to(device)
 
     def state(self) -> State:
         return {name: x for name, x in self.parameters.state().items() if x.role is Role.TRAINING}
@@ -201,6 +207,9 @@ class AutoTraining(ColourTraining):
     def follow(self, edit: TopologyEdit) -> None:
         if self._frozen is not None:
             self._frozen = edit.apply(self._frozen)
+
+    def place(self, device: torch.device) -> None:
+        self._frozen = None if self._frozen is None else self._frozen.to(device)
 
     def state(self) -> State:
         return {} if self._frozen is None else {"frozen": StateTensor(self._frozen, Role.TRAINING)}

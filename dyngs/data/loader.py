@@ -73,7 +73,7 @@ class Picture:
         """Return the (H, W, 3) picture over the colour ``background`` (3,)."""
         if self.alpha is None:
             return self.rgb_premultiplied
-        return self.rgb_premultiplied + (1 - self.alpha[..., None]) * background
+        return self.rgb_premultiplied + (1 - self.alpha[..., None]) * background.to(self.alpha.device)
 
     def to(self, device: torch.device | str) -> Picture:
         """Return the same picture, with its camera, on another device."""
@@ -137,11 +137,12 @@ class PictureLoader:
 
     Once the cache is full, what is in it stays: where every picture is asked for once per epoch, in a new order each
     time, the one used last is the one needed last. The same index always gives the same bytes, cached or not, decoded
-    ahead or not. Safe to use from several threads. Tensors are on the CPU.
+    ahead or not. Safe to use from several threads. Pictures are decoded and cached on the CPU.
 
     Attributes:
         corrected: returns the camera of a picture, given the index of its view and its camera by the capture; None: the
             latter.
+        device: pictures and cameras are given out there.
     """
 
     def __init__(
@@ -174,6 +175,7 @@ class PictureLoader:
         self._small_by, self._small_bytes = 1, 0
         self._last_map: tuple[object, LensMap] | None = None
         self.corrected: Callable[[int, Cameras], Cameras] | None = None
+        self.device = torch.device("cpu")
         self._lock = Lock()
         with pictures_up_to(options.max_megapixels):
             check_files(self._views)
@@ -200,10 +202,10 @@ class PictureLoader:
         return self._with_camera(index, self._as_stored(index))
 
     def _with_camera(self, index: int, picture: Picture) -> Picture:
-        """Return ``picture`` with its camera corrected."""
-        if self.corrected is None:
-            return picture
-        return replace(picture, cameras=self.corrected(index % len(self._views), picture.cameras))
+        """Return ``picture`` with its camera corrected, on ``device``."""
+        if self.corrected is not None:
+            picture = replace(picture, cameras=self.corrected(index % len(self._views), picture.cameras))
+        return picture if self.device.type == "cpu" else picture.to(self.device)
 
     def _as_stored(self, index: int) -> Picture:
         """Return the picture of view ``index`` with the camera of the capture."""
@@ -227,7 +229,8 @@ class PictureLoader:
     def cameras(self) -> list[Cameras]:
         """Return the cameras of all pictures as they are by now, one each; no picture is read."""
         stored = [_camera_of(view, *size) for view, size in zip(self._views, self.sizes, strict=True)]
-        return stored if self.corrected is None else [self.corrected(i, x) for i, x in enumerate(stored)]
+        found = stored if self.corrected is None else [self.corrected(i, x) for i, x in enumerate(stored)]
+        return [x.to(device=self.device) for x in found]
 
     def shrunk(self, index: int, factor: int) -> Picture:
         """Return ``self[index].shrunk(factor)``; cached for the last factor, where memory is left."""

@@ -252,9 +252,9 @@ class ControlNodes(NetworkField):
         last = self.num_points - 1
         low = 0 if seen[0] <= 0 else math.floor(seen[0] * self.num_pieces) + 1
         high = last if seen[1] >= 1 else math.ceil(seen[1] * self.num_pieces) + SPAN - 3
-        reach = min(2, high - low)
-        after = torch.arange(1, last - high + 1, device="cpu")[:, None]
-        before = torch.arange(low, 0, -1, device="cpu")[:, None]
+        reach, device = min(2, high - low), self.setup.center.device
+        after = torch.arange(1, last - high + 1, device=device)[:, None]
+        before = torch.arange(low, 0, -1, device=device)[:, None]
         for x in (points.data for points in self._splines().values()):
             x[:, high + 1 :] = x[:, high, None] + after * ((x[:, high] - x[:, high - reach]) / max(reach, 1))[:, None]
             x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
@@ -287,7 +287,7 @@ class ControlNodes(NetworkField):
         """Return the nodes' offsets at ``time`` in the frames of their groups, if they have any."""
         place = min(max(time, 0.0), 1.0) * self.num_pieces
         piece = min(int(place), self.num_pieces - 1)
-        shares = cubic_shares(place - piece)[:, None]
+        shares = cubic_shares(place - piece)[:, None].to(self.setup.center.device)
         parts = {n: (shares * x[:, piece : piece + SPAN]).sum(1) for n, x in self._splines().items()}
         if "logit_opacities" in parts:
             parts["logit_opacities"] = parts["logit_opacities"][:, 0]
@@ -296,7 +296,8 @@ class ControlNodes(NetworkField):
     def _untrained(self, count: int) -> Parameters:
         """Return the parameters of ``count`` nodes that stand still."""
         sizes = head_sizes(self.options)
-        tensors = {name: torch.zeros(count, self.num_points, size, device="cpu") for name, size in sizes.items()}
+        device = self.setup.center.device
+        tensors = {name: torch.zeros(count, self.num_points, size, device=device) for name, size in sizes.items()}
         rates = {"means": self.options.lr_means * self.setup.extent} | LR
         return Parameters(tensors, {name: rates[name] for name in sizes}, LR_DECAY)
 
@@ -407,14 +408,14 @@ class ControlNodes(NetworkField):
             groups: number of rigid groups and of control points of their splines; None: no groups.
         """
         plain = self._untrained(nodes)
-        tensors, rates = plain.values(), dict(plain.rates)
+        tensors, rates, device = plain.values(), dict(plain.rates), self.setup.center.device
         if groups is not None:
-            tensors["group_shifts"] = torch.zeros(*groups, 3, device="cpu")
-            tensors["group_quats"] = torch.zeros(*groups, 4, device="cpu")
-            tensors["binding"] = torch.zeros(moving, 1, device="cpu")
+            tensors["group_shifts"] = torch.zeros(*groups, 3, device=device)
+            tensors["group_quats"] = torch.zeros(*groups, 4, device=device)
+            tensors["binding"] = torch.zeros(moving, 1, device=device)
             rates |= GROUP_RATES | {"group_shifts": rates["means"]}
         if lives:
-            tensors |= {name: torch.zeros(moving, size, device="cpu") for name, size in SIZES.items()}
+            tensors |= {name: torch.zeros(moving, size, device=device) for name, size in SIZES.items()}
             rates |= LIFE_RATES | {"life_velocities": rates["means"]}
         roles = {name: Role.PER_MOVING if name in ("binding", *SIZES) else Role.SHARED for name in tensors}
         return Parameters(tensors, rates, LR_DECAY, roles)

@@ -48,11 +48,11 @@ class Nodes:
 
 def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
     """Return the nodes at ``positions`` (S, 3), at least one, followed by the points ``means`` (M, 3)."""
-    tree, places, points = _tree(positions), positions.double().numpy(), means.detach().double().numpy()
+    tree, places, points = _tree(positions), positions.double().cpu().numpy(), means.detach().double().cpu().numpy()
     count = min(FOLLOWED, len(positions))
-    gaps = torch.from_numpy(tree.query(places, k=count)[0]).reshape(len(positions), -1)
+    gaps = torch.from_numpy(tree.query(places, k=count)[0]).to(positions.device).reshape(len(positions), -1)
     radii = gaps[:, 1:].mean(1) if count > 1 else torch.ones(len(positions), dtype=torch.float64, device=gaps.device)
-    followed = torch.from_numpy(tree.query(points, k=count)[1]).reshape(len(points), -1)
+    followed = torch.from_numpy(tree.query(points, k=count)[1]).to(positions.device).reshape(len(points), -1)
     floor = max(1e-6 * float(radii.max()), 1e-12)
     return Nodes(positions, radii.clamp_min(floor).to(positions), followed)
 
@@ -83,8 +83,8 @@ def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
     points = points.detach().double()
     chosen: list[int] = []
     if len(taken):
-        nearest, _ = _tree(taken).query(points.numpy())
-        apart = torch.from_numpy(nearest).square()
+        nearest, _ = _tree(taken).query(points.cpu().numpy())
+        apart = torch.from_numpy(nearest).to(points.device).square()
     elif count and len(points):
         chosen = [int((points - points.mean(0)).square().sum(1).argmin())]
         apart = (points - points[chosen[0]]).square().sum(1)
@@ -125,4 +125,4 @@ def turned(offsets: Tensor, vectors: Tensor) -> Tensor:
 def _tree(points: Tensor) -> KDTree:
     from scipy.spatial import KDTree
 
-    return KDTree(points.double().numpy())
+    return KDTree(points.double().cpu().numpy())

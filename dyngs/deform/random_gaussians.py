@@ -22,7 +22,8 @@ SOLID = 0.05
 def with_random_gaussians(gaussians: Gaussians, count: int, extent: float, generator: torch.Generator) -> EditResult:
     """Return the edit that adds ``count`` faint grey Gaussians at random points of the box of ``gaussians``."""
     center, half_size = box_of(gaussians, extent)
-    places = center + half_size * (2 * torch.rand((count, 3), generator=generator, device="cpu") - 1)
+    unit = torch.rand((count, 3), generator=generator, device="cpu").to(center.device)
+    places = center + half_size * (2 * unit - 1)
     spacing = float((2 * half_size).prod() / max(count, 1)) ** (1 / 3)
     added = Gaussians(
         means=places,

@@ -220,7 +220,7 @@ def quats_of(turns: Tensor) -> Tensor:
     """Return the unit quaternions (..., 4) wxyz of rotation matrices (..., 3, 3)."""
     from scipy.spatial.transform import Rotation
 
-    flat = Rotation.from_matrix(turns.reshape(-1, 3, 3).double().numpy()).as_quat()
+    flat = Rotation.from_matrix(turns.reshape(-1, 3, 3).double().cpu().numpy()).as_quat()
     return torch.from_numpy(flat).roll(1, dims=1).to(turns).reshape(*turns.shape[:-2], 4)
 
 

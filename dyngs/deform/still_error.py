@@ -134,7 +134,7 @@ def _median_pictures(pictures: Sequence[Picture], background: Tensor) -> dict[by
 def _camera_key(picture: Picture) -> bytes:
     """Return a key that is equal for pictures from the same camera pose, but for rounding."""
     cameras = picture.cameras
-    return b"".join(x.round(decimals=6).numpy().tobytes() for x in (cameras.cam_from_world, cameras.intrinsics))
+    return b"".join(x.round(decimals=6).cpu().numpy().tobytes() for x in (cameras.cam_from_world, cameras.intrinsics))
 
 
 def two_group_threshold(scores: Tensor) -> float:
@@ -143,4 +143,4 @@ def two_group_threshold(scores: Tensor) -> float:
 
     if not len(scores) or float(scores.min()) == float(scores.max()):
         return float("inf")
-    return float(threshold_otsu(scores.numpy()))
+    return float(threshold_otsu(scores.cpu().numpy()))

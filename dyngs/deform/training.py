@@ -198,6 +198,7 @@ class DynamicTraining:
         else:
             field = new_field(self.options.deform, setup, self._generator)
         std = self._update.of(gaussians)
+        field = field.to(now.means.device)
         return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
 
     def variant(self, scene: DynamicScene, step: int) -> Variant[DynamicScene] | None:
@@ -225,7 +226,7 @@ class DynamicTraining:
             return scene
         count, means = len(scene), scene.gaussians.means.detach()
         setup = FieldSetup(means.mean(0), torch.full_like(means[0], extent), len(self.times), count, extent)
-        field = new_field(self.options.deform, setup, torch.Generator())
+        field = new_field(self.options.deform, setup, torch.Generator()).to(means.device)
         return replace(scene, moving=torch.arange(count, device=means.device), field=field)
 
     def follow(self, edit: TopologyEdit) -> None:

@@ -27,6 +27,7 @@ from dyngs.files.write import write_text
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.captured import captured_motion, same_bodies
 from dyngs.metrics import LpipsNet, MetricValue, load_lpips
+from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 from dyngs.scene import Scene, render_options
 from dyngs.training.background import evaluation_background
@@ -133,7 +134,13 @@ class EvalReport:
 
 
 def evaluate_run(
-    run_dir: Path, split: str = "test", *, lpips_net: LpipsNet = "alex", threads: int = 0, refine_poses: bool = False
+    run_dir: Path,
+    split: str = "test",
+    *,
+    lpips_net: LpipsNet = "alex",
+    threads: int = 0,
+    refine_poses: bool = False,
+    device: str = "cpu",
 ) -> EvalReport:
     """Return the report of a run on one split and write it into its folder: ``metrics.json``, ``metrics_SPLIT.json``.
 
@@ -144,15 +151,14 @@ def evaluate_run(
         threads: for rendering and metrics; 0 leaves the number as it is.
         refine_poses: also score from poses, of a person's body, otherwise of the cameras, that were refined on the
             pictures themselves; always done for a run that refined its cameras.
+        device: "auto", "cpu" or "cuda": draws the views; all else is done on the CPU.
 
     Raises:
         DyngsError: no such run or split, unreadable pictures, a render or metric that is not finite, unwritable folder,
-            poses of training views that are to be refined.
+            poses of training views that are to be refined, no card that can be used.
     """
-    if refine_poses and split == "train":
-        raise DyngsError(
-            f"{run_dir}: --refine is for pictures that were not trained on; name them with --split test, val or pose"
-        )
+    draws_on = device_for(device)
+    _require_untrained(run_dir, split, refine_poses)
     run = load_run(run_dir)
     capture = read_capture(run.config.data)
     views = split_views(capture, split)
@@ -164,7 +170,7 @@ def evaluate_run(
         regions = Regions(views, loader, colour)
         pictures = (loader[i] for i in range(len(loader)))
         lpips = load_lpips(lpips_net)
-        scores, reasons = score_views(scene, pictures, drawing.options, colour, lpips, regions)
+        scores, reasons = score_views(scene.to(draws_on), pictures, drawing.options, colour, lpips, regions)
         temporal = _temporal(drawing, loader, views)
         tracks = _track_scores(run, capture, scene, views)
         asked = split != "train" and (refine_poses or run.config.camera.refine == "always")
@@ -176,22 +182,38 @@ def evaluate_run(
         background=background,
         flip=mean_of([s.flip for s in scores]),
         lpips_net=lpips_net,
-        flicker=temporal["flicker"].value,
-        flicker_error=temporal["flicker_error"].value,
         psnr_per_time=psnr_per_time((s.time, s.psnr) for s in scores),
         reasons=reasons,
         notes=_notes(run, scores),
         per_view=tuple(scores),
-        psnr_own_poses=fitted.psnr,
-        own_poses=fitted.to_pictures,
-        silhouette_poses=fitted.to_silhouettes,
+        **_own_poses(fitted),
+        **{name: measured.value for name, measured in temporal.items()},
         **means_of(scores),
         **_facts(run_dir, run, scene),
         **_sizes_and_speed(scores),
     )
-    report = _with_parts(report, regions, tracks)
-    write_text(report_path(run_dir, split), report.to_json())
+    return _written(run_dir, _with_parts(report, regions, tracks))
+
+
+def _written(run_dir: Path, report: EvalReport) -> EvalReport:
+    write_text(report_path(run_dir, report.split), report.to_json())
     return report
+
+
+def _require_untrained(run_dir: Path, split: str, refine_poses: bool) -> None:
+    if refine_poses and split == "train":
+        raise DyngsError(
+            f"{run_dir}: --refine is for pictures that were not trained on; name them with --split test, val or pose"
+        )
+
+
+def _own_poses(fitted: PoseRefinement) -> dict[str, Any]:
+    """Return the fields of a report on refined poses."""
+    return {
+        "psnr_own_poses": fitted.psnr,
+        "own_poses": fitted.to_pictures,
+        "silhouette_poses": fitted.to_silhouettes,
+    }
 
 
 def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from dyngs.evaluate.people import person_scores
 from dyngs.evaluate.regions import Regions, RegionScores
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.metrics import Lpips, flip, psnr, ssim
+from dyngs.ops.device import finish
 from dyngs.rendering import Rendering, RenderOptions
 from dyngs.scene import Scene
 
@@ -89,7 +90,7 @@ def score_views(
     """Return scores of the Gaussians against pictures, and the reasons for metrics that are None.
 
     Args:
-        scene: what to draw, at the time of each picture.
+        scene: what to draw, at the time of each picture; on any device.
         pictures: truth and camera of each view, drawn one at a time.
         options: as in training, without depth.
         background: (3,) colour behind both the truth and the render.
@@ -154,14 +155,18 @@ def mean_of(values: Sequence[float | None]) -> float | None:
 def _timed_render(
     scene: Scene, picture: Picture, options: RenderOptions, background: Tensor
 ) -> tuple[Rendering, float, float]:
-    """Return the rendering, the seconds it took, and the seconds of these for deformation."""
+    """Return the rendering, on the CPU, the seconds it took, and the seconds of these for deformation."""
     with torch.no_grad():
+        device = scene.gaussians.means.device
+        finish(device)
         start = time.perf_counter()
         moment = scene.moment(picture.time)
+        finish(device)
         deformed = time.perf_counter()
         rendering = scene.render(picture.cameras, moment, options=options, background=background)
+        finish(device)
         end = time.perf_counter()
-    return rendering, end - start, deformed - start
+    return rendering.to(device="cpu"), end - start, deformed - start
 
 
 def _require_finite(score: ViewScore, mask: Tensor | None) -> None:

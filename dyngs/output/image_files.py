@@ -19,6 +19,7 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
 from dyngs.files.write import to_uint8, write_image
 from dyngs.metrics import psnr
+from dyngs.ops.device import CPU
 from dyngs.output.camera_paths import CameraPath
 from dyngs.output.contact_sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
 from dyngs.output.render_job import Frame, RenderJob, job_frames, render_frame
@@ -86,6 +87,7 @@ def write_split_images(
     out_dir: Path,
     output: OutputOptions = OutputOptions(),
     report: ReportProgress = report_nothing,
+    device: torch.device = CPU,
 ) -> list[Path]:
     """Render a split of a run to ``NAME.png`` per view and ``sheet.png`` (truth, render, error); return the paths.
 
@@ -98,6 +100,7 @@ def write_split_images(
         out_dir: folder for the pictures, which are named after the views (``file_stems``).
         output: depth, alpha, video (views of one size only).
         report: is told of each view.
+        device: draws.
 
     Raises:
         DyngsError: no such run or split, unreadable pictures, a file cannot be written.
@@ -108,7 +111,7 @@ def write_split_images(
     loader = PictureLoader(views, run.config.data)
     _, background = evaluation_background(run.config.data.background, capture.has_alpha)
     options = _with_depth(render_options(run.config.model), output)
-    scene = scene_of_split(run, capture, split)
+    scene = scene_of_split(run, capture, split).to(device)
     shown = set(np.linspace(0, len(loader) - 1, min(len(loader), _SHEET_ROWS)).round().astype(int).tolist())
     rows: list[SheetRow] = []
     with _FrameWriter(out_dir, output, files_of(capture)) as writer:
@@ -136,7 +139,7 @@ def files_of(capture: Capture) -> frozenset[Path]:
 def _sheet_row(label: str, truth: Tensor, rendered: Tensor, mask: Tensor | None) -> SheetRow:
     """Return a row of the sheet; masked pixels are black on both sides, so that they show no error."""
     counts = 1.0 if mask is None else mask[..., None]
-    return SheetRow(label, to_uint8((truth * counts).numpy()), to_uint8((rendered * counts).numpy()))
+    return SheetRow(label, to_uint8((truth * counts).cpu().numpy()), to_uint8((rendered * counts).cpu().numpy()))
 
 
 def file_stems(names: Sequence[str]) -> list[str]:

@@ -81,7 +81,7 @@ def _path(scene: HumanScene, world_offset: tuple[float, float, float], options: 
 def _around(scene: HumanScene, options: RenderJobOptions, count: int) -> Cameras:
     """Return an orbit around the person, a spiral in front, or without a path one camera in front."""
     moments = np.linspace(0, 1, 1 if scene.is_still else _SAMPLED_TIMES)
-    means = torch.cat([scene.at(moment).means for moment in moments.tolist()]).numpy()
+    means = torch.cat([scene.at(moment).means for moment in moments.tolist()]).cpu().numpy()
     x, y, z = up_direction(scene.clip).tolist() if options.up is None else axis(options.up)
     size = options.size or DEFAULT_SIZE
     if options.path == "orbit":

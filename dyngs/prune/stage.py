@@ -139,7 +139,7 @@ def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
     found: dict[bytes, Cameras] = {}
     for camera in cameras:
         numbers = torch.cat([camera.cam_from_world[0, :3], camera.intrinsics[0]], dim=1)
-        found.setdefault(numbers.numpy().tobytes(), camera)
+        found.setdefault(numbers.cpu().numpy().tobytes(), camera)
     different = list(found.values())
     return [different[i] for i in evenly_spaced(len(different), count)]
 

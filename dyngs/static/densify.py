@@ -78,6 +78,10 @@ class Densifier(Protocol):
         """Add the strategy's noise to the parameters, in place, after the optimizer's step."""
         ...
 
+    def place(self, device: torch.device) -> None:
+        """Go on on ``device``."""
+        ...
+
     def limit(self, max_gaussians: int) -> None:
         """Limit the number of Gaussians from now on; none are removed. Not part of the state."""
         ...
@@ -145,6 +149,9 @@ class DefaultDensifier:
 
     def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
         return None
+
+    def place(self, device: torch.device) -> None:
+        self.grad_sum, self.seen = self.grad_sum.to(device), self.seen.to(device)
 
     def limit(self, max_gaussians: int) -> None:
         self.options = self.options.model_copy(update={"max_gaussians": max_gaussians})

@@ -30,6 +30,7 @@ def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
     """
     means = means.detach()
     nearest = torch.full((len(means),), torch.inf, device=means.device)
+    cameras = [group.to(device=means.device) for group in cameras]
     focal = max(float(group.intrinsics[:, 0, 0].max()) for group in cameras)
     for group in cameras:
         for pose, intrinsics in zip(group.cam_from_world, group.intrinsics, strict=True):

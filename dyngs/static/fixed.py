@@ -31,6 +31,9 @@ class FixedDensifier:
     def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
         return None
 
+    def place(self, device: torch.device) -> None:
+        return None
+
     def limit(self, max_gaussians: int) -> None:
         return None
 

@@ -96,6 +96,9 @@ class McmcDensifier:
         weight = 1 / (1 + (NOISE_STEEPNESS * (opacities - NOISE_OPACITY)).exp())
         parameters.means.detach().index_add_(0, rows, shake * (weight * (self.options.noise * lr_means))[:, None])
 
+    def place(self, device: torch.device) -> None:
+        return None
+
     def limit(self, max_gaussians: int) -> None:
         self.max_gaussians = max_gaussians
 

@@ -86,6 +86,12 @@ class GaussianOptimizer:
             lambda x: torch.cat([x[:, :1], torch.where(chosen, 0.0, x[:, 1:])], dim=1)[:, :count].contiguous(), ["sh"]
         )
 
+    def to(self, device: torch.device | str) -> GaussianOptimizer:
+        """Return an optimizer of the same parameters and moments on ``device``."""
+        moved = GaussianOptimizer(self.parameters.detach().to(device=device), self.options)
+        moved._adam = self._adam.to(device)
+        return moved
+
     def state(self) -> State:
         """Return the moments by name: ``exp_avg.*``, ``exp_avg_sq.*``."""
         return self._adam.state()

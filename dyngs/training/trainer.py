@@ -21,6 +21,7 @@ from dyngs.conventions import SH_C0
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.ops.device import CPU
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.rendering import Rendering, RenderOptions
 from dyngs.scene import Scene, SceneTraining
@@ -62,6 +63,7 @@ class Trainer:
         held_out: indices of the training views that are not trained on up to ``held_out_until``.
         held_out_until: the last step without them.
         processes: that take a share of the views of each step; one: this.
+        device: where the scene is trained; see ``place``.
     """
 
     config: Config
@@ -88,6 +90,7 @@ class Trainer:
     held_out: frozenset[int] = frozenset()
     held_out_until: float = math.inf
     processes: Processes = field(default_factory=Processes)
+    device: torch.device = CPU
 
     @property
     def num_gaussians(self) -> int:
@@ -140,7 +143,7 @@ class Trainer:
         config, scene = self.config, self.scene
         divisor = picture_divisor(config.train, step)
         picture = self._picture(index, step, divisor)
-        background = background_colour(self.background, self.generator)
+        background = background_colour(self.background, self.generator).to(self.device)
         moment = self.training.moment(scene, picture, step)
         probe = (
             torch.zeros(1, len(scene), 4, requires_grad=True, device=scene.gaussians.means.device)
@@ -210,7 +213,7 @@ class Trainer:
         """Return everything that ``restore`` needs."""
         mode = self.config.model.rasterize_mode.value
         info = CheckpointInfo(self.done, self.extent, self.world_offset, self.background, mode)
-        return Checkpoint(info, tensors_of(self.state()))
+        return Checkpoint(info, {name: x.cpu() for name, x in tensors_of(self.state()).items()})
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go back to where ``checkpoint`` was taken.
@@ -241,6 +244,21 @@ class Trainer:
                 raise DyngsError(f"{checkpoint.name} lacks {missing}; {OTHER_CONFIG}") from None
         self.optimizer, self.scene = optimizer, replace(scene, colour=self.colours.network)
         self.done = checkpoint.info.step
+        self.place(self.device)
+
+    def place(self, device: torch.device) -> None:
+        """Go on on ``device``: with the scene, its optimizers and pictures, and the strategy.
+
+        What belongs to single pictures stays on the CPU: exposures, corrections of cameras, random numbers.
+        """
+        self.device = self.pictures.device = device
+        if self.scene.gaussians.means.device == device:
+            return
+        self.optimizer = self.optimizer.to(device)
+        self.colours.place(device)
+        self.densifier.place(device)
+        scene = self.scene.to(device).with_gaussians(self.optimizer.parameters)
+        self.scene = replace(scene, colour=self.colours.network)
 
     def _drawn_with_depth(self, background: Tensor) -> Callable[[Cameras, float | None], Rendering]:
         """Return what draws the scene with its expected depth."""
@@ -324,7 +342,7 @@ class Trainer:
 
     def _looks(self, step: int) -> TrainingLooks:
         """Return the training views as they are drawn after ``step``."""
-        colour = background_colour(self.background)
+        colour = background_colour(self.background).to(self.device)
 
         def views(indices: Sequence[int]) -> Iterator[MeasuredView]:
             for picture in (self.pictures[i] for i in indices):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 
@@ -16,3 +17,6 @@ class RunConfig(Section):
     dir: Path | None = Field(default=None, description="run folder; null: runs/NAME")
     seed: int = Field(default=42, ge=0, lt=2**63, description="seed of all random numbers")
     threads: int = Field(default=0, ge=0, le=1024, description="CPU threads; 0: one per core")
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        default="auto", description="what computes; auto: a CUDA card that can be used (docs/gpu.md), else the CPU"
+    )

@@ -69,8 +69,8 @@ def footage_of(pictures: Iterable[Picture], background: Tensor, total: int = 1) 
     for picture in pictures:
         small = picture.shrunk(math.ceil(max(picture.cameras.width, picture.cameras.height) / longest))
         rgb = small.composite(background).clamp(0, 1)
-        shown.append((255 * rgb).round().to(torch.uint8).numpy())
-        counted.append(np.ones(rgb.shape[:2], bool) if small.mask is None else small.mask.numpy() > 0.5)
+        shown.append((255 * rgb).round().to(torch.uint8).cpu().numpy())
+        counted.append(np.ones(rgb.shape[:2], bool) if small.mask is None else small.mask.cpu().numpy() > 0.5)
         times.append(small.time or 0.0)
         camera = small.cameras
     if camera is None:

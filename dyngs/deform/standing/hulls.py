@@ -123,8 +123,8 @@ def silhouettes_at(footage: Sequence[Footage], time: float) -> list[Silhouette]:
         if time not in one.times:
             continue
         i = one.times.index(time)
-        pose = one.camera.cam_from_world[0].double().numpy()[:3]
-        projection = one.camera.intrinsics[0].double().numpy() @ pose
+        pose = one.camera.cam_from_world[0].double().cpu().numpy()[:3]
+        projection = one.camera.intrinsics[0].double().cpu().numpy() @ pose
         sums, masked = (np.pad(x.cumsum(0).cumsum(1), ((1, 0), (1, 0))) for x in (one.changed[i], ~one.counted[i]))
         found.append(Silhouette(projection, one.pictures[i], one.changed[i], one.counted[i], sums, masked))
     return found

@@ -154,7 +154,7 @@ def fitted(track: Track, pieces: int) -> Tensor:
 
 def _misfit(track: Track, points: Tensor) -> float:
     basis = _basis(track.times, len(points) - SPAN + 1)
-    return float(np.linalg.norm(basis @ points.double().numpy() - track.centers, axis=1).mean())
+    return float(np.linalg.norm(basis @ points.double().cpu().numpy() - track.centers, axis=1).mean())
 
 
 def _basis(times: Sequence[float], pieces: int) -> np.ndarray:
@@ -162,7 +162,7 @@ def _basis(times: Sequence[float], pieces: int) -> np.ndarray:
     basis = np.zeros((len(times), pieces + SPAN - 1))
     for row, time in enumerate(times):
         piece = min(int(time * pieces), pieces - 1)
-        basis[row, piece : piece + SPAN] = cubic_shares(time * pieces - piece).numpy()
+        basis[row, piece : piece + SPAN] = cubic_shares(time * pieces - piece).cpu().numpy()
     return basis
 
 

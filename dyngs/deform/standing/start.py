@@ -94,12 +94,12 @@ def first_motion(
     shown = [track.travels * len(track.times) * track.radius**2 for track in tracks]
     travelling = [t for t, area in zip(tracks, shown, strict=True) if area > LEAST_SHOWN * max(shown)][:MAX_TRACKS]
     seeds: list[Seeds] = []
-    others = still.means[moving].double().numpy()
+    others = still.means[moving].double().cpu().numpy()
     for track in travelling:
         one = seeds_of(track, footage, limit // max(len(travelling), 1), still.sh.shape[1], others)
         if pays(one, footage):
             seeds.append(one)
-            others = np.concatenate([others, one.gaussians.means.double().numpy()])
+            others = np.concatenate([others, one.gaussians.means.double().cpu().numpy()])
     if not seeds:
         return FirstMotion()
     total = len({time for one in footage for time in one.times})
@@ -120,8 +120,8 @@ def found_tracks(footage: Sequence[Footage], low: np.ndarray, high: np.ndarray) 
 
 def _box(footage: Sequence[Footage], still: Gaussians, extent: float) -> tuple[np.ndarray, np.ndarray]:
     """Return two corners (3,) of a box with the still things and the cameras, and some room around."""
-    center, half_size = (x.double().numpy() for x in box_of(still, extent))
-    centers = np.concatenate([one.camera.centers.double().numpy() for one in footage])
+    center, half_size = (x.double().cpu().numpy() for x in box_of(still, extent))
+    centers = np.concatenate([one.camera.centers.double().cpu().numpy() for one in footage])
     low, high = np.minimum(center - half_size, centers.min(0)), np.maximum(center + half_size, centers.max(0))
     room = ROOM * (high - low).max()
     return low - room, high + room

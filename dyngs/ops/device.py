@@ -1,0 +1,131 @@
+"""Which device computes: the CPU, or a CUDA card where torch, its driver and the compiled core can use one."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import torch
+
+from dyngs.errors import DyngsError
+from dyngs.ops.native import cuda_core, has_cuda_core
+from dyngs.ops.options import check_choice
+
+CPU = torch.device("cpu")
+CHOICES = ("auto", "cpu", "cuda")
+OLDEST = (7, 5)
+"""Compute capability of the oldest cards that the kernels are compiled for."""
+
+_TORCH = "install a torch for CUDA, see pytorch.org"
+_BUILD = "install dyngs with `pip install . -C cmake.define.DYNGS_CUDA=ON`, which needs nvcc (docs/gpu.md)"
+
+
+def device_for(choice: str) -> torch.device:
+    """Return the device for ``auto``, ``cpu`` or ``cuda``; auto is a card where one can be used, else the CPU.
+
+    Raises:
+        DyngsError: ``cuda`` where no card can be used, in one line with the reason and what to do; or another choice.
+    """
+    check_choice("device", choice, CHOICES)
+    if choice == "cpu":
+        return CPU
+    reason = why_no_card()
+    if reason is None:
+        return torch.device("cuda", torch.cuda.current_device())
+    if choice == "cuda":
+        raise DyngsError(f"device cuda: {reason}, or give device cpu")
+    return CPU
+
+
+def why_on_cpu(choice: str) -> str | None:
+    """Return a line on why ``choice`` means the CPU although the machine seems to have a card; None otherwise."""
+    if choice != "auto" or not has_driver():
+        return None
+    reason = why_no_card()
+    return None if reason is None else f"computing on the CPU: {reason}; device=cpu ends this line"
+
+
+def finish(device: torch.device) -> None:
+    """Wait until ``device`` has done what was asked of it, so that it can be timed."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def has_driver() -> bool:
+    """Return whether a driver of NVIDIA seems to be installed."""
+    return Path("/proc/driver/nvidia/version").exists() or shutil.which("nvidia-smi") is not None
+
+
+@cache
+def why_no_card() -> str | None:
+    """Return why no card can be used and what to do, beginning with a small letter; None where one can be."""
+    if torch.version.cuda is None:
+        return f"this torch ({torch.__version__}) is built without CUDA: {_TORCH}"
+    if not torch.cuda.is_available():
+        return _why_torch_has_none()
+    if not has_cuda_core():
+        return f"dyngs was built without its kernels for cards: {_BUILD}"
+    return _why_kernels_fail()
+
+
+def _why_torch_has_none() -> str:
+    """Return why torch, built with CUDA, finds no card."""
+    try:
+        torch.cuda.init()
+    except Exception as error:  # of torch: RuntimeError, or an AssertionError where it was built otherwise
+        found = str(error).splitlines()[0].rstrip(".").partition(" Please ")[0].rstrip(".")
+        if "too old" in found:
+            return f"{found}: update the driver of the card, or {_TORCH.replace('CUDA', 'an older CUDA')}"
+        if "no NVIDIA driver" in found.lower() or "no nvidia driver" in found.lower():
+            return "no driver of NVIDIA is there: install it"
+        return f"torch finds no card ({found}): see `nvidia-smi`"
+    return "torch finds no card: see `nvidia-smi`, and CUDA_VISIBLE_DEVICES if it is set"
+
+
+def _why_kernels_fail() -> str | None:
+    """Return why the kernels cannot run on the card that torch has found; None where they can."""
+    try:
+        core = cuda_core()
+    except DyngsError as error:
+        return str(error)
+    built, driver = core.runtime_version(), core.driver_version()
+    if driver < built // 1000 * 1000:  # CUDA's minor versions are compatible
+        versions = f"the kernels were built with CUDA {_said(built)}, but the driver knows {_said(driver)} at most"
+        return f"{versions}: update the driver, or build dyngs with an older nvcc"
+    capability = torch.cuda.get_device_capability()
+    if capability < OLDEST:
+        found, least = (f"{x[0]}.{x[1]}" for x in (capability, OLDEST))
+        return f"{torch.cuda.get_device_name()} has compute capability {found}, and {least} is needed: use another card"
+    return None
+
+
+def findings() -> Mapping[str, str]:
+    """Return what there is of torch's CUDA, driver, card and compiled core, by name; for ``dyngs doctor``."""
+    version = torch.version.cuda
+    found = {"torch for": "the CPU alone" if version is None else f"CUDA {version}"}
+    if has_cuda_core():
+        try:
+            core = cuda_core()
+        except DyngsError as error:
+            return found | {"kernels for cards": str(error)}
+        found["kernels for cards"] = f"built with CUDA {_said(core.runtime_version())}"
+        driver = core.driver_version()
+        found["driver"] = f"knows CUDA {_said(driver)}" if driver else "none"
+    else:
+        found["kernels for cards"] = "not built"
+        found["driver"] = "there" if has_driver() else "none"
+    if version is not None and torch.cuda.is_available():
+        major, minor = torch.cuda.get_device_capability()
+        gigabytes = torch.cuda.mem_get_info()[1] / 1e9
+        name = torch.cuda.get_device_name()
+        found["card"] = f"{name}, compute capability {major}.{minor}, {gigabytes:.0f} GB"
+    else:
+        found["card"] = "none"
+    return found
+
+
+def _said(version: int) -> str:
+    """Return a version as CUDA writes it, 13020, for people: 13.2."""
+    return f"{version // 1000}.{version % 1000 // 10}"
