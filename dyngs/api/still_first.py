@@ -141,9 +141,10 @@ class StillComparison:
         trainer, source = self._trainer(), self._folder / STILL_FOLDER
         if not trainer.held_out or not checkpoint_paths(source):
             return
-        still = load_run(source)
-        small = PictureLoader(trainer.pictures.views, still.config.data)
-        found = [_compared(trainer, still.scene, trainer.pictures[i], small[i]) for i in sorted(trainer.held_out)]
+        run = load_run(source)
+        still, small = run.scene.to(trainer.device), PictureLoader(trainer.pictures.views, run.config.data)
+        small.device = trainer.device
+        found = [_compared(trainer, still, trainer.pictures[i], small[i]) for i in sorted(trainer.held_out)]
         moving, standing = _means([x[0] for x in found]), [x[1] for x in found if x[1] is not None]
         self.is_lost = not is_gain([x[0][0] - x[0][1] for x in found])
         kept = "a still model is trained instead" if self.is_lost else "motion is kept"
@@ -195,14 +196,15 @@ def _small_still_model(folder: Path) -> tuple[float, list[float]]:
     """
     run = load_run(folder)
     trainer = assemble(run.config, restored=True)
+    scene = run.scene.to(trainer.device)
     background = background_colour(trainer.background)
     fails = total = 0.0
     for index in sorted(trainer.held_out):
         picture = trainer.pictures[index]
-        shown = drawn(run.scene, picture, trainer.options, background, fitted=trainer.exposures is not None)
-        errors, weights = signed_errors(run.scene.gaussians, picture, trainer.options, background, shown)
+        shown = drawn(scene, picture, trainer.options, background, fitted=trainer.exposures is not None)
+        errors, weights = signed_errors(scene.gaussians, picture, trainer.options, background, shown)
         mean: Tensor = errors.abs().mean(1) / weights.clamp_min(1e-6)
         fails += float(weights[mean > ERRS].sum())
         total += float(weights.sum())
-    scores = held_out_scores(run.scene, trainer, background)
+    scores = held_out_scores(scene, trainer, background)
     return fails / max(total, 1e-9), scores

@@ -59,6 +59,7 @@ def fitted_affine(shown: Sequence[Shown], background: Tensor, counts: Tensor | N
         background: (3,) behind both.
         counts: (H, W) weights beside the masks; None: 1.
     """
+    background = background.to(shown[0][1].rgb.device)
     identity = torch.eye(3, 4, dtype=torch.float64, device=background.device)
     affine, equations = identity, [_equations(picture, rendering, background, counts) for picture, rendering in shown]
     for _ in range(ROUNDS):

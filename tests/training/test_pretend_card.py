@@ -8,9 +8,13 @@ import pytest
 import torch
 from pretend_card import CARD, OnCard, pretend_card
 
+from dyngs.api.train import train
 from dyngs.build import assemble
 from dyngs.config import Config
 from dyngs.config.io import load_config
+from dyngs.evaluate.report import evaluate_run
+from dyngs.output.image_files import write_split_images
+from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.state import tensors_of
 from dyngs.training.trainer import Trainer
 
@@ -108,3 +112,30 @@ def test_how_often_the_host_waits_in_a_step(still: Path, monkeypatch: pytest.Mon
             trainer.step()
         waits = {name: count / 10 for name, count in card.waits.items()}
     assert waits == {"item": 7, "to the card": 9}
+
+
+def test_views_are_drawn_and_scored_there_alike(still: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "run"
+    train(config_of("static", still, *STATIC, f"run.dir={folder}"))
+    expected = evaluate_run(folder)
+    pictures = write_split_images(folder, "test", tmp_path / "cpu")
+    monkeypatch.setattr("dyngs.evaluate.report.device_for", lambda _: CARD)
+    with pretend_card():
+        found = evaluate_run(folder)
+        there = write_split_images(folder, "test", tmp_path / "card", device=CARD)
+    assert (found.psnr, found.ssim) == (expected.psnr, expected.ssim)
+    assert [x.read_bytes() for x in there] == [x.read_bytes() for x in pictures]
+
+
+def test_with_limits_and_pruning_it_ends_with_the_same_bytes(
+    still: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(name: str) -> list[bytes]:
+        limits = ("budget.max_gaussians=80", "prune.share=0.3", "prune.steps=10")
+        folder = train(config_of("static", still, *STATIC, *limits, f"run.dir={tmp_path / name}", "run.threads=1"))
+        return [checkpoint_paths(folder)[-1].read_bytes()]
+
+    expected = run("cpu")
+    monkeypatch.setattr("dyngs.build.device_for", lambda _: CARD)
+    with pretend_card():
+        assert run("card") == expected
