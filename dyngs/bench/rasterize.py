@@ -7,6 +7,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,6 +22,7 @@ from dyngs.files.write import write_text
 from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, Tally, TileEntries, bin_tiles, rasterize, tally
+from dyngs.state import fields_moved_to
 
 T = TypeVar("T")
 
@@ -48,6 +50,10 @@ class Workload:
     @property
     def size(self) -> tuple[int, int]:
         return self.cameras.width, self.cameras.height
+
+    def to(self, device: torch.device) -> Workload:
+        """Return the same workload on ``device``."""
+        return fields_moved_to(self, device)
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,8 @@ class RasterizeReport:
         entries: number of (tile, Gaussian) pairs.
         pairs: number of blended (pixel, Gaussian) pairs.
         lanes_used: share of the computed pairs that were blended.
-        runs: times per number of threads.
+        runs: times per number of threads; on a card one.
+        device: "cpu", or the name of the card.
     """
 
     isa: str
@@ -91,6 +98,7 @@ class RasterizeReport:
     pairs: int
     lanes_used: float
     runs: list[StageTimes]
+    device: str = "cpu"
 
 
 def garden_workload(path: Path) -> Workload:
@@ -135,7 +143,10 @@ def _with_random_shapes(means: Tensor, colors: Tensor, cameras: Cameras) -> Work
 
 
 def bench_rasterize(load: Workload, threads: list[int], repeats: int) -> RasterizeReport:
-    """Measure every stage, interleaved over thread counts so that other load affects them alike."""
+    """Measure every stage, interleaved over thread counts so that other load affects them alike.
+
+    A workload on a card is timed by CUDA events.
+    """
     with torch.no_grad():
         projection = project(load.means, load.quats, load.scales, load.opacities, load.cameras, _LIMITS)
     opacities = load.opacities[None]
@@ -160,6 +171,7 @@ def bench_rasterize(load: Workload, threads: list[int], repeats: int) -> Rasteri
         pairs=int(pairs),
         lanes_used=pairs / max(lanes, 1.0),
         runs=[_summary(count, samples[count]) for count in threads],
+        device="cpu" if load.means.device.type == "cpu" else torch.cuda.get_device_name(load.means.device),
     )
 
 
@@ -173,36 +185,44 @@ def _time_stages(load: Workload, projection: Projection, entries: TileEntries, t
     means2d, factors, opacities, colors = (x.clone().requires_grad_() for x in splats)
     flat = Projection(means2d, projection.depths, factors, projection.compensations, projection.radii)
     seconds: dict[str, float] = {}
+    timed = partial(_timed, load.means.device)
     with kernel_threads(threads):
-        seconds["project"], projected = _timed(
+        seconds["project"], projected = timed(
             lambda: project(*leaves, load.opacities, load.cameras, _LIMITS)  # type: ignore[misc]
         )
-        seconds["bin + sort"], _ = _timed(lambda: bin_tiles(projection, load.opacities[None], load.size))
-        seconds["blend"], blended = _timed(
+        seconds["bin + sort"], _ = timed(lambda: bin_tiles(projection, load.opacities[None], load.size))
+        seconds["blend"], blended = timed(
             lambda: rasterize(flat, opacities, colors, load.size, options=BlendOptions(), entries=entries)
         )
         grad = torch.ones_like(blended.color)
-        seconds["blend backward"], _ = _timed(lambda: torch.autograd.backward(blended.color, grad))
+        seconds["blend backward"], _ = timed(lambda: torch.autograd.backward(blended.color, grad))
         outputs = [projected.means2d, projected.factors, projected.depths]
         grads = [torch.ones_like(x) for x in outputs]
-        seconds["project backward"], _ = _timed(lambda: torch.autograd.backward(outputs, grads))
-    seconds["sgemm"] = _sgemm_seconds(threads)
+        seconds["project backward"], _ = timed(lambda: torch.autograd.backward(outputs, grads))
+    seconds["sgemm"] = _sgemm_seconds(load.means.device, threads)
     return seconds
 
 
-def _timed(work: Callable[[], T]) -> tuple[float, T]:
-    """Run ``work``; return its seconds and its result."""
+def _timed(device: torch.device, work: Callable[[], T]) -> tuple[float, T]:
+    """Run ``work`` on ``device``; return its seconds and its result."""
+    if device.type == "cuda":
+        begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        begin.record()
+        result = work()
+        end.record()
+        end.synchronize()
+        return 1e-3 * begin.elapsed_time(end), result
     start = time.perf_counter()
     result = work()
     return time.perf_counter() - start, result
 
 
-def _sgemm_seconds(threads: int) -> float:
+def _sgemm_seconds(device: torch.device, threads: int) -> float:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
-    a = torch.ones(SGEMM_SIZE, SGEMM_SIZE, device="cpu")
-    _timed(lambda: a @ a)  # starts the threads
-    seconds, _ = _timed(lambda: a @ a)
+    a = torch.ones(SGEMM_SIZE, SGEMM_SIZE, device=device)
+    _timed(device, lambda: a @ a)  # starts the threads
+    seconds, _ = _timed(device, lambda: a @ a)
     torch.set_num_threads(before)
     return seconds
 
@@ -223,8 +243,9 @@ def format_report(report: RasterizeReport) -> str:
     lines = [
         f"{report.num_gaussians:,} Gaussians, {report.num_visible:,} visible at {report.width}x{report.height}, "
         f"{report.entries:,} tile entries, {report.pairs / 1e6:.1f} M blended pairs, "
-        f"{report.lanes_used:.0%} of the lanes used; instruction set {report.isa}",
-        f"{'stage, median (best) ms':<26}" + "".join(f"{f'{run.threads} thread(s)':>20}" for run in report.runs),
+        f"{report.lanes_used:.0%} of the lanes used; "
+        + (f"instruction set {report.isa}" if report.device == "cpu" else report.device),
+        f"{'stage, median (best) ms':<26}" + "".join(f"{_label(report, run):>20}" for run in report.runs),
     ]
     for name in STAGES:
         cells = [f"{run.milliseconds[name]:10.2f} ({run.fastest[name]:6.2f})" for run in report.runs]
@@ -242,6 +263,10 @@ def format_report(report: RasterizeReport) -> str:
         rows.append(("  per sgemm GFLOP/s", [f"{x:.2f}" for x in per_flop]))
     lines += [f"{name:<26}" + "".join(f"{cell:>20}" for cell in cells) for name, cells in rows]
     return "\n".join(lines)
+
+
+def _label(report: RasterizeReport, run: StageTimes) -> str:
+    return f"{run.threads} thread(s)" if report.device == "cpu" else "cuda"
 
 
 def _preparation_share(run: StageTimes) -> float:

@@ -28,13 +28,13 @@ def threads(text: str) -> int:
     return int(text)
 
 
-def add_device(parser: argparse.ArgumentParser) -> None:
+def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
     """Add ``--device``."""
     parser.add_argument(
         "--device",
         choices=("auto", "cpu", "cuda"),
-        default="auto",
-        help="what computes (default auto: a CUDA card that can be used, else the CPU)",
+        default=default,
+        help=f"what computes; auto: a CUDA card that can be used, else the CPU (default {default})",
     )
 
 

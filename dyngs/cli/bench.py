@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dyngs.cli.arguments import add_device, computing_device
 from dyngs.errors import DyngsError
 
 
@@ -20,6 +21,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--threads", type=int, nargs="+", metavar="N", help="numbers of threads (default: 1 and all cores)"
     )
     raster.add_argument("--repeats", type=int, default=30, metavar="N", help="repetitions (default 30)")
+    add_device(raster, "cpu")
     raster.set_defaults(run=run_rasterize)
     deform = stages.add_parser(
         "deform", help="share of the field in a training step, with and without the static split"
@@ -62,9 +64,12 @@ def run_rasterize(arguments: argparse.Namespace) -> int:
 
     from dyngs.bench.rasterize import bench_rasterize, format_report, garden_workload, random_workload, write_report
 
+    device = computing_device(arguments.device)
     threads = arguments.threads or [1, torch.get_num_threads()]
+    if device.type != "cpu":
+        threads = [1]
     workload = garden_workload(arguments.points) if arguments.points else random_workload()
-    report = bench_rasterize(workload, sorted(set(threads)), arguments.repeats)
+    report = bench_rasterize(workload.to(device), sorted(set(threads)), arguments.repeats)
     print(format_report(report))
     if arguments.json:
         write_report(report, arguments.json)
