@@ -42,7 +42,7 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
     return grad * 2 * ctx.count, None
 
 
-double_op = register("test_double", _double, fake=_fake_double, gradient=Gradient(_save, _backward))
+double_op = register("test_double", _double, fake=_fake_double, devices=("cpu",), gradient=Gradient(_save, _backward))
 
 
 def on(device: DispatchKey, op: Any, *arguments: object) -> Any:
