@@ -213,6 +213,7 @@ def test_wrong_usage_and_missing_input_end_in_one_line(
         (PermissionError(errno.EACCES, "Permission denied", "b"), "b: Permission denied; choose another folder"),
         (BrokenPipeError(errno.EPIPE, "Broken pipe"), "Broken pipe"),
         (MemoryError(), "out of memory"),
+        (RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"), "the card is out of memory; lower strategy.max"),
     ],
 )
 def test_errors_of_the_world_end_in_one_line(

@@ -54,15 +54,13 @@ class McmcDensifier:
         dead = torch.nonzero(~alive)[:, 0]
         source, is_new = torch.arange(n, device=opacities.device), ~alive
         if len(dead) > 0:
-            picks = torch.multinomial(
-                torch.where(alive, opacities, 0.0), len(dead), replacement=True, generator=generator
-            )
+            picks = _drawn(torch.where(alive, opacities, 0.0), len(dead), generator)
             opacities, log_scales, shared = self._share(opacities, log_scales, picks)
             source[dead], opacities[dead], log_scales[dead] = picks, opacities[picks], log_scales[picks]
             is_new = is_new | shared
         added = max(0, int(min(self.max_gaussians, (1 + self.growth) * n)) - n)
         if added > 0:
-            picks = torch.multinomial(opacities, added, replacement=True, generator=generator)
+            picks = _drawn(opacities, added, generator)
             opacities, log_scales, shared = self._share(opacities, log_scales, picks)
             is_new = torch.cat([is_new | shared, torch.ones(added, dtype=torch.bool, device=opacities.device)])
             source = torch.cat([source, source[picks]])
@@ -117,6 +115,11 @@ class McmcDensifier:
         opacities[shared] = thinner
         log_scales[shared] += factor.log().float()[:, None]
         return opacities, log_scales, shared
+
+
+def _drawn(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Return ``count`` indices drawn with ``weights`` (N,), with repetition; the generator is one of the CPU."""
+    return torch.multinomial(weights.cpu(), count, replacement=True, generator=generator).to(weights.device)
 
 
 def relocated(opacities: Tensor, copies: Tensor, min_opacity: float = 0.005) -> tuple[Tensor, Tensor]:
