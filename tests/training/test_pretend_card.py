@@ -34,8 +34,8 @@ def trained(config: Config, monkeypatch: pytest.MonkeyPatch, device: torch.devic
     return trainer
 
 
-STATIC = ("train.steps=30", "init.kind=random", "init.num_random=100")
-DYNAMIC = ("train.steps=60", "model.num_random_moving=100", "init.kind=random", "init.num_random=300")
+STATIC = ("train.steps=20", "init.kind=random", "init.num_random=100")
+DYNAMIC = ("train.steps=40", "model.num_random_moving=100", "init.kind=random", "init.num_random=300")
 CASES = {
     "growing": ("static", "still", (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.grad_threshold=1e-7")),
     "mcmc": ("static_mcmc", "still", (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.min_opacity=0.09")),
@@ -47,8 +47,7 @@ CASES = {
     "robust": ("static", "still", (*STATIC, "train.robust=always")),
     "nodes": ("dynamic", "moving", DYNAMIC),
     "hexplane": ("dynamic", "moving", (*DYNAMIC, "model.deform.kind=hexplane", "model.deform.resolution=16")),
-    "trajectory": ("dynamic", "moving", (*DYNAMIC, "model.deform.kind=trajectory")),
-    "human": ("human", "person", ("train.steps=20", "model.resolution=48")),
+    "human": ("human", "person", ("train.steps=12", "model.resolution=32")),
 }
 """Preset, capture and overrides by name."""
 
@@ -85,7 +84,7 @@ def test_a_run_goes_on_there_from_a_checkpoint(still: Path, monkeypatch: pytest.
     config = config_of("static", still, *STATIC, "camera.refine=always", "train.exposure=always")
     monkeypatch.setattr("dyngs.build.device_for", lambda _: torch.device("cpu"))
     begun, expected = assemble(config), assemble(config)
-    for _ in range(15):
+    for _ in range(10):
         begun.step()
     stored = begun.checkpoint()
     expected.restore(stored)
