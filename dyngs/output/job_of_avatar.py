@@ -6,18 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options
 from dyngs.export.avatar import read_avatar
 from dyngs.human.avatar.scene import HumanScene, avatar_of
-from dyngs.human.motion.placement import up_direction
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.output.animation import with_motion
 from dyngs.output.camera_paths import CameraPath, read_path, static_path, with_times
-from dyngs.output.orbit import frame_orbit_for_points, spiral_path
+from dyngs.output.orbit import spiral_path
+from dyngs.output.person_orbit import person_orbit
 from dyngs.output.render_job import (
     DEFAULT_FRAMES,
     DEFAULT_SIZE,
@@ -29,8 +28,6 @@ from dyngs.output.render_job import (
     resize_cameras,
 )
 
-_SAMPLED_TIMES = 8
-"""Times of a motion at which the person must be in view."""
 _RING = 24
 
 
@@ -80,13 +77,10 @@ def _path(scene: HumanScene, world_offset: tuple[float, float, float], options: 
 
 def _around(scene: HumanScene, options: RenderJobOptions, count: int) -> Cameras:
     """Return an orbit around the person, a spiral in front, or without a path one camera in front."""
-    moments = np.linspace(0, 1, 1 if scene.is_still else _SAMPLED_TIMES)
-    means = torch.cat([scene.at(moment).means for moment in moments.tolist()]).cpu().numpy()
-    x, y, z = up_direction(scene.clip).tolist() if options.up is None else axis(options.up)
-    size = options.size or DEFAULT_SIZE
+    up, size = None if options.up is None else axis(options.up), options.size or DEFAULT_SIZE
     if options.path == "orbit":
-        return frame_orbit_for_points(means, count, size, (x, y, z))
-    ring = frame_orbit_for_points(means, _RING, size, (x, y, z))
+        return person_orbit(scene, count, size, up)
+    ring = person_orbit(scene, _RING, size, up)
     facing = axis_angle_to_matrix(scene.clip.poses[0, 0])[:, 2]
     front = int((ring.centers @ facing).argmax())
     if options.path is None:

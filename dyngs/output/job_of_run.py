@@ -15,11 +15,13 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
+from dyngs.human.avatar.scene import avatar_of
 from dyngs.output.along import path_along
 from dyngs.output.animation import in_rest_pose, with_motion
 from dyngs.output.camera_paths import CameraPath, read_path, static_path, with_times
 from dyngs.output.image_files import file_stems, files_of
 from dyngs.output.orbit import orbit_of, orbit_path, spiral_path
+from dyngs.output.person_orbit import person_orbit
 from dyngs.output.render_job import DEFAULT_FRAMES, RenderJob, RenderJobOptions, axis, path_file, resize_cameras
 from dyngs.runs.checkpoint import LoadedRun, load_run
 
@@ -119,7 +121,12 @@ def _placed_path(name: str, run: LoadedRun, capture: Capture, options: RenderJob
     up = None if options.up is None else np.asarray(axis(options.up))
     match name:
         case "orbit":
-            return CameraPath(orbit_path(cameras, frames, up), notes=orbit_of(cameras, up).notes)
+            person = avatar_of(run.scene)
+            if person is None or orbit_of(cameras, up).width is None:
+                return CameraPath(orbit_path(cameras, frames, up), notes=orbit_of(cameras, up).notes)
+            around = None if options.up is None else axis(options.up)
+            notes = ("the person was filmed from one side: the orbit goes all around them",)
+            return CameraPath(person_orbit(person, frames, (cameras.width, cameras.height), around), notes=notes)
         case "spiral":
             return CameraPath(spiral_path(cameras, frames, up))
         case _:
