@@ -34,6 +34,8 @@ from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
 from dyngs.training.events import StepReport
 from dyngs.training.loop import Loop, Stopwatch
+from dyngs.training.processes import Processes
+from dyngs.training.state import Checkpoint
 from dyngs.training.trainer import Trainer
 
 PLAIN = Config(data=DataConfig(root=Path("nowhere")))
@@ -115,18 +117,24 @@ def test_what_happens_once_is_neither_missed_nor_redone() -> None:
     assert same_phase(with_steps(thrifty, 1000), with_steps(thrifty, 1200), 650)
 
 
+def alone(config: Config, folder: Path, resumed: Checkpoint | None = None) -> _Run:
+    """A run in one process."""
+    return _Run(config, folder, resumed, processes=Processes(), threads=1)
+
+
 def test_no_limit_no_deadline(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The number of steps that were asked for is kept in mind; that of a resumed run is settled."""
     _slowed(monkeypatch, 0.1)
     config = busy_config(moving, tmp_path / "run", "trajectory")
-    assert _Run(config, tmp_path / "free", None).limits == {}
-    run = _Run(timed(config, 2), tmp_path / "run", None)
+    assert alone(config, tmp_path / "free").limits == {}
+    run = alone(timed(config, 2), tmp_path / "run")
     (found,) = run.limits.values()
     assert isinstance(found, Deadline)
     assert (found.run.given, found.most_steps, found.fits) == (120, config.train.steps, True)
     run.loop.run(lambda: run.loop.trainer.done >= 2)
     run._save()
-    (settled,) = _Run(timed(config, 2), tmp_path / "run", latest_checkpoint(tmp_path / "run")).limits.values()
+    resumed = latest_checkpoint(tmp_path / "run")
+    (settled,) = alone(timed(config, 2), tmp_path / "run", resumed).limits.values()
     assert isinstance(settled, Deadline)
     assert not settled.fits
 

@@ -36,7 +36,10 @@ def now(preset: str, *overrides: str) -> Config:
     return config.model_copy(update={"run": config.run.model_copy(update={"name": name})})
 
 
-ADDED = {"dynamic": ("model.compare_with_still=false", "model.pilot_steps=0", "train.alpha_weight=0")}
+ADDED = {
+    "dynamic": ("model.compare_with_still=false", "model.pilot_steps=0", "train.alpha_weight=0"),
+    "human": ("model.scaffold_heights=[0,0.02]", "train.steps=2000"),
+}
 """Overrides that undo what presets ask for since."""
 
 
@@ -53,7 +56,8 @@ def with_choices(config: Config) -> Config:
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_runs_of_before_are_what_their_presets_still_say(preset: str, tmp_path: Path) -> None:
-    """But for what the preset of moving scenes asks for since: silhouettes where needed, a still model beside it."""
+    """But for what the preset of moving scenes asks for since: silhouettes where needed, a still model beside it;
+    and that of people: one scaffold, more steps."""
     config, asked = load_resolved(FORMER / f"{preset}.yaml"), ADDED.get(preset, ())
     assert with_choices(config) == now(preset, *asked)
     save_config(config, tmp_path / "config.yaml")
