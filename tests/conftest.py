@@ -42,7 +42,11 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that say how many examples they need in ``ci`` draw more by the same factor in ``long``."""
+    """Begin with the longest module: in the end no process waits for another one.
+
+    Tests that say how many examples they need in ``ci`` draw more by the same factor in ``long``.
+    """
+    items.sort(key=lambda item: item.path.name != "test_fuzz.py")
     factor = settings.default.max_examples // FEW
     for test in {id(item.obj): item.obj for item in items if isinstance(item, pytest.Function)}.values():
         own = getattr(test, "_hypothesis_internal_use_settings", None)  # hypothesis has no public way to reach these
