@@ -37,6 +37,9 @@ Borrowed::Borrowed(int64_t bytes) {
   nb::object tensor = nb::module_::import_("dyngs.ops.native").attr("lend")(bytes, queue.device);
   lent_ = {reinterpret_cast<void*>(nb::cast<uintptr_t>(tensor.attr("data_ptr")())), bytes};
   owner_ = tensor.release().ptr();
+#if defined(DYNGS_EMULATED)
+  emulated::regions().remove(lent_.memory, bytes);  // what lay here before has been given back
+#endif
 }
 
 Borrowed::~Borrowed() {

@@ -196,6 +196,18 @@ def test_only_the_number_of_tile_entries_is_read_back(card: Callable) -> None:
         assert reads == {"render": 1, "tally": 3}.get(name, 0), name
 
 
+def test_lent_memory_is_new_wherever_other_arrays_lay_before(card: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Torch lends memory of arrays that are gone; the emulation must not take it for theirs."""
+    pool = torch.zeros(1 << 20, dtype=torch.uint8)
+    with card() as module:
+        monkeypatch.setattr(native, "lend", lambda size, _: pool[:size])
+        expected = looked_up()
+        for byte in range(8, 512, 8):
+            module.note_memory(pool.data_ptr() + byte, 8, 8)
+        for a, b in zip(looked_up(), expected, strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=0)
+
+
 def test_scenes_without_gaussians_and_pictures_without_splats(card: Callable) -> None:
     nothing = Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (), (1, 3))))
     behind = single().gaussians
