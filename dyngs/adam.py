@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 import torch
 from torch import Tensor
 
-from dyngs.ops.adam import adam_step_
+from dyngs.ops.adam import Count, adam_step_
 from dyngs.state import Role, State, moved_to, prefixed, with_role
 from dyngs.tensor_checks import require_tensor
 
@@ -52,7 +52,7 @@ class AdamState:
 
     def step_(
         self, name: str, x: Tensor, *, lr: float | Tensor, step: int, eps: float = 1e-15, rows: Tensor | None = None
-    ) -> int:
+    ) -> Count:
         """Update the leaf tensor ``x`` in place, drop its gradient, and return the number of rows left out.
 
         Rows whose gradient is not finite are left out.
@@ -71,7 +71,7 @@ class AdamState:
         x.grad = None
         return adam_step_(*arrays, lr=lr, step=step, eps=eps, rows=rows)
 
-    def step_along_last_axis_(self, name: str, x: Tensor, *, lr: float, step: int) -> int:
+    def step_along_last_axis_(self, name: str, x: Tensor, *, lr: float, step: int) -> Count:
         """As ``step_``; only the values along the last axis are a row, so that little is left out of a large array."""
         if x.grad is None:
             return 0

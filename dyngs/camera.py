@@ -46,5 +46,8 @@ class Cameras:
 
     def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
         """Return the same cameras on another device or in another precision."""
-        pose, intrinsics = (x.to(device=device, dtype=dtype) for x in (self.cam_from_world, self.intrinsics))
+        pose, intrinsics = (
+            x.to(device=device, dtype=dtype, non_blocking=x.device.type == "cpu")  # no card waits for them
+            for x in (self.cam_from_world, self.intrinsics)
+        )
         return Cameras(pose, intrinsics, self.width, self.height)

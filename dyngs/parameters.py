@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyngs.adam import MOMENTS, AdamState
 from dyngs.gaussians import TopologyEdit
+from dyngs.ops.adam import Count
 from dyngs.state import Role, State, StateTensor, moved_to
 from dyngs.tensor_checks import require_tensor
 
@@ -57,7 +58,7 @@ class Parameters:
         """Number of values in all tensors."""
         return sum(x.numel() for x in self._tensors.values())
 
-    def step(self, step: int, progress: float) -> int:
+    def step(self, step: int, progress: float) -> Count:
         """Update all tensors, drop the gradients, and return the number of rows left out for bad gradients.
 
         Args:
@@ -67,7 +68,7 @@ class Parameters:
         progress = min(progress, 1.0)
         return self.update(step, self.decay**progress if self.decay > 0 else 1 - progress)
 
-    def update(self, step: int, factor: float) -> int:
+    def update(self, step: int, factor: float) -> Count:
         """As ``step``, with all rates multiplied by ``factor``."""
         adam, rates = self._adam, self.rates
         return sum(

@@ -22,6 +22,7 @@ from dyngs.config import SceneModel
 from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.ops.adam import Count
 from dyngs.parameters import Parameters
 from dyngs.rendering import Rendering, RenderOptions, Shader, render
 from dyngs.state import Role, State, fields_moved_to, prefixed, with_role
@@ -259,7 +260,7 @@ class SceneTraining(Protocol[S]):
         """Return the moment drawn for ``picture`` in ``step``, with the penalties."""
         ...
 
-    def optimize(self, scene: S, step: int) -> int:
+    def optimize(self, scene: S, step: int) -> Count:
         """Update, in place, what the scene learns beside its Gaussians and colours.
 
         Returns:

@@ -80,7 +80,7 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any], waits: Counter[str]) 
     if device is not None:
         kwargs = {**kwargs, "device": torch.device("cpu")}
     to_card = on_card if device is None else torch.device(device) == CARD
-    note(packet, args, on_card, to_card, waits)
+    note(packet, args, kwargs, on_card, to_card, waits)
 
     def taken(x: Any) -> Any:
         return x.held if isinstance(x, OnCard) else x
@@ -92,14 +92,15 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any], waits: Counter[str]) 
     return return_and_correct_aliasing(func, args, kwargs, wrapped) if on_card else wrapped
 
 
-def note(packet: Any, args: Any, on_card: bool, to_card: bool, waits: Counter[str]) -> None:
-    """Count what makes the host wait: numbers read from the card, sizes that depend on them."""
+def note(packet: Any, args: Any, kwargs: dict[str, Any], on_card: bool, to_card: bool, waits: Counter[str]) -> None:
+    """Count what makes the host wait: numbers read from the card, sizes that depend on them; and what is queued."""
     if on_card and packet in READS_BACK:
         waits[READS_BACK[packet]] += 1
     elif on_card and not to_card:
         waits["to the CPU"] += 1
     elif to_card and not on_card and packet in (aten._to_copy, aten.copy_):
-        waits["to the card"] += 1
+        queued = kwargs.get("non_blocking") or (packet is aten.copy_ and len(args) > 2 and args[2])
+        waits["queued to the card" if queued else "to the card"] += 1
     elif packet is aten.copy_ and isinstance(args[1], OnCard) and not isinstance(args[0], OnCard):
         waits["to the CPU"] += 1
     elif packet is aten.index and any(x is not None and x.dtype == torch.bool for x in args[1]) and on_card:

@@ -15,6 +15,7 @@ from dyngs.colour.view_dependence import MeasuredView, find_view_dependent
 from dyngs.config import AutoColour, ColourSection, NetworkColour
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.initialisation import glorot
+from dyngs.ops.adam import Count
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
 from dyngs.parameters import Parameters
@@ -98,7 +99,7 @@ class ColourTraining:
     def follow(self, edit: TopologyEdit) -> None:
         """Follow a change of the set of Gaussians."""
 
-    def optimize(self, step: int) -> int:
+    def optimize(self, step: int) -> Count:
         """Update what is learned beside the harmonics, and return the number of rows left out for bad gradients."""
         return 0
 
@@ -148,7 +149,7 @@ class NetworkTraining(ColourTraining):
     def learned(self) -> Parameters:
         return self.parameters
 
-    def optimize(self, step: int) -> int:
+    def optimize(self, step: int) -> Count:
         return self.parameters.update(step, rate_factor(step, self.steps, self.options.warm_up))
 
     def place(self, device: torch.device) -> None:

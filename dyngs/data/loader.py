@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from dyngs.camera import Cameras
 from dyngs.config import DataConfig
 from dyngs.data.ahead import Ahead
 from dyngs.data.capture import View
+from dyngs.data.decoded import Decoded
 from dyngs.data.geometry.intrinsics import scaled_intrinsics
 from dyngs.data.pictures.depth import read_depth, read_labels
 from dyngs.data.pictures.flow import read_flow
@@ -32,9 +34,13 @@ from dyngs.data.pictures.resampling import flow_at, nearest_positions, resized, 
 from dyngs.data.pictures.silhouettes import cut_out
 from dyngs.errors import DyngsError
 from dyngs.files.containment import pictures_up_to
+from dyngs.ops.device import CPU, free_bytes
 
 FULLY_KEPT = 1 - 1e-4
 """Mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding."""
+
+CARD_SHARE = 0.25
+"""Share of the free memory of a card that pictures may take: the rest is for the scene and what is drawn."""
 
 _SMALL_BYTES = 4
 """Bytes of a shrunk picture, whose values are float32, per byte of the whole one and share of its pixels."""
@@ -117,32 +123,17 @@ class Picture:
         )
 
 
-@dataclass(frozen=True)
-class _Decoded:
-    """A cached picture: (H, W, 3 or 4) uint8 straight-alpha pixels, the (H, W) bool mask, and the maps of a picture."""
-
-    pixels: Tensor
-    mask: Tensor | None
-    moves: Tensor | None = None
-    depth: Tensor | None = None
-    flow: Tensor | None = None
-
-    @property
-    def num_bytes(self) -> int:
-        return sum(x.nbytes for x in (self.pixels, self.mask, self.moves, self.depth, self.flow) if x is not None)
-
-
 class PictureLoader:
     """A sequence of pictures, decoded on demand or ahead of it; the first ones are cached up to ``options.cache_mb``.
 
     Once the cache is full, what is in it stays: where every picture is asked for once per epoch, in a new order each
     time, the one used last is the one needed last. The same index always gives the same bytes, cached or not, decoded
-    ahead or not. Safe to use from several threads. Pictures are decoded and cached on the CPU.
+    ahead or not. Safe to use from several threads. Pictures are decoded on the CPU. Those given out on a card are kept
+    there as far as a quarter of its free memory goes; the others are copied beside its work.
 
     Attributes:
         corrected: returns the camera of a picture, given the index of its view and its camera by the capture; None: the
             latter.
-        device: pictures and cameras are given out there.
     """
 
     def __init__(
@@ -167,21 +158,37 @@ class PictureLoader:
         self._views = tuple(views)
         self._options = options = options or DataConfig(root=Path())
         self._with_maps = with_maps
-        self._cache: dict[int, _Decoded] = {}
-        self._cached_bytes = 0
+        self._device, self._card_room = CPU, 0.0
+        self._cache: dict[int, Decoded] = {}
+        self._on_card: dict[int, Decoded] = {}
+        self._cached_bytes = self._card_bytes = 0
         self._threads = decoding_threads if options.cache_mb > 0 else 0
-        self._ahead = Ahead(self._read, self._threads)
+        self._ahead = Ahead(self._made_ready, self._threads)
         self._small: dict[int, Picture] = {}
         self._small_by, self._small_bytes = 1, 0
         self._last_map: tuple[object, LensMap] | None = None
         self.corrected: Callable[[int, Cameras], Cameras] | None = None
-        self.device = torch.device("cpu")
         self._lock = Lock()
         with pictures_up_to(options.max_megapixels):
             check_files(self._views)
 
     def __len__(self) -> int:
         return len(self._views)
+
+    @property
+    def device(self) -> torch.device:
+        """Where pictures and cameras are given out."""
+        return self._device
+
+    @device.setter
+    def device(self, device: torch.device) -> None:
+        if device == self._device:
+            return
+        self.rest()
+        free = free_bytes(device)
+        with self._lock:
+            self._on_card, self._card_bytes, self._small, self._small_bytes = {}, 0, {}, 0
+            self._device, self._card_room = device, math.inf if free is None else CARD_SHARE * free
 
     @property
     def times(self) -> tuple[float | None, ...]:
@@ -246,7 +253,7 @@ class PictureLoader:
         picture = self._as_stored(index).shrunk(factor)
         with self._lock:
             is_new = index not in self._small and factor == self._small_by
-            if is_new and self.cached_bytes + picture.num_bytes <= self._options.cache_mb * 1e6:
+            if is_new and self._taken + picture.num_bytes <= self._room:
                 self._small[index] = picture
                 self._small_bytes += picture.num_bytes
         return self._with_camera(index, picture)
@@ -254,7 +261,7 @@ class PictureLoader:
     def expect(self, indices: Sequence[int]) -> None:
         """Begin to decode the pictures that are asked for next, in this order, as far as they are not cached."""
         with self._lock:
-            wanted = [i for i in indices if i not in self._cache and not (self._small_by > 1 and i in self._small)]
+            wanted = [i for i in indices if i not in self._kept and not (self._small_by > 1 and i in self._small)]
         self._ahead.expect(wanted)
 
     def rest(self) -> None:
@@ -271,7 +278,7 @@ class PictureLoader:
     @property
     def decoded_ahead(self) -> int:
         """Number of pictures that ``expect`` decodes ahead; 0 where all are cached."""
-        return 0 if len(self._cache) == len(self._views) else self._ahead.most
+        return 0 if len(self._kept) == len(self._views) else self._ahead.most
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
@@ -287,8 +294,13 @@ class PictureLoader:
     @property
     def bytes_to_come(self) -> int:
         """Bytes that pictures will take, in the cache or decoded ahead, beside those that they take now."""
-        whole = min(self._bytes_of_all(), round(self._options.cache_mb * 1e6))
+        whole = min(self._bytes_of_all() - self.bytes_on_card, round(self._options.cache_mb * 1e6))
         return max(whole - self.cached_bytes, 0)
+
+    @property
+    def bytes_on_card(self) -> int:
+        """Bytes that pictures will take of the memory of a card."""
+        return 0 if self._device == CPU else int(min(self._bytes_of_all(), self._card_room))
 
     def _bytes_of_all(self) -> int:
         """Return the bytes of all pictures once decoded; whether a file has alpha is not known, and taken as no."""
@@ -297,38 +309,74 @@ class PictureLoader:
 
     @property
     def cached_bytes(self) -> int:
-        """Bytes of memory that cached pictures take."""
-        return self._cached_bytes + self._small_bytes
+        """Bytes of the CPU's memory that cached pictures take."""
+        return self._cached_bytes + (self._small_bytes if self._device == CPU else 0)
 
-    def _decoded(self, index: int) -> _Decoded:
+    @property
+    def _kept(self) -> dict[int, Decoded]:
+        """Pictures that are kept where they are given out."""
+        return self._cache if self._device == CPU else self._on_card
+
+    @property
+    def _taken(self) -> int:
+        """Bytes that are taken where pictures are given out."""
+        return self.cached_bytes if self._device == CPU else self._card_bytes + self._small_bytes
+
+    @property
+    def _room(self) -> float:
+        """Bytes that may be taken there."""
+        return self._options.cache_mb * 1e6 if self._device == CPU else self._card_room
+
+    def _decoded(self, index: int) -> Decoded:
+        """Return the decoded picture ``index`` on ``device``."""
         with self._lock:
-            if index in self._cache:
-                return self._cache[index]
-        decoded = self._ahead.take(index)
-        if decoded is None:
-            decoded = self._read(index)
+            if index in self._kept:
+                return self._kept[index]
+        decoded, upload = self._ahead.take(index) or self._made_ready(index)
+        there = decoded if upload is None else upload()
         with self._lock:
-            if index not in self._cache and self._has_room(decoded.num_bytes):
+            self._keep(index, decoded, there)
+        return there
+
+    def _made_ready(self, index: int) -> tuple[Decoded, Callable[[], Decoded] | None]:
+        """Return the decoded picture ``index``, and its copy that is on its way to a card, if there is one."""
+        with self._lock:
+            decoded = self._cache.get(index)
+        decoded = self._read(index) if decoded is None else decoded
+        return decoded, None if self._device == CPU else decoded.upload(self._device)
+
+    def _keep(self, index: int, decoded: Decoded, there: Decoded) -> None:
+        """Keep a picture where it is given out, if there is room; else, if that is a card, on the CPU."""
+        if index not in self._kept and self._has_room(there.num_bytes):
+            self._kept[index] = there
+            if self._device == CPU:
+                self._cached_bytes += there.num_bytes
+                return
+            self._card_bytes += there.num_bytes
+            if self._cache.pop(index, None) is not None:
+                self._cached_bytes -= decoded.num_bytes
+        elif self._device != CPU and index not in self._on_card and index not in self._cache:
+            waiting = (self._ahead.most + 1) * decoded.num_bytes
+            if self._cached_bytes + waiting <= self._options.cache_mb * 1e6:
                 self._cache[index] = decoded
                 self._cached_bytes += decoded.num_bytes
-        return decoded
 
     def _has_room(self, size: int) -> bool:
-        """Return whether a picture of ``size`` bytes is to be cached.
+        """Return whether a picture of ``size`` bytes is to be kept where it is given out.
 
         While pictures are shrunk, only where small and large ones fit together: the small ones are what is asked for.
         """
-        limit, left = self._options.cache_mb * 1e6, len(self._views) - len(self._cache) - 1
-        if self._small_by > 1 and len(self._views) * size * (1 + _SMALL_BYTES / self._small_by**2) > limit:
+        left = len(self._views) - len(self._kept) - 1
+        if self._small_by > 1 and len(self._views) * size * (1 + _SMALL_BYTES / self._small_by**2) > self._room:
             return False
         waiting = min(self._ahead.most, left) * size
-        return self.cached_bytes + size + waiting <= limit
+        return self._taken + size + waiting <= self._room
 
-    def _read(self, index: int) -> _Decoded:
+    def _read(self, index: int) -> Decoded:
         with pictures_up_to(self._options.max_megapixels):
             return self._decode(self._views[index])
 
-    def _decode(self, view: View) -> _Decoded:
+    def _decode(self, view: View) -> Decoded:
         pixels = read_picture(view.image_path, (view.width, view.height))
         if view.silhouette is not None:
             pixels = cut_out(pixels, view.silhouette)
@@ -338,7 +386,7 @@ class PictureLoader:
         size = target_size(view.width, view.height, self._options.downscale, self._options.longest_side)
         maps = self._maps(view, size)
         if is_pinhole(view.lens) and size == (view.width, view.height):
-            return _Decoded(pixels, mask, **maps)
+            return Decoded(pixels, mask, **maps)
         if is_pinhole(view.lens):
             small = area_downscale_uint8(pixels, *size)
         else:
@@ -348,7 +396,7 @@ class PictureLoader:
         if mask is not None:
             # A pixel counts only if all that it covers is kept: otherwise masked colours would bleed in.
             mask = area_downscale(mask.float()[..., None], *size)[..., 0] > FULLY_KEPT
-        return _Decoded(small, mask, **maps)
+        return Decoded(small, mask, **maps)
 
     def _maps(self, view: View, size: tuple[int, int]) -> dict[str, Tensor]:
         """Return motion mask, depth and flow of a view, as far as it has them, for the picture of ``size``."""

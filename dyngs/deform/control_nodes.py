@@ -46,6 +46,7 @@ from dyngs.deform.rigid_groups import (
 from dyngs.deform.spline_fit import SPAN, cubic_shares, refitted, spline_basis
 from dyngs.gaussians import TopologyEdit
 from dyngs.ops.quaternions import identity_quat, unit_quats
+from dyngs.ops.transfer import sent
 from dyngs.parameters import Parameters
 from dyngs.state import Role, State, StateTensor, moved_to, part_of, prefixed, tensors_of
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
@@ -281,13 +282,14 @@ class ControlNodes(NetworkField):
     def _group_shares(self, time: float) -> Tensor:
         """Return the weights (Q, 1) of the control points of the groups' splines at ``time``."""
         pieces = self.parameters["group_quats"].shape[1] - SPAN + 1
-        return spline_basis(torch.tensor([time], device="cpu"), pieces)[0, :, None].to(self.parameters["means"])
+        shares = spline_basis(torch.tensor([time], device="cpu"), pieces)[0, :, None]
+        return sent(shares.float(), self.setup.center.device)
 
     def _local(self, time: float) -> Offsets:
         """Return the nodes' offsets at ``time`` in the frames of their groups, if they have any."""
         place = min(max(time, 0.0), 1.0) * self.num_pieces
         piece = min(int(place), self.num_pieces - 1)
-        shares = cubic_shares(place - piece)[:, None].to(self.setup.center.device)
+        shares = sent(cubic_shares(place - piece)[:, None], self.setup.center.device)
         parts = {n: (shares * x[:, piece : piece + SPAN]).sum(1) for n, x in self._splines().items()}
         if "logit_opacities" in parts:
             parts["logit_opacities"] = parts["logit_opacities"][:, 0]
@@ -295,8 +297,7 @@ class ControlNodes(NetworkField):
 
     def _untrained(self, count: int) -> Parameters:
         """Return the parameters of ``count`` nodes that stand still."""
-        sizes = head_sizes(self.options)
-        device = self.setup.center.device
+        sizes, device = head_sizes(self.options), self.setup.center.device
         tensors = {name: torch.zeros(count, self.num_points, size, device=device) for name, size in sizes.items()}
         rates = {"means": self.options.lr_means * self.setup.extent} | LR
         return Parameters(tensors, {name: rates[name] for name in sizes}, LR_DECAY)
@@ -433,8 +434,7 @@ class ControlNodes(NetworkField):
         bodies = self.buffers.get("bodies")
         labels = None if bodies is None else bodies[added, 0]
         started = self._motion_at(means[added], labels)
-        own = self._splines()
-        values = {name: torch.cat([x.detach()[kept], started[name]]) for name, x in own.items()}
+        values = {name: torch.cat([x.detach()[kept], started[name]]) for name, x in self._splines().items()}
         self.parameters = self.parameters.rearranged(values, source, is_new)
         if labels is not None:
             self.buffers["labels"] = torch.cat([self.buffers["labels"][kept], labels])

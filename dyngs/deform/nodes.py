@@ -105,7 +105,7 @@ def follow(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:
     A node turns what follows it about its own place: x' = sum_b w_b (R_b (x - p_b) + p_b + d_b); differentiable in x,
     the weights taken as constant. All other offsets are blended alike.
     """
-    identity = at_nodes.means.new_tensor([1.0, 0.0, 0.0, 0.0])
+    identity = identity_quat(at_nodes.means)
     quats = identity.expand(len(at_nodes.means), 4) if at_nodes.quats is None else at_nodes.quats + identity
     others = {name: x for name, x in vars(at_nodes).items() if name != "means" and x is not None}
     values = torch.cat(

@@ -28,6 +28,7 @@ from dyngs.deform.standing.start import FirstMotion, first_motion
 from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.ops.adam import Count
 from dyngs.parameters import Parameters
 from dyngs.scene import Moment, Scene, Variant
 from dyngs.state import Role, State, with_role
@@ -144,7 +145,7 @@ class DynamicTraining:
             penalties.pop("node acceleration", None)
         return Moment(gaussians, picture.time, None, penalties)
 
-    def optimize(self, scene: DynamicScene, step: int) -> int:
+    def optimize(self, scene: DynamicScene, step: int) -> Count:
         """Update the field."""
         if scene.field is None:
             return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -10,6 +11,10 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 from dyngs.ops.native import array, core_for, num_threads, writable
 from dyngs.ops.registration import has_kernel, register
+from dyngs.ops.transfer import sent
+
+Count: TypeAlias = int | Tensor
+"""A number, or a tensor () of one that may still be on a card, where ``int`` waits for it."""
 
 
 def _adam_step(
@@ -79,8 +84,8 @@ def adam_step_(
     eps: float = 1e-15,
     betas: tuple[float, float] = (0.9, 0.999),
     rows: Tensor | None = None,
-) -> int:
-    """Update ``param`` and its two moments in place; return the number of rows skipped for an unusable gradient.
+) -> Tensor:
+    """Update ``param`` and its two moments in place; return the number () int64 of rows skipped for a bad gradient.
 
     The update of Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global ``step``
     also for rows that were skipped before. Rows skipped keep their value and moments unchanged. A gradient cannot be
@@ -92,7 +97,7 @@ def adam_step_(
         grad: same shape; copied if not contiguous.
         exp_avg: same shape, contiguous: running mean of the gradient.
         exp_avg_sq: same shape, contiguous: running mean of its square.
-        lr: learning rate, or (C,) rates, one per column of a row.
+        lr: learning rate, or (C,) rates, one per column of a row, better on the CPU: they are checked.
         step: count of this step, 1 for the first.
         eps: added to the root of the second moment.
         betas: decay rates of the moments.
@@ -105,12 +110,12 @@ def adam_step_(
     _check(param, grad, exp_avg, exp_avg_sq, rows, step)
     _check_constants(param.dtype, eps, betas)
     if param.numel() == 0:
-        return 0
+        return torch.zeros((), dtype=torch.int64, device=param.device)
     row_size = param.numel() // len(param)
     rates = _column_rates(lr, row_size, param)
     p, g, m, v = (x.detach().view(len(param), row_size) for x in (param, grad.contiguous(), exp_avg, exp_avg_sq))
     native = param.dtype == torch.float32 and has_kernel("adam_step_", param.device)
-    return int((adam_step_op if native else _torch_adam_step)(p, g, m, v, rates, rows, list(betas), eps, step))
+    return (adam_step_op if native else _torch_adam_step)(p, g, m, v, rates, rows, list(betas), eps, step)
 
 
 @torch.no_grad()
@@ -153,7 +158,9 @@ def _column_rates(lr: float | Tensor, row_size: int, param: Tensor) -> Tensor:
     is_finite = bool(lr.isfinite().all()) if isinstance(lr, Tensor) else math.isfinite(lr)
     if not is_finite:
         raise DyngsError("Adam: lr must be finite")
-    rates = torch.as_tensor(lr, dtype=param.dtype, device=param.device).detach()
+    if not isinstance(lr, Tensor):
+        return torch.full((row_size,), lr, dtype=param.dtype, device=param.device)
+    rates = sent(lr.detach(), param.device).to(param.dtype)
     if rates.ndim == 0:
         return rates.expand(row_size).contiguous()
     if rates.shape != (row_size,):

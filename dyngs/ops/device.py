@@ -47,6 +47,11 @@ def why_on_cpu(choice: str) -> str | None:
     return None if reason is None else f"computing on the CPU: {reason}; device=cpu ends this line"
 
 
+def free_bytes(device: torch.device) -> int | None:
+    """Return the bytes of a card's memory that nobody has taken; None where ``device`` is none."""
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else None
+
+
 def finish(device: torch.device) -> None:
     """Wait until ``device`` has done what was asked of it, so that it can be timed."""
     if device.type == "cuda":

@@ -10,7 +10,7 @@ from torch import Tensor
 from dyngs.adam import AdamState
 from dyngs.config import OptimConfig
 from dyngs.gaussians import EditResult, Gaussians
-from dyngs.ops.adam import seen_rows
+from dyngs.ops.adam import Count, seen_rows
 from dyngs.state import State
 
 ADAM_EPS = 1e-15
@@ -29,7 +29,7 @@ class GaussianOptimizer:
         self.parameters = _as_leaves(gaussians.tensors())
         self._adam = AdamState.zero(gaussians.tensors())
 
-    def step(self, step: int, lr_means: float, *, dense: bool, frozen_rest: Tensor | None = None) -> int:
+    def step(self, step: int, lr_means: float, *, dense: bool, frozen_rest: Tensor | None = None) -> Count:
         """Update the parameters, drop the gradients, and return the number of rows left out for bad gradients.
 
         Args:
@@ -110,10 +110,8 @@ class GaussianOptimizer:
         return optimizer
 
     def _harmonics_rates(self) -> Tensor:
-        """Return (K * 3,) one rate per coefficient."""
-        rates = torch.full(
-            (self.parameters.sh.shape[1], 3), self.options.lr_sh_rest, device=self.parameters.means.device
-        )
+        """Return (K * 3,) one rate per coefficient, on the CPU."""
+        rates = torch.full((self.parameters.sh.shape[1], 3), self.options.lr_sh_rest, device="cpu")
         rates[0] = self.options.lr_sh_dc
         return rates.reshape(-1)
 

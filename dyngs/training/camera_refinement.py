@@ -18,7 +18,7 @@ from torch import Tensor
 from dyngs.adam import AdamState
 from dyngs.camera import Cameras
 from dyngs.data.capture import View
-from dyngs.ops.adam import adam_step_
+from dyngs.ops.adam import Count, adam_step_
 from dyngs.ops.quaternions import rotation_matrices
 from dyngs.tensor_checks import require_tensor
 
@@ -196,7 +196,7 @@ class CameraRefinement:
         }
 
     @torch.no_grad()
-    def optimize(self, step: int, index: int, cameras: Cameras) -> int:
+    def optimize(self, step: int, index: int, cameras: Cameras) -> Count:
         """Update the corrections of view ``index``; return how many had gradients that are not finite.
 
         A gradient is that by a further correction of the corrected camera; both are so small that they add.
@@ -206,7 +206,7 @@ class CameraRefinement:
             index: of the view.
             cameras: that of its picture, from ``watched``, after the backward pass.
         """
-        rate, left_out = self.rate(step), 0
+        rate, left_out = self.rate(step), torch.zeros((), dtype=torch.int64, device="cpu")
         by_pose, by_intrinsics = cameras.cam_from_world.grad, cameras.intrinsics.grad
         if rate == 0 or by_pose is None or by_intrinsics is None:
             return 0

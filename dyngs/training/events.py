@@ -89,7 +89,7 @@ class StepDone:
     @property
     def bad_gradients(self) -> int:
         """Number of rows left out of steps so far because their gradient was not finite."""
-        return self.loop.trainer.bad_gradients
+        return int(self.loop.trainer.bad_gradients)
 
     @property
     def seconds(self) -> float:

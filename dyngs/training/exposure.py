@@ -24,6 +24,7 @@ from dyngs.colour.affine import SATURATED, recoloured
 from dyngs.config import TrainConfig
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.times import videos
+from dyngs.ops.adam import Count
 from dyngs.rendering import Rendering
 from dyngs.state import tensors_of
 from dyngs.tensor_checks import require_tensor
@@ -138,7 +139,7 @@ class ViewExposures:
         """Return the neighbours of a picture that were trained on."""
         return [i for i in self._neighbours[index] if int(self._visits[i])]
 
-    def optimize(self, index: int, step: int) -> int:
+    def optimize(self, index: int, step: int) -> Count:
         """Update the affine of the picture that was trained on; return the number of rows left out, 0 or 1."""
         if step <= self._begins:
             return 0

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from dyngs.errors import DyngsError
+from dyngs.ops.adam import Count
 from dyngs.training.events import Event, Listener, Message, Started, StepDone, StepReport, TotalChanged
 from dyngs.training.state import Checkpoint
 
@@ -16,8 +17,11 @@ class Trainable(Protocol):
 
     done: int
     """Steps done."""
-    bad_gradients: int
-    """How often something was left out of a step because its gradient was not finite."""
+
+    @property
+    def bad_gradients(self) -> Count:
+        """How often something was left out of a step because its gradient was not finite."""
+        ...
 
     @property
     def num_gaussians(self) -> int: ...

@@ -21,8 +21,10 @@ from dyngs.conventions import SH_C0
 from dyngs.data.loader import Picture, PictureLoader
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.ops.adam import Count
 from dyngs.ops.device import CPU
 from dyngs.ops.loss import l1_ssim_loss
+from dyngs.ops.transfer import sent
 from dyngs.rendering import Rendering, RenderOptions
 from dyngs.scene import Scene, SceneTraining
 from dyngs.state import Role, State, prefixed, tensors_of, with_role
@@ -39,6 +41,7 @@ from dyngs.training.robust import RobustMasks
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.schedule import active_sh_degree, means_rate, picture_divisor, rates_of
 from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
+from dyngs.training.step_check import StepCheck
 from dyngs.training.trial import decide
 
 
@@ -86,7 +89,7 @@ class Trainer:
     exposures: ViewExposures | None = None
     refinement: CameraRefinement | None = None
     done: int = 0
-    bad_gradients: int = 0
+    bad_gradients: Count = 0
     held_out: frozenset[int] = frozenset()
     held_out_until: float = math.inf
     processes: Processes = field(default_factory=Processes)
@@ -143,15 +146,13 @@ class Trainer:
         config, scene = self.config, self.scene
         divisor = picture_divisor(config.train, step)
         picture = self._picture(index, step, divisor)
-        background = background_colour(self.background, self.generator).to(self.device)
+        background = sent(background_colour(self.background, self.generator), self.device)
         moment = self.training.moment(scene, picture, step)
         probe = (
             torch.zeros(1, len(scene), 4, requires_grad=True, device=scene.gaussians.means.device)
             if self.densifier.wants_signal(step)
             else None
         )
-        if scene.num_moving:
-            _require_finite(moment.gaussians, step, picture, self.training.moves_by)
         options = self.priors.options(self._options(step), picture)
         rendering = scene.render(picture.cameras, moment, options=options, background=background, probe=probe)
         if self.robust is not None:
@@ -173,16 +174,17 @@ class Trainer:
         view = StepView(index, lambda time: first <= time <= last, options)
         terms |= self.priors.terms(scene, picture, rendering, view, self.generator)
         terms |= self.densifier.regularizers(scene.gaussians) | self.colours.penalties(scene.gaussians)
-        loss = _finite_sum(terms, step, picture)
-        sum(terms.values(), torch.zeros((), device=scene.gaussians.means.device)).backward()
+        check = StepCheck(terms, moment.gaussians if scene.num_moving else None, self.device)
+        sum(terms.values(), torch.zeros((), device=self.device)).backward()
+        loss = check.loss(step, picture, self.training.moves_by)
         if probe is not None and probe.grad is not None:
             size = (picture.cameras.width, picture.cameras.height)
             # Fewer Gaussians suit small pictures: a gradient counts for less there.
             self.densifier.after_backward(step, probe.grad / divisor, rendering.radii, size)
         if self.exposures is not None:
-            self.bad_gradients += self.exposures.optimize(index, step)
+            self.bad_gradients = self.bad_gradients + self.exposures.optimize(index, step)
         if self.refinement is not None:
-            self.bad_gradients += self.refinement.optimize(step, index, picture.cameras)
+            self.bad_gradients = self.bad_gradients + self.refinement.optimize(step, index, picture.cameras)
         return StepReport(step, loss, picture, rendered.detach(), truth)
 
     def holds_out(self, index: int, step: int) -> bool:
@@ -298,8 +300,9 @@ class Trainer:
         """Optimize, let the strategy act, and count the step; return a line about what was found, or None."""
         lr_means = means_rate(self.config.optim, rates_of(self.config).progress(step), self.extent)
         frozen, dense = self.colours.frozen_rest(), self.densifier.touches_all
-        self.bad_gradients += self.optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen)
-        self.bad_gradients += self.colours.optimize(step) + self.training.optimize(self.scene, step)
+        bad = self.optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen)
+        bad = bad + self.colours.optimize(step) + self.training.optimize(self.scene, step)
+        self.bad_gradients = self.bad_gradients + bad
         result = self.densifier.edit(step, self.optimizer.parameters, self.generator)
         if result is not None:
             self._apply(result)
@@ -377,23 +380,3 @@ def _random_numbers(generator: torch.Generator, seed: int | None) -> Iterator[No
         yield
     finally:
         generator.set_state(own)
-
-
-def _finite_sum(terms: dict[str, Tensor], step: int, picture: Picture) -> float:
-    values = {name: float(term.detach()) for name, term in terms.items()}
-    for name, value in values.items():
-        if not math.isfinite(value):
-            what = "look at that picture; lower the rates in optim" if name == "picture" else "lower its weight or rate"
-            raise DyngsError(f"step {step}, view {picture.name!r}: the loss term {name!r} is {value}; {what}")
-    return sum(values.values())
-
-
-def _require_finite(gaussians: Gaussians, step: int, picture: Picture, moves_by: tuple[str, str]) -> None:
-    """Raise if a Gaussian is not finite: it would not be drawn, so that a diverging field could go unseen."""
-    broken = [name for name, x in gaussians.tensors().items() if not bool(x.detach().isfinite().all())]
-    if broken:
-        what, section = moves_by
-        raise DyngsError(
-            f"step {step}, view {picture.name!r}: the {what} makes {', '.join(broken)} at {picture.time or 0:g} not "
-            f"finite; lower the rates in {section}"
-        )

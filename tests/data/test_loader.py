@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pretend_card import CARD, pretend_card
 from tiny_captures import random_pixels, write_picture
 
 from dyngs.config import DataConfig
@@ -144,6 +145,45 @@ def test_pictures_decoded_ahead_are_the_same(cache_mb: float, tmp_path: Path) ->
             ahead.expect((*order[position + 1 : position + 4], 0))
             assert ahead.cached_bytes <= cache_mb * 1e6
     assert ahead.decoded_ahead == (0 if cache_mb == 1 else 4)
+
+
+@pytest.mark.parametrize("free", [None, 4 * 2.5 * 8 * 12 * 4, 0])
+@pytest.mark.parametrize("cache_mb", [1e-3, 1])
+@pytest.mark.parametrize("threads", [0, 2])
+def test_pictures_given_out_on_a_card_are_the_same(
+    free: float | None, cache_mb: float, threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether they are kept there, on the CPU, or nowhere; within both limits."""
+    views = views_of(tmp_path, 6)
+    monkeypatch.setattr("dyngs.data.loader.free_bytes", lambda _: free)
+    options = DataConfig(root=Path(), cache_mb=cache_mb)
+    there, plain = PictureLoader(views, options, decoding_threads=threads), loader(views, cache_mb=0)
+    with pretend_card():
+        there.device = CARD
+        for factor, order in ((2, (3, 1, 4, 0, 2, 5)), (1, (5, 0, 1, 2, 4, 3)), (1, (0, 1, 2, 3, 4, 5))):
+            for position, index in enumerate(order):
+                found, wanted = there.shrunk(index, factor), plain.shrunk(index, factor)
+                assert found.rgb_premultiplied.device == found.cameras.intrinsics.device == CARD
+                assert torch.equal(found.rgb_premultiplied.cpu(), wanted.rgb_premultiplied)
+                there.expect((*order[position + 1 : position + 4], 0))
+                assert there.cached_bytes <= cache_mb * 1e6
+                assert there._taken <= there._room
+        assert there.decoded_ahead == (0 if free is None else 2 * threads)
+        assert there.bytes_on_card == {None: 6 * 8 * 12 * 3, 0: 0}.get(free, int(2.5 * 8 * 12 * 4))
+
+
+def test_pictures_that_a_card_keeps_are_sent_once(tmp_path: Path) -> None:
+    pictures = loader(views_of(tmp_path, 3), cache_mb=1)
+    pictures[0]
+    assert pictures.cached_bytes > 0
+    with pretend_card() as card:
+        pictures.device = CARD
+        for _ in range(2):
+            for i in range(3):
+                pictures[i]
+        cameras = 2 * 6
+        assert card.waits == {"queued to the card": 3 + cameras}
+    assert pictures.cached_bytes == 0, "they are not kept twice"
 
 
 def test_a_damaged_picture_is_reported_when_its_turn_comes(tmp_path: Path) -> None:

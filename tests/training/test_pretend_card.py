@@ -99,19 +99,33 @@ def test_a_run_goes_on_there_from_a_checkpoint(still: Path, monkeypatch: pytest.
     assert [key for key, x in tensors_of(expected.state()).items() if not torch.equal(found[key], x)] == []
 
 
-def test_how_often_the_host_waits_in_a_step(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every wait costs a card some ten microseconds of idleness; docs/gpu.md has the numbers."""
-    config = config_of("static", still, *STATIC, "strategy.kind=fixed")
+@pytest.mark.parametrize("name", ["static", "nodes", "hexplane", "human"])
+def test_how_often_the_host_waits_in_a_step(
+    name: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once for the loss; the number of tile entries, which the kernels read back, is not seen here (docs/gpu.md)."""
+    kind, capture, more = CASES[name] if name != "static" else ("static", "still", STATIC)
+    config = config_of(kind, request.getfixturevalue(capture), *more, "strategy.kind=fixed")
     with pretend_card() as card:
         monkeypatch.setattr("dyngs.build.device_for", lambda _: CARD)
         trainer = assemble(config)
-        for _ in range(3):
+        for _ in range(8):
             trainer.step()
         card.waits.clear()
-        for _ in range(10):
+        for _ in range(2):
             trainer.step()
-        waits = {name: count / 10 for name, count in card.waits.items()}
-    assert waits == {"item": 7, "to the card": 9}
+        queued = card.waits.pop("queued to the card")
+        assert card.waits == {"to the CPU": 2} | ({"item": 6} if name == "human" else {})
+        assert queued <= 2 * 12
+
+
+def test_pictures_that_do_not_fit_there_are_streamed(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = config_of("static", still, *STATIC)
+    with pretend_card():
+        kept = trained(config, monkeypatch, CARD).checkpoint().tensors
+        monkeypatch.setattr("dyngs.data.loader.free_bytes", lambda _: 0)
+        streamed = trained(config, monkeypatch, CARD).checkpoint().tensors
+    assert [key for key, x in kept.items() if not torch.equal(streamed[key], x)] == []
 
 
 def test_views_are_drawn_and_scored_there_alike(still: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ from dyngs.human.avatar.posing import BodyPose, Skeleton
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.joints import mirrored_joints
+from dyngs.ops.transfer import sent
 from dyngs.parameters import Parameters
 from dyngs.state import Role, fields_moved_to
 
@@ -144,7 +145,9 @@ def share_sides(learned: Parameters) -> None:
     """
     gradient = learned["joints"].grad
     if gradient is not None:
-        other = gradient[list(mirrored_joints(len(gradient)))] * gradient.new_tensor([-1.0, 1.0, 1.0])
+        mirrored = sent(torch.tensor(mirrored_joints(len(gradient)), device="cpu"), gradient.device)
+        other = gradient.index_select(0, mirrored)
+        other[:, 0].neg_()
         gradient.add_(other).div_(2)
 
 

@@ -22,6 +22,7 @@ from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.subject import Subject
 from dyngs.human.avatar.unseen import HARDLY, filled, mirror_images, sightings, trust_in
+from dyngs.ops.adam import Count
 from dyngs.parameters import Parameters
 from dyngs.scene import Moment, Scene
 from dyngs.state import Role, State, StateTensor
@@ -100,11 +101,11 @@ class HumanTraining:
             penalties |= correction_penalties(scene.learned, self.options)
             if scene.light is not None:
                 penalties["sides"] = SIDES_WEIGHT * difference_of_sides(scene.gaussians, *self._images_in(scene))
-        penalties |= self._between_neighbours(scene, gaussians, float(scene.clip.scale[row]), step)
+        penalties |= self._between_neighbours(scene, gaussians, scene.clip.scale[row], step)
         frame = Frame(scene.gaussians.means, posing.rotations[0])
         return Moment(gaussians, picture.time, frame, penalties)
 
-    def optimize(self, scene: HumanScene, step: int) -> int:
+    def optimize(self, scene: HumanScene, step: int) -> Count:
         """Update the corrections."""
         if not self._refines(step):
             return 0
@@ -191,7 +192,7 @@ class HumanTraining:
             terms["scale"] = options.scale_weight * longer.clamp_min(0).square().sum(1).mean()
         return terms
 
-    def _between_neighbours(self, scene: HumanScene, moved: Gaussians, scale: float, step: int) -> dict[str, Tensor]:
+    def _between_neighbours(self, scene: HumanScene, moved: Gaussians, scale: Tensor, step: int) -> dict[str, Tensor]:
         """Return penalties between neighbours at rest, in cm^2; in each step for one of the five neighbours.
 
         Rigidity: distances do not change. Smoothness: offsets from the scaffold are alike.

@@ -11,6 +11,8 @@ import math
 import torch
 from torch import Tensor
 
+from dyngs.ops.transfer import sent
+
 
 def axis_angle_to_matrix(poses: Tensor) -> Tensor:
     """Return the rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), rad; exact at zero, as is the gradient.
@@ -44,14 +46,14 @@ def joint_transforms(joints: Tensor, parents: tuple[int, ...], rotations: Tensor
     check_tree(parents)
     shifts = joints[..., None] - rotations @ joints[..., None]
     own = torch.cat([rotations.expand(*shifts.shape[:-1], 3), shifts], dim=-1)
-    bottom = own.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*own.shape[:-2], 1, 4)
+    bottom = torch.eye(4, dtype=own.dtype, device=own.device)[3].expand(*own.shape[:-2], 1, 4)
     own = torch.cat([own, bottom], dim=-2)
     world = torch.eye(4, dtype=own.dtype, device=own.device).expand(*own.shape[:-3], 1, 4, 4)
     chains = torch.cat([world, own], dim=-3)
     above = torch.tensor((-1, *parents), device="cpu").add(1)  # on the CPU: the loop must not wait for the device
     above[0] = 0
     while above.any():
-        chains = chains.index_select(-3, above.to(own.device)) @ chains
+        chains = chains.index_select(-3, sent(above, own.device)) @ chains
         above = above[above]
     return chains[..., 1:, :3, :]
 

@@ -1,0 +1,60 @@
+"""The value of the loss, and whether it and what was drawn are finite: read at once, while a card goes on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from dyngs.data.loader import Picture
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.ops.transfer import ReadBack, sent
+
+
+class StepCheck:
+    """The loss of a step, term by term, and whether the Gaussians that were drawn are finite.
+
+    Args:
+        terms: of the loss, () each, on any device.
+        moved: Gaussians that a field or body has moved: one that is not finite would not be drawn, so that a diverging
+            field could go unseen; None: they are those of the optimizer, which stay finite.
+        device: of the scene.
+    """
+
+    def __init__(self, terms: Mapping[str, Tensor], moved: Gaussians | None, device: torch.device) -> None:
+        parts = {} if moved is None else moved.tensors()
+        self._terms, self._parts = tuple(terms), tuple(parts)
+        numbers = [sent(x.detach(), device).double() for x in terms.values()]
+        numbers += [x.detach().isfinite().all().double() for x in parts.values()]
+        self._read = ReadBack(torch.stack(numbers))
+
+    def loss(self, step: int, picture: Picture, moves_by: tuple[str, str]) -> float:
+        """Return the sum of the terms; waits for them.
+
+        Args:
+            step: that is being done.
+            picture: that was drawn.
+            moves_by: what moves the Gaussians, and its section of the configuration, for messages.
+
+        Raises:
+            DyngsError: something is not finite; says what, and what to do.
+        """
+        numbers = self._read.numbers().tolist()
+        values, finite = numbers[: len(self._terms)], numbers[len(self._terms) :]
+        broken = [name for name, is_finite in zip(self._parts, finite, strict=True) if not is_finite]
+        where = f"step {step}, view {picture.name!r}"
+        if broken:
+            what, section = moves_by
+            raise DyngsError(
+                f"{where}: the {what} makes {', '.join(broken)} at {picture.time or 0:g} not finite; lower the rates "
+                f"in {section}"
+            )
+        for name, value in zip(self._terms, values, strict=True):
+            if not math.isfinite(value):
+                of_picture = "look at that picture; lower the rates in optim"
+                what = of_picture if name == "picture" else "lower its weight or rate"
+                raise DyngsError(f"{where}: the loss term {name!r} is {value}; {what}")
+        return sum(values)
