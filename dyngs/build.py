@@ -131,10 +131,6 @@ def build(config: Config, *, restored: bool = False) -> Built:
     """Return the trainer of a configuration; see ``assemble`` for the arguments and errors."""
     match config.model:
         case HumanPredictorModel():
-            if config.run.device == "cuda":
-                raise DyngsError(
-                    "run.device=cuda: a network that predicts people is trained on the CPU; give auto or cpu"
-                )
             return Built(assemble_network(config, config.model), None)
         case StaticModel() | DynamicModel() | HumanModel():
             trainer = assemble(config, restored=restored)

@@ -35,6 +35,7 @@ from dyngs.data.pictures.silhouettes import cut_out
 from dyngs.errors import DyngsError
 from dyngs.files.containment import pictures_up_to
 from dyngs.ops.device import CPU, free_bytes
+from dyngs.ops.transfer import sent
 
 FULLY_KEPT = 1 - 1e-4
 """Mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding."""
@@ -83,11 +84,11 @@ class Picture:
 
     def to(self, device: torch.device | str) -> Picture:
         """Return the same picture, with its camera, on another device."""
-        maps = {name: None if x is None else x.to(device) for name, x in self._maps().items()}
+        maps = {name: None if x is None else sent(x, device) for name, x in self._maps().items()}
         return replace(
             self,
             cameras=self.cameras.to(device=device),
-            rgb_premultiplied=self.rgb_premultiplied.to(device),
+            rgb_premultiplied=sent(self.rgb_premultiplied, device),
             **maps,
         )
 

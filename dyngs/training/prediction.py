@@ -21,9 +21,12 @@ from dyngs.human.prediction.predict import PredictedAvatar, num_input_channels, 
 from dyngs.human.prediction.texel_maps import TexelMaps, observe_texels, to_atlas
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.load import load_template
+from dyngs.ops.device import CPU, device_for
 from dyngs.ops.loss import l1_ssim_loss
+from dyngs.ops.transfer import sent
 from dyngs.rendering import Rendering
 from dyngs.scene import render_options
+from dyngs.state import fields_moved_to
 from dyngs.static.rates import Rates
 from dyngs.tensor_checks import require_tensor
 from dyngs.training.background import background_colour, evaluation_background
@@ -46,18 +49,28 @@ _LOWEST = 1e-3
 
 @dataclass
 class Filmed:
-    """A person to train on: pictures, and the choices of those that are predicted from, with their maps once known."""
+    """A person to train on: pictures, and the choices of those that are predicted from, with their maps once known.
+
+    All that is observed is observed on the CPU.
+    """
 
     sitter: CapturedPerson
     pictures: PictureLoader
     choices: list[list[int]]
     _maps: dict[int, TexelMaps] = field(default_factory=dict)
+    _there: CapturedPerson | None = None
 
-    def maps(self, choice: int) -> TexelMaps:
-        """Return the maps of the pictures of a choice; kept."""
+    def maps(self, choice: int, device: torch.device) -> TexelMaps:
+        """Return the maps of the pictures of a choice on ``device``; kept."""
         if choice not in self._maps:
-            self._maps[choice] = self.look(self.choices[choice])
+            self._maps[choice] = fields_moved_to(self.look(self.choices[choice]), device)
         return self._maps[choice]
+
+    def sitter_on(self, device: torch.device) -> CapturedPerson:
+        """Return the person on ``device``; kept."""
+        if self._there is None:
+            self._there = fields_moved_to(self.sitter, device)
+        return self._there
 
     def look(self, views: list[int]) -> TexelMaps:
         """Return the maps of these pictures."""
@@ -78,6 +91,7 @@ class NetworkTrainer:
         generator: the only source of randomness.
         done: steps done.
         num_gaussians: of the last person.
+        device: of the network and the scenes that it predicts.
     """
 
     config: Config
@@ -93,6 +107,7 @@ class NetworkTrainer:
     num_gaussians: int = 0
     bad_gradients: int = 0
     has_test_views: bool = False
+    device: torch.device = CPU
 
     @property
     def num_moving(self) -> int:
@@ -109,13 +124,10 @@ class NetworkTrainer:
         person = self.people[self.sampler.next(self.generator, lambda _: True)]
         choice = self._draw(len(person.choices))
         targets = self._targets(person, person.choices[choice])
-        background, drawing = (
-            background_colour(self.background, self.generator),
-            replace(render_options(self.model), nonfinite="trust"),
-        )
-        avatar = predict_gaussians(
-            person.sitter, person.maps(choice), self.mean, self.network, self.model.min_silhouette_share
-        )
+        background = sent(background_colour(self.background, self.generator), self.device)
+        drawing = replace(render_options(self.model), nonfinite="trust")
+        sitter, maps = person.sitter_on(self.device), person.maps(choice, self.device)
+        avatar = predict_gaussians(sitter, maps, self.mean, self.network, self.model.min_silhouette_share)
         scene, training = scene_of(human_options(self.model), avatar, Rates(1))
         moment = training.moment(scene, targets[0], step)
         total = torch.zeros((), device=self.mean.device)
@@ -123,11 +135,12 @@ class NetworkTrainer:
             rendering = scene.render(picture.cameras, moment, options=drawing, background=background)
             truth = picture.composite(background)
             total = total + picture_loss(rendering, picture, truth, self.config) / len(targets)
-        if not math.isfinite(float(total.detach())):
-            raise DyngsError(f"step {step}, {person.sitter.name}: the loss is {float(total.detach())}; lower model.lr")
+        value = float(total.detach())
+        if not math.isfinite(value):
+            raise DyngsError(f"step {step}, {sitter.name}: the loss is {value}; lower model.lr")
         self._update(total, step)
         self.done, self.num_gaussians = step, len(avatar.gaussians)
-        return StepReport(step, float(total.detach()), picture, rendering.rgb[0].detach(), truth)
+        return StepReport(step, value, picture, rendering.rgb[0].detach(), truth)
 
     def checkpoint(self) -> Checkpoint:
         """Return everything that ``restore`` needs."""
@@ -138,7 +151,8 @@ class NetworkTrainer:
             moments = self.optimizer.state.get(parameter, {})
             tensors |= {f"optimizer.{key}.{name}": x for key, x in moments.items()}
         mode = self.model.rasterize_mode.value
-        return Checkpoint(CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), self.background, mode), tensors)
+        info = CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), self.background, mode)
+        return Checkpoint(info, {name: x.detach().cpu() for name, x in tensors.items()})
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go back to where ``checkpoint`` was taken.
@@ -146,14 +160,16 @@ class NetworkTrainer:
         Raises:
             DyngsError: it belongs to another network.
         """
-        self.mean = load_network(self.network, checkpoint, self.model.resolution)
+        self.mean = load_network(self.network, checkpoint, self.model.resolution).to(self.device)
         with reading(checkpoint.name, OTHER_CONFIG):
             self.sampler.load_state(checkpoint.part("sampler"))
             self.generator.set_state(checkpoint.tensors["rng"])
             for name, parameter in self.network.named_parameters():
                 shapes = {"step": (), "exp_avg": tuple(parameter.shape), "exp_avg_sq": tuple(parameter.shape)}
                 self.optimizer.state[parameter] = {
-                    key: require_tensor(name, checkpoint.tensors[f"optimizer.{key}.{name}"], shape)
+                    key: require_tensor(name, checkpoint.tensors[f"optimizer.{key}.{name}"], shape).to(
+                        CPU if key == "step" else self.device, copy=True
+                    )
                     for key, shape in shapes.items()
                 }
         self.done = checkpoint.info.step
@@ -165,7 +181,7 @@ class NetworkTrainer:
         frame = views[others[self._draw(len(others))]].frame
         shown = [i for i in others if views[i].frame == frame]
         order = torch.randperm(len(shown), generator=self.generator, device="cpu").tolist()
-        return [person.pictures[shown[i]] for i in order[: self.model.target_views]]
+        return [person.pictures[shown[i]].to(self.device) for i in order[: self.model.target_views]]
 
     def _update(self, loss: Tensor, step: int) -> None:
         self.optimizer.zero_grad(set_to_none=True)
@@ -201,8 +217,9 @@ def assemble_network(config: Config, model: HumanPredictorModel) -> NetworkTrain
     Raises:
         DyngsError: ``data.root`` has no captures of people, or settings that do not go together.
     """
+    device = device_for(config.run.device)
     body, generator = load_template(human_options(model)), torch.Generator().manual_seed(config.run.seed)
-    network = new_network(model, generator)
+    network = new_network(model, generator).to(device)
     people = [filmed(data, model, body) for data in captures_in(config.data)]
     for person in people:
         person.choices = _choices(person.sitter, model, generator)
@@ -212,11 +229,12 @@ def assemble_network(config: Config, model: HumanPredictorModel) -> NetworkTrain
         model=model,
         people=people,
         network=network,
-        mean=mean_colours(people, model.resolution),
+        mean=mean_colours(people, model.resolution).to(device),
         optimizer=torch.optim.AdamW(network.parameters(), lr=model.lr, weight_decay=WEIGHT_DECAY),
         sampler=ViewSampler(len(people)),
         background=background if background == "random" else evaluation_background(background, True)[0],
         generator=generator,
+        device=device,
     )
 
 

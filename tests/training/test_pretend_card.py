@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from pretend_card import CARD, OnCard, pretend_card
+from tiny_people import NET, people
 
 from dyngs.api.train import train
 from dyngs.build import assemble
@@ -16,6 +17,8 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.output.image_files import write_split_images
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.state import tensors_of
+from dyngs.training.prediction import assemble_network
+from dyngs.training.state import Checkpoint
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -67,6 +70,31 @@ def test_it_learns_there_what_it_learns_on_the_cpu(
         assert len(trainer.scene) != 100 or name not in ("growing", "mcmc", "mip"), "the set was to change"
     assert found.keys() == expected.keys()
     assert [key for key, x in expected.items() if not torch.equal(found[key], x)] == []
+
+
+@pytest.mark.filterwarnings("ignore:for .* copying from a non-meta parameter")  # of torch, about the device's name
+def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, steps = people(tmp_path / "people", (1, 2)), 3
+
+    def checkpoints(device: torch.device) -> list[Checkpoint]:
+        """After the last step but one and the last, which is done on what was stored."""
+        monkeypatch.setattr("dyngs.training.prediction.device_for", lambda _: device)
+        config = Config.model_validate({"data": {"root": folder}, "model": NET.model_dump(), "train": {"steps": steps}})
+        trainer, resumed = assemble_network(config, NET), assemble_network(config, NET)
+        for _ in range(steps - 1):
+            trainer.step()
+        found = [trainer.checkpoint()]
+        resumed.restore(found[0])
+        resumed.step()
+        return [*found, resumed.checkpoint()]
+
+    expected = checkpoints(torch.device("cpu"))
+    with pretend_card():
+        found = checkpoints(CARD)
+    for there, here in zip(found, expected, strict=True):
+        assert [key for key, x in here.tensors.items() if not torch.equal(there.tensors[key], x)] == []
 
 
 def test_a_network_without_a_kernel_is_computed_by_torch(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
