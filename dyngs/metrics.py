@@ -128,8 +128,8 @@ class Lpips:
             return MetricValue(None, f"pictures of {a.shape[3]}x{a.shape[2]} are too small for LPIPS ({self.net})")
 
 
-def load_lpips(net: LpipsNet = "alex") -> Lpips:
-    """Return LPIPS from ``torchmetrics`` or ``lpips``, only if the backbone's weights are already in torch's cache.
+def load_lpips(net: LpipsNet = "alex", device: torch.device | str = "cpu") -> Lpips:
+    """Return LPIPS on ``device`` from ``torchmetrics`` or ``lpips``, only if the weights are already in torch's cache.
 
     Both packages would download missing weights, hence the check before either is constructed.
     """
@@ -140,7 +140,7 @@ def load_lpips(net: LpipsNet = "alex") -> Lpips:
         weights = _backbone_file(net)
         if not weights.is_file():
             return Lpips(net, f"the weights {weights.name} are not in torch's cache ({weights.parent})")
-        return Lpips(net, None, _lpips_distance(package, net))
+        return Lpips(net, None, _lpips_distance(package, net, device))
     except Exception as error:  # whatever a third-party package raises is a reason, never a failed evaluation
         return Lpips(net, f"{package} could not be set up: {' '.join(str(error).split())[:200]}")
 
@@ -157,14 +157,14 @@ def _backbone_file(net: LpipsNet) -> Path:
     return Path(torch.hub.get_dir()) / "checkpoints" / weights[net].url.rsplit("/", 1)[1]
 
 
-def _lpips_distance(package: str, net: LpipsNet) -> Callable[[Tensor, Tensor], Tensor]:
+def _lpips_distance(package: str, net: LpipsNet, device: torch.device | str) -> Callable[[Tensor, Tensor], Tensor]:
     if package == "lpips":
         from lpips import LPIPS  # pyright: ignore[reportMissingImports]
 
-        return LPIPS(net=net, verbose=False).eval()
+        return LPIPS(net=net, verbose=False).eval().to(device)
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity as Metric  # pyright: ignore[reportMissingImports]
 
-    return Metric(net_type=net, normalize=False).eval()
+    return Metric(net_type=net, normalize=False).eval().to(device)
 
 
 def _weighted_mean(values: Tensor, mask: Tensor | None) -> float:

@@ -151,7 +151,7 @@ def evaluate_run(
         threads: for rendering and metrics; 0 leaves the number as it is.
         refine_poses: also score from poses, of a person's body, otherwise of the cameras, that were refined on the
             pictures themselves; always done for a run that refined its cameras.
-        device: "auto", "cpu" or "cuda": draws the views; all else is done on the CPU.
+        device: "auto", "cpu" or "cuda": draws the views, and compares pictures, but for FLIP.
 
     Raises:
         DyngsError: no such run or split, unreadable pictures, a render or metric that is not finite, unwritable folder,
@@ -163,14 +163,15 @@ def evaluate_run(
     capture = read_capture(run.config.data)
     views = split_views(capture, split)
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
-    scene = scene_of_split(run, capture, split)
-    drawing = Drawing(scene, render_options(run.config.model), colour)
+    scene = scene_of_split(run, capture, split).to(draws_on)
+    drawing = Drawing(scene, render_options(run.config.model), colour.to(draws_on))
     with _num_threads(threads):
         loader = pictures_of_split(capture, views, run_dir, run)
-        regions = Regions(views, loader, colour)
+        loader.device = draws_on
+        regions = Regions(views, loader, drawing.background)
         pictures = (loader[i] for i in range(len(loader)))
-        lpips = load_lpips(lpips_net)
-        scores, reasons = score_views(scene.to(draws_on), pictures, drawing.options, colour, lpips, regions)
+        lpips = load_lpips(lpips_net, draws_on)
+        scores, reasons = score_views(scene, pictures, drawing.options, drawing.background, lpips, regions)
         temporal = _temporal(drawing, loader, views)
         tracks = _track_scores(run, capture, scene, views)
         asked = split != "train" and (refine_poses or run.config.camera.refine == "always")

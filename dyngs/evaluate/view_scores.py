@@ -90,7 +90,7 @@ def score_views(
     """Return scores of the Gaussians against pictures, and the reasons for metrics that are None.
 
     Args:
-        scene: what to draw, at the time of each picture; on any device.
+        scene: what to draw, at the time of each picture; on the device of all else.
         pictures: truth and camera of each view, drawn one at a time.
         options: as in training, without depth.
         background: (3,) colour behind both the truth and the render.
@@ -155,7 +155,7 @@ def mean_of(values: Sequence[float | None]) -> float | None:
 def _timed_render(
     scene: Scene, picture: Picture, options: RenderOptions, background: Tensor
 ) -> tuple[Rendering, float, float]:
-    """Return the rendering, on the CPU, the seconds it took, and the seconds of these for deformation."""
+    """Return the rendering, the seconds it took, and the seconds of these for deformation."""
     with torch.no_grad():
         device = scene.gaussians.means.device
         finish(device)
@@ -166,7 +166,7 @@ def _timed_render(
         rendering = scene.render(picture.cameras, moment, options=options, background=background)
         finish(device)
         end = time.perf_counter()
-    return rendering.to(device="cpu"), end - start, deformed - start
+    return rendering, end - start, deformed - start
 
 
 def _require_finite(score: ViewScore, mask: Tensor | None) -> None:

@@ -42,7 +42,7 @@ def fitted_to_picture(
     options, truth = options or scene.options, picture.composite(background)
     counts = picture.mask if weights is None or picture.mask is None else weights * picture.mask
     counts = weights if counts is None else counts
-    correction = torch.zeros(1, 6, device="cpu")
+    correction = torch.zeros(1, 6, device=picture.cameras.cam_from_world.device)
     first, second = torch.zeros_like(correction), torch.zeros_like(correction)
     best, least = correction.clone(), float("inf")
     for update in range(1, UPDATES + 1):
