@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 from dyngs.api.train import num_cores, train
 from dyngs.build import assemble
 from dyngs.config import Config, PruneConfig
@@ -126,7 +128,7 @@ def prune_within(
     with kernel_threads(config.run.threads or num_cores()):
         trainer = assemble(config, restored=True)
         trainer.restore(start)
-        search = Search(trainer, start, tell, _unseen(config))
+        search = Search(trainer, start, tell, _unseen(config, trainer.device))
         found = search.run(max_loss)
         stored = search.stored(found, max_loss)
     with new_folder(out) as started:
@@ -155,7 +157,7 @@ def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequenc
     return config
 
 
-def _unseen(config: Config) -> list[Picture]:
+def _unseen(config: Config, device: torch.device) -> list[Picture]:
     """Return at most ``MOST_HELD_OUT`` pictures of the split `val`, which no training sees; of people none.
 
     They play other motions there, in which poses are not refined.
@@ -164,6 +166,7 @@ def _unseen(config: Config) -> list[Picture]:
     if not views or person_of(config) is not None:
         return []
     loader = PictureLoader(views, config.data)
+    loader.device = device
     return [loader[i] for i in evenly_spaced(len(loader), MOST_HELD_OUT)]
 
 

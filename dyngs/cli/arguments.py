@@ -38,6 +38,18 @@ def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
     )
 
 
+def add_run_device(parser: argparse.ArgumentParser) -> None:
+    """Add ``--device`` to a command that trains: it sets ``run.device``."""
+    parser.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), help="what computes, as run.device=... (default auto)"
+    )
+
+
+def run_device(arguments: argparse.Namespace) -> list[str]:
+    """Return the override that ``--device`` of ``add_run_device`` means."""
+    return [] if arguments.device is None else [f"run.device={arguments.device}"]
+
+
 def computing_device(choice: str) -> torch.device:
     """Return the device that ``--device`` or ``run.device`` means; where that may surprise, a line on stderr says why.
 

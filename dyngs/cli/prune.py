@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import threads
+from dyngs.cli.arguments import add_run_device, computing_device, run_device, threads
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
@@ -60,6 +60,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument("--steps", metavar="N", help="fine-tuning steps: of each trial 1000, with --prune 2000")
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
+    add_run_device(parser)
     parser.add_argument(
         "overrides", nargs="*", default=[], metavar="key=value", help="other config keys of the run (docs/cli.md)"
     )
@@ -78,11 +79,12 @@ def run(arguments: argparse.Namespace) -> int:
     keys = {"prune": "share", "score": "score", "masks": "mask_times", "steps": "steps"}
     asked = {key: getattr(arguments, option) for option, key in keys.items()}
     overrides = [f"prune.{key}={value}" for key, value in asked.items() if value is not None]
-    overrides += [f"run.threads={arguments.threads}", *arguments.overrides]
+    overrides += [f"run.threads={arguments.threads}", *run_device(arguments), *arguments.overrides]
     folder, promise = _pruned(arguments, overrides)
-    before, after = compared([arguments.run_dir, file_of(folder)], arguments.threads or num_cores())
-    Console().print(cost_table(before, after, promise))
     pruned = load_run(folder)
+    device = computing_device(pruned.config.run.device)
+    before, after = compared([arguments.run_dir, file_of(folder)], arguments.threads or num_cores(), device)
+    Console().print(cost_table(before, after, promise))
     if pruned.config.prune.mask_times > 1 and pruned.scene.masks is None:
         print("note: --masks was ignored; they are for scenes in which a deformation field moves something")
     print(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import threads
+from dyngs.cli.arguments import add_device, computing_device, threads
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
@@ -72,6 +72,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     goal.add_argument("--maximize", metavar="METRIC", help="likewise (default psnr)")
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
+    add_device(parser)
     parser.set_defaults(run=run)
 
 
@@ -107,8 +108,18 @@ def _run(arguments: argparse.Namespace, group: ProcessGroup) -> int:
     name = arguments.minimize or arguments.maximize or "psnr"
     goal = parse_goal(name, smallest=arguments.minimize is not None)
     run_dir = Path(arguments.target) if is_run else _trained(arguments, group)
-    runs = VariantRuns(run_dir, arguments.out or run_dir / "tradeoff", arguments.threads or group.cores)
-    plan = Plan(variations, arguments.finetune, arguments.combine, arguments.split, arguments.rounds, arguments.threads)
+    runs = VariantRuns(
+        run_dir, arguments.out or run_dir / "tradeoff", arguments.threads or group.cores, arguments.device
+    )
+    plan = Plan(
+        variations,
+        arguments.finetune,
+        arguments.combine,
+        arguments.split,
+        arguments.rounds,
+        arguments.threads,
+        computing_device(arguments.device),
+    )
     try:
         measurements = sweep(runs, plan, print, group)
     except KeyboardInterrupt:
@@ -137,7 +148,8 @@ def _trained(arguments: argparse.Namespace, group: ProcessGroup) -> Path:
     if arguments.out is None:
         raise DyngsError(f"{arguments.target}: give --out DIR; a config is trained there first")
     folder = arguments.out / "run"
-    overrides = [*arguments.overrides, f"run.dir={folder}", f"run.threads={arguments.threads}"]
+    own = [f"run.dir={folder}", f"run.threads={arguments.threads}", f"run.device={arguments.device}"]
+    overrides = [*arguments.overrides, *own]
     if group.is_first:
         finished(load_config(config, overrides), folder)
     group.wait()

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import computing_device
+from dyngs.cli.arguments import add_run_device, computing_device, run_device
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.cli.view import add_serving_arguments
 from dyngs.errors import DyngsError
@@ -67,9 +67,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument("--view", action="store_true", help="show the scene in a browser while it trains")
     add_serving_arguments(parser)
-    parser.add_argument(
-        "--device", choices=("auto", "cpu", "cuda"), help="what computes, as run.device=... (default auto)"
-    )
+    add_run_device(parser)
     parser.set_defaults(run=run)
 
 
@@ -84,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> int:
     """Train as the first of ``processes``, or alone."""
-    given = [] if arguments.device is None else [f"run.device={arguments.device}"]
+    given = run_device(arguments)
     config = parse_config([*arguments.overrides, *given], arguments.resume)
     computing_device(config.run.device)  # where none is, before anything else is done
     if arguments.port is not None and not arguments.view:

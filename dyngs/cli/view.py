@@ -6,7 +6,7 @@ import argparse
 import threading
 from pathlib import Path
 
-from dyngs.cli.arguments import threads
+from dyngs.cli.arguments import add_device, computing_device, threads
 from dyngs.errors import DyngsError
 
 _EPILOG = """\
@@ -43,6 +43,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="up axis (default: up for the cameras of a run; of a file what it says, or what is usual for its format)",
     )
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
+    add_device(parser)
     parser.set_defaults(run=run)
 
 
@@ -77,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)
     motions = motion_files(arguments.motion)
-    source = open_source(arguments.source, arguments.up, arguments.capture)
+    source = open_source(arguments.source, arguments.up, arguments.capture, computing_device(arguments.device))
     first = first_of(source)
     if motions and person_in(first) is None:
         raise DyngsError(f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out")

@@ -122,11 +122,7 @@ def first_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance:
 
 def _mean_and_change(seen: Iterable[MeasuredView], options: RenderOptions) -> tuple[Tensor, Tensor]:
     """Return (N, 3) mean of what the harmonics add to the base colour in the views, and (N,) how much that varies."""
-    weight, total, squares = (
-        torch.zeros(1, 1, device="cpu"),
-        torch.zeros(1, 3, device="cpu"),
-        torch.zeros(1, device="cpu"),
-    )
+    weight = total = squares = torch.zeros((), device="cpu")  # scalars may be added to what lies on any device
     for view in seen:
         share = contributions(view.gaussians, view.camera, options)[0]
         added = _added(view.gaussians, view.camera, share, options)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, median
+from typing import TypeAlias
 
 import torch
 
@@ -17,6 +18,7 @@ from dyngs.data.read import read_capture
 from dyngs.evaluate.report import parameter_megabytes, render_options, scene_of_split, split_views
 from dyngs.evaluate.temporal import Drawing
 from dyngs.metrics import psnr
+from dyngs.ops.device import CPU, finish
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 from dyngs.training.background import evaluation_background
@@ -24,6 +26,9 @@ from dyngs.training.background import evaluation_background
 COMPARED_VIEWS = 20
 """Number of views compared per split; enough for before and after, not for a benchmark."""
 ROUNDS = 3
+
+_Shown: TypeAlias = list[tuple[Picture, list[Drawing]]]
+"""Pictures, each with one drawing per run."""
 
 
 @dataclass(frozen=True)
@@ -46,22 +51,31 @@ class Cost:
     stored: float | None = None
 
 
-def compared(folders: Sequence[Path], threads: int) -> list[Cost]:
+def compared(folders: Sequence[Path], threads: int, device: torch.device = CPU) -> list[Cost]:
     """Return the costs of runs on one capture; pictures are drawn in turn, so that machine load affects all.
 
     Args:
         folders: of runs, or of files that were exported from them; the capture is that of the first.
         threads: to draw with.
+        device: draws.
     """
     runs = [load_run(folder) for folder in folders]
     capture = read_capture(runs[0].config.data)
     has_test = bool(capture.splits.get("test"))
     with kernel_threads(threads), torch.no_grad():
-        train_psnr = _psnr(runs, capture, "train")
-        test_psnr = _psnr(runs, capture, "test") if has_test else [None] * len(runs)
-        fps = _fps(runs, capture, "test" if has_test else "train")
+        splits = ("train", "test") if has_test else ("train",)
+        shown = {split: _views(runs, capture, split, device) for split in splits}
+        psnrs = {split: _psnr(len(runs), views) for split, views in shown.items()}
+        fps = _fps(len(runs), shown[splits[-1]], device)
     return [
-        Cost(len(run.scene), train_psnr[i], test_psnr[i], fps[i], parameter_megabytes(run.scene), _stored(folders[i]))
+        Cost(
+            num_gaussians=len(run.scene),
+            psnr_train=psnrs["train"][i],
+            psnr_test=psnrs["test"][i] if has_test else None,
+            fps=fps[i],
+            megabytes=parameter_megabytes(run.scene),
+            stored=_stored(folders[i]),
+        )
         for i, run in enumerate(runs)
     ]
 
@@ -70,29 +84,34 @@ def _stored(folder: Path) -> float | None:
     return 1e-6 * (folder / SCENE_FILE).stat().st_size if has_only_scene_file(folder) else None
 
 
-def _psnr(runs: Sequence[LoadedRun], capture: Capture, split: str) -> list[float]:
-    values: list[list[float]] = [[] for _ in runs]
-    for picture, drawings in _views(runs, capture, split):
+def _psnr(num_runs: int, views: _Shown) -> list[float]:
+    values: list[list[float]] = [[] for _ in range(num_runs)]
+    for picture, drawings in views:
         for found, drawing in zip(values, drawings, strict=True):
             drawn = drawing.picture(picture.cameras, picture.time)
             found.append(psnr(drawn, picture.composite(drawing.background), picture.mask))
     return [fmean(found) for found in values]
 
 
-def _fps(runs: Sequence[LoadedRun], capture: Capture, split: str) -> list[float]:
-    seconds: list[list[float]] = [[] for _ in runs]
-    for picture, drawings in [view for _ in range(ROUNDS) for view in _views(runs, capture, split)]:
+def _fps(num_runs: int, views: _Shown, device: torch.device) -> list[float]:
+    seconds: list[list[float]] = [[] for _ in range(num_runs)]
+    for picture, drawings in views * ROUNDS:
         for found, drawing in zip(seconds, drawings, strict=True):
             start = time.perf_counter()
             drawing.picture(picture.cameras, picture.time)
+            finish(device)
             found.append(time.perf_counter() - start)
     return [1 / median(found) for found in seconds]
 
 
-def _views(runs: Sequence[LoadedRun], capture: Capture, split: str) -> list[tuple[Picture, list[Drawing]]]:
+def _views(runs: Sequence[LoadedRun], capture: Capture, split: str, device: torch.device) -> _Shown:
     """Return some pictures of a split, each with one drawing per run."""
     config = runs[0].config
     loader = PictureLoader(split_views(capture, split), config.data)
-    _, colour = evaluation_background(config.data.background, capture.has_alpha)
-    drawings = [Drawing(scene_of_split(r, capture, split), render_options(r.config.model), colour) for r in runs]
+    loader.device = device
+    background = evaluation_background(config.data.background, capture.has_alpha)[1].to(device)
+    drawings = [
+        Drawing(scene_of_split(run, capture, split).to(device), render_options(run.config.model), background)
+        for run in runs
+    ]
     return [(loader[i], drawings) for i in evenly_spaced(len(loader), COMPARED_VIEWS)]

@@ -169,8 +169,7 @@ def evaluate_run(
         loader = pictures_of_split(capture, views, run_dir, run)
         loader.device = draws_on
         regions = Regions(views, loader, drawing.background)
-        pictures = (loader[i] for i in range(len(loader)))
-        lpips = load_lpips(lpips_net, draws_on)
+        pictures, lpips = (loader[i] for i in range(len(loader))), load_lpips(lpips_net, draws_on)
         scores, reasons = score_views(scene, pictures, drawing.options, drawing.background, lpips, regions)
         temporal = _temporal(drawing, loader, views)
         tracks = _track_scores(run, capture, scene, views)

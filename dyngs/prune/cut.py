@@ -14,6 +14,7 @@ from dyngs.config import AutoColour, Config, ControlNodesField, DynamicModel
 from dyngs.conventions import SH_C0
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.scene import DynamicScene
+from dyngs.ops.transfer import sent
 from dyngs.prune.stage import remove_
 from dyngs.scene import Scene, render_options
 from dyngs.training.background import background_colour
@@ -114,7 +115,7 @@ def _drop_harmonics(trainer: Trainer, tolerance: float) -> None:
     usable = [i for i in range(len(trainer.pictures)) if i not in trainer.held_out]
     judged = usable[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or usable[:1]
     seen = [i for i in usable if i not in judged] or judged
-    background = background_colour(trainer.background)
+    background = sent(background_colour(trainer.background), trainer.device)
     looks = list(_looks(trainer, judged, background))
     found = find_view_dependent(_looks(trainer, seen, background), looks, trainer.options, background, tolerance)
     base = trainer.scene.gaussians.sh.detach()[:, 0] + found.offsets / SH_C0

@@ -21,6 +21,7 @@ from dyngs.config.kinds import field_of
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Picture
 from dyngs.metrics import psnr
+from dyngs.ops.transfer import sent
 from dyngs.prune.score import Importance, ScoringViews, importance
 from dyngs.prune.selection import highest
 from dyngs.scene import Scene
@@ -168,8 +169,8 @@ def probe_pictures(trainer: Trainer) -> list[Picture]:
 @torch.no_grad()
 def quality_of(trainer: Trainer, scene: Scene, pictures: Sequence[Picture]) -> float:
     """Return the mean PSNR of ``pictures`` drawn of ``scene``, dB."""
-    background, options = background_colour(trainer.background), trainer.options
-    values = []
+    background, options = sent(background_colour(trainer.background), trainer.device), trainer.options
+    scene, values = scene.to(trainer.device), []
     for picture in pictures:
         drawn = scene.render(picture.cameras, picture.time, options=options, background=background).rgb[0]
         values.append(psnr(drawn, picture.composite(background), picture.mask))

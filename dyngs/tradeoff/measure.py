@@ -18,6 +18,7 @@ from dyngs.data.loader import Picture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import render_options
 from dyngs.metrics import Lpips, psnr, ssim
+from dyngs.ops.device import finish
 from dyngs.rendering import RenderOptions
 from dyngs.scene import Scene
 from dyngs.tradeoff.measurements import Quartiles, Speed
@@ -124,7 +125,7 @@ def time_interleaved(renderers: Sequence[VariantRenderer], pictures: Sequence[Pi
         for turn in range(len(renderers)):
             row = (column + turn) % len(renderers)
             start = time.perf_counter()
-            renderers[row].picture(picture.cameras, picture.time)
+            finish(renderers[row].picture(picture.cameras, picture.time).device)
             seconds[row, column] = time.perf_counter() - start
     return [Speed(ms=quartiles(1e3 * own), gain=quartiles(seconds[0] / own)) for own in seconds]
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
+import torch
+
 from dyngs.api.train import num_cores
 from dyngs.config.io import load_resolved
 from dyngs.data.frame_selection import evenly_spaced
@@ -18,6 +20,7 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.report import scene_of_split, split_views
 from dyngs.files.write import write_text
 from dyngs.metrics import load_lpips
+from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.tradeoff.distributed import SINGLE_PROCESS, ProcessGroup
@@ -48,6 +51,7 @@ class Plan:
         split: "test", "val", "train" or "pose".
         rounds: renders of each timed view.
         threads: for timing; 0 = all cores.
+        device: draws.
     """
 
     variations: tuple[Variation, ...]
@@ -56,6 +60,7 @@ class Plan:
     split: str = "test"
     rounds: int = 5
     threads: int = 0
+    device: torch.device = CPU
 
 
 def sweep(
@@ -95,8 +100,9 @@ class _Session:
         self._runs, self._plan, self._meter, self._log = runs, plan, meter, log
         self._capture = read_capture(config.data)
         self._loader = PictureLoader(split_views(self._capture, plan.split), config.data)
-        self._background = evaluation_background(config.data.background, self._capture.has_alpha)[1]
-        self._lpips = load_lpips("alex")
+        self._loader.device = plan.device
+        self._background = evaluation_background(config.data.background, self._capture.has_alpha)[1].to(plan.device)
+        self._lpips = load_lpips("alex", plan.device)
 
     def measured(self, variants: Sequence[Variant], group: ProcessGroup) -> list[Measurement]:
         """Return measurements: each process makes its share, then the first one times all."""
@@ -126,7 +132,9 @@ class _Session:
             lpips=quality.lpips,
             num_gaussians=len(renderer.scene),
             mb=megabytes_on_disk(folder),
-            memory_mb=self._meter.peak_megabytes(folder, variant, shown, self._background),
+            memory_mb=self._meter.peak_megabytes(folder, variant, shown, self._background)
+            if self._plan.device == CPU
+            else None,
         )
         write_measurement(path, measurement)
         counts = f"{measurement.num_gaussians:,} Gaussians, {measurement.mb:.2f} MB"
@@ -152,7 +160,7 @@ class _Session:
 
     def _renderer(self, variant: Variant) -> VariantRenderer:
         run = load_run(self._runs.folder(variant))
-        scene = scene_of_split(run, self._capture, self._plan.split)
+        scene = scene_of_split(run, self._capture, self._plan.split).to(self._plan.device)
         return VariantRenderer(scene, render_options_of(variant, run.config.model), self._background, variant.scale)
 
     def _pictures(self, count: int) -> list[Picture]:
@@ -174,6 +182,7 @@ def _require_same_source(runs: VariantRuns, plan: Plan, *, is_first: bool) -> No
         "checkpoint": newest.name,
         "sha256": hashlib.sha256(newest.read_bytes()).hexdigest(),
         "split": plan.split,
+        "device": plan.device.type,
     }
     path = runs.out / SOURCE_NAME
     if not path.is_file():
@@ -184,5 +193,8 @@ def _require_same_source(runs: VariantRuns, plan: Plan, *, is_first: bool) -> No
         known = cast(object, json.loads(path.read_text(encoding="utf-8")))
     except ValueError:
         known = None
-    if not isinstance(known, dict) or any(known.get(key) != source[key] for key in ("sha256", "split")):
-        raise DyngsError(f"{runs.out}: holds measurements of another run, checkpoint or split; give another --out")
+    same = {"sha256": None, "split": None, "device": "cpu"}  # folders of old do not name the device
+    if not isinstance(known, dict) or any(known.get(key, default) != source[key] for key, default in same.items()):
+        raise DyngsError(
+            f"{runs.out}: holds measurements of another run, checkpoint, split or device; give another --out"
+        )

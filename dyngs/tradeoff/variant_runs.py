@@ -49,11 +49,18 @@ class VariantRuns:
         run_dir: the run, with a checkpoint.
         out: output folder.
         threads: for training, rendering and pruning; 0 = all cores.
+        device: trains and prunes: "auto", "cpu" or "cuda".
     """
 
     run_dir: Path
     out: Path
     threads: int = 0
+    device: str = "auto"
+
+    @property
+    def _where(self) -> list[str]:
+        """Overrides for what is trained."""
+        return [*NO_BUDGET, f"run.threads={self.threads}", f"run.device={self.device}"]
 
     def folder(self, variant: Variant) -> Path:
         """Return the run folder of a variant without its render settings; it is made if it does not exist.
@@ -97,20 +104,20 @@ class VariantRuns:
             changes += ["model.pilot_steps=0", "model.compare_with_still=false"]
         if wanted.colour is not None:
             changes.append(f"colour.kind={wanted.colour}")
-        changes += [*NO_BUDGET, f"run.dir={out}", f"run.threads={self.threads}"]
+        changes += [*self._where, f"run.dir={out}"]
         return finished(load_resolved(self.run_dir, changes), out)
 
     def _finetuned(self, wanted: Variant) -> Path:
         source, out = self.folder(wanted.trained), self.out / "training" / wanted.slug
         if checkpoint_paths(out):
             return finished(load_resolved(out), out)
-        steps = [*NO_BUDGET, f"prune.steps={wanted.finetune}", f"run.threads={self.threads}"]
+        steps = [*self._where, f"prune.steps={wanted.finetune}"]
         return prune_run(source, out, [*_pruning_overrides(wanted, load_resolved(source).prune), *steps])
 
     def _pruned(self, source: Path, wanted: Variant) -> tuple[Checkpoint, Config]:
         """Return the checkpoint after pruning and masking, without fine-tuning."""
         checkpoint = latest_checkpoint(source)
-        changes = [f"train.steps={checkpoint.info.step}", *NO_BUDGET]
+        changes = [f"train.steps={checkpoint.info.step}", *self._where]
         config = load_resolved(source, [*changes, *_pruning_overrides(wanted, load_resolved(source).prune)])
         with kernel_threads(self.threads or num_cores()):
             trainer = assemble(config, restored=True)

@@ -83,7 +83,7 @@ def truth_in_window(viewed: Viewed, view: int, size: tuple[int, int]) -> np.ndar
     footage = viewed.footage
     if footage.pictures is None:
         return None
-    picture = footage.pictures[view].composite(viewed.background)
+    picture = footage.pictures[view].composite(viewed.background).cpu()
     high, wide = picture.shape[:2]
     width, height = size
     scale = min(width / wide, height / high)
@@ -100,7 +100,7 @@ def truth_in_window(viewed: Viewed, view: int, size: tuple[int, int]) -> np.ndar
 def motion_colours(viewed: Viewed) -> Tensor:
     """Return (N, 3) colours of how far each Gaussian moves over all times: dark blue is not at all, red is far.
 
-    Red begins where 99% of those that move are left behind.
+    Red begins where 99% of those that move are left behind. On the CPU.
     """
     return viewed.once("motion", lambda: _motion_colours(viewed.scene))
 
@@ -122,9 +122,12 @@ def _layer(viewed: Viewed, shot: Shot, camera: Cameras, time: float | None) -> n
 
 
 def _rendering(viewed: Viewed, part: Part, camera: Cameras, time: float | None, with_depth: bool = False) -> Rendering:
+    """Return a rendering, on the CPU."""
     scene = _part(viewed, part)
     options = replace(viewed.options, depth="expected") if with_depth else viewed.options
-    return scene.render(camera, viewed.moment(part, scene, time), options=options, background=viewed.background)
+    background = viewed.background.to(scene.gaussians.means.device)
+    made = scene.render(camera, viewed.moment(part, scene, time), options=options, background=background)
+    return made.to(device="cpu")
 
 
 def _part(viewed: Viewed, part: Part) -> Scene:
@@ -142,13 +145,13 @@ def _motion(viewed: Viewed, part: Part, camera: Cameras, time: float | None) -> 
     gaussians = scene.at(time)
     coloured = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None].to(gaussians.means))
     if part != "all":
-        moves = torch.zeros(len(scene), dtype=torch.bool, device=colours.device)
+        moves = torch.zeros(len(scene), dtype=torch.bool, device=gaussians.means.device)
         if not scene.is_still:
             moves[scene.rows] = True
         coloured = coloured.select(moves if part == "moving" else ~moves)
     plain = replace(scene, colour=None, background=None)
     made = plain.render(camera, Moment(coloured, time), options=replace(viewed.options, sh_degree=0))
-    return to_uint8(made.rgb[0].clamp(0, 1).numpy())
+    return to_uint8(made.rgb[0].clamp(0, 1).cpu().numpy())
 
 
 def _motion_colours(scene: Scene) -> Tensor:

@@ -6,10 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
+
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.config.kinds import network_of
 from dyngs.errors import DyngsError
 from dyngs.files.wrong_place import command_for
+from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.view.network import PeopleNetwork, open_network
 from dyngs.view.viewed import Viewed, load_viewed
@@ -34,13 +37,14 @@ class Source:
     network: PeopleNetwork | None = None
 
 
-def open_source(path: Path, up: str | None = None, capture: Path | None = None) -> Source:
+def open_source(path: Path, up: str | None = None, capture: Path | None = None, device: torch.device = CPU) -> Source:
     """Return what is to be seen of a run, a file, a folder of runs or a network; the first scene is not loaded yet.
 
     Args:
         path: of it.
         up: up axis; None: that of the capture, or of the file.
         capture: for a network: a person, or a folder of people.
+        device: draws the scenes.
 
     Raises:
         DyngsError: nothing is there, a folder without runs, or a ``capture`` without a network.
@@ -49,18 +53,18 @@ def open_source(path: Path, up: str | None = None, capture: Path | None = None) 
         raise DyngsError(f"{path}: no such run, file or folder; give what `dyngs train` or `dyngs export` wrote")
     if is_network(path):
         network = open_network(path, capture)
-        return Source(tuple(network.people), lambda name: network.predict(name, up=up), network)
+        return Source(tuple(network.people), lambda name: network.predict(name, up=up).on(device), network)
     if capture is not None:
         raise DyngsError(f"--capture goes with the run of a network of people, {path} is none; leave it out")
     if not path.is_dir() or _is_run(path):
         name = path.name or str(path)
-        return Source((name,), lambda _: load_viewed(path, up))
+        return Source((name,), lambda _: load_viewed(path, up).on(device))
     runs = {run.relative_to(path).as_posix(): run for run in runs_in(path)}
     if not runs:
         known = command_for(path)
         instead = f"{known}; then " if known else ""
         raise DyngsError(f"{path}: no runs there; {instead}give a run, a file, or a folder of runs")
-    return Source(tuple(runs), lambda name: replace(load_viewed(runs[name], up), name=name))
+    return Source(tuple(runs), lambda name: replace(load_viewed(runs[name], up).on(device), name=name))
 
 
 def first_of(source: Source) -> Viewed:

@@ -122,6 +122,10 @@ class Viewed:
         """Return the same with another scene, which takes ``seconds`` from time 0 to 1."""
         return replace(self, scene=scene, seconds=seconds or self.seconds, derived={})
 
+    def on(self, device: torch.device | str) -> Viewed:
+        """Return the same with its scene on ``device``, which then draws it."""
+        return replace(self, scene=self.scene.to(device), derived={})
+
     def noted(self, note: str) -> Viewed:
         """Return the same with one more note."""
         return replace(self, notes=(*self.notes, note))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from moving_scene import write_moving_run
+from pretend_card import CARD, pretend_card
 from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.api.prune import file_of, prune_run, prune_within
@@ -53,6 +55,21 @@ def test_a_pruned_run_can_be_pruned(run_dir: Path, tmp_path: Path) -> None:
     assert sizes[0] > sizes[1] > sizes[2] > sizes[3]
     assert load_run(twice).step == 32
     assert load_run(thrice).step == 36
+
+
+def test_on_a_card_it_is_the_same(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search, its file, and the comparison with the run before."""
+    briefly = ("prune.steps=1", "run.threads=1")
+    expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
+    here = compared([run_dir, file_of(expected.folder)], 1)
+    monkeypatch.setattr("dyngs.build.device_for", lambda _: CARD)
+    with pretend_card():
+        found = prune_within(run_dir, tmp_path / "there", 3.0, briefly, silent)
+        there = compared([run_dir, file_of(found.folder)], 1, CARD)
+    assert replace(found, folder=expected.folder) == expected
+    files = [file_of(x.folder) / SCENE_FILE for x in (found, expected)]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert [replace(x, fps=1) for x in there] == [replace(x, fps=1) for x in here]
 
 
 def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from pretend_card import CARD, pretend_card
 from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.api.train import train
@@ -89,10 +90,22 @@ def test_finished_points_are_not_measured_again(points: list[Measurement], runs:
 
 
 def test_points_of_something_else_do_not_mix(points: list[Measurement], runs: VariantRuns, tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="measurements of another run, checkpoint or split"):
+    with pytest.raises(DyngsError, match="measurements of another run, checkpoint, split or device"):
         sweep(runs, replace(PLAN, split="train"), lambda line: None)
     with pytest.raises(DyngsError, match="no views"):
         sweep(VariantRuns(runs.run_dir, tmp_path, 1), replace(PLAN, split="val"), lambda line: None)
+
+
+def test_on_a_card_quality_is_the_same(runs: VariantRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    briefly = replace(PLAN, variations=parse_variations(("prune=0.5",), trains=False), finetune=0, combine=0)
+    expected = sweep(VariantRuns(runs.run_dir, tmp_path / "here", 1), briefly, lambda line: None)
+    monkeypatch.setattr("dyngs.build.device_for", lambda _: CARD)
+    with pretend_card():
+        there = VariantRuns(runs.run_dir, tmp_path / "there", 1)
+        found = sweep(there, replace(briefly, device=CARD), lambda line: None)
+    assert [replace(x, speed=None) for x in found] == [replace(x, speed=None, memory_mb=None) for x in expected]
+    with pytest.raises(DyngsError, match="another run, checkpoint, split or device"):
+        sweep(there, briefly, lambda line: None)
 
 
 def test_the_report_has_every_point(points: list[Measurement], runs: VariantRuns) -> None:

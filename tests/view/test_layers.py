@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from moving_scene import MOVING_ROWS, camera, still_scene, write_moving_run
+from pretend_card import CARD, pretend_card
 from view_sessions import balls
 
 from dyngs.output.render_job import render_frame
@@ -30,6 +31,18 @@ def test_every_layer_of_every_part_is_a_picture(layer: str, part: str) -> None:
         shown = draw(viewed, Shot(camera(), 0.5, layer, part))  # type: ignore[arg-type]
         assert shown.shape == (14, 20, 3)
         assert shown.dtype == np.uint8
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_a_card_draws_every_layer_alike(run: Viewed, layer: str) -> None:
+    view = 0 if layer in ("colour", "error") else None
+    shots = [Shot(camera(), 0.5, layer, part, view, 0.5) for part in PARTS]  # type: ignore[arg-type]
+    expected = [draw(run, shot) for shot in shots]
+    with pretend_card():
+        there = run.on(CARD)
+        found = [draw(there, shot) for shot in shots]
+    for a, b in zip(found, expected, strict=True):
+        assert np.array_equal(a, b)
 
 
 def test_parts_together_are_all() -> None:

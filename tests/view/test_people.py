@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from moving_scene import camera
+from pretend_card import CARD, pretend_card
 from scene_kinds import scene_of_kind
 
 from dyngs.errors import DyngsError
@@ -31,6 +32,16 @@ def test_a_turned_joint_moves_some_of_the_person(viewed: Viewed) -> None:
     assert float((turned - rest).norm(dim=1).max()) > 1e-3
     back = posed(viewed, {"pelvis": (0.0, 360.0, 0.0)}).scene.at(None).means
     assert torch.allclose(back, rest, atol=1e-4)
+
+
+def test_a_person_on_a_card_is_posed_there(viewed: Viewed) -> None:
+    angles = {"neck": (30.0, 0.0, 0.0)}
+    expected = in_motion(viewed, BY_SLIDERS, {}, angles).scene.at(None).means
+    with pretend_card():
+        posed_there = in_motion(viewed.on(CARD), BY_SLIDERS, {}, angles).scene.at(None).means
+        assert posed_there.device == CARD
+        found = posed_there.cpu()
+    assert torch.equal(found, expected)
 
 
 @pytest.mark.parametrize("count", [24, 52, 55])
