@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pretend_card import CARD, pretend_card
 
+from dyngs import build
 from dyngs.api.following import together
 from dyngs.api.train import train
 from dyngs.cli import main
@@ -87,6 +89,13 @@ def trained(configs: list[Config], fails: str = "") -> int:
         return 0
 
     return together(lead)
+
+
+def trained_on_card(configs: list[Config]) -> int:
+    """As ``trained``, with the scene on the pretended card."""
+    build.device_for = lambda _: CARD
+    with pretend_card():
+        return trained(configs)
 
 
 def resumed(run: Path) -> int:

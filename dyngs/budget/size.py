@@ -12,6 +12,7 @@ from torch import Tensor
 from dyngs.build import restored_scene
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.errors import DyngsError
+from dyngs.ops.device import CPU
 from dyngs.prune.selection import highest
 from dyngs.prune.stage import default_scores, probe_pictures, quality_of
 from dyngs.runs.checkpoint import SCENE_FILE
@@ -93,7 +94,7 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
     Raises:
         DyngsError: no way that was tried fits; the run itself is complete.
     """
-    whole, scene, config = trainer.checkpoint(), trainer.scene, trainer.config
+    whole, scene, config = trainer.checkpoint(), trainer.scene.to(CPU), trainer.config  # files are made on the CPU
     pictures = probe_pictures(trainer)
     before = quality_of(trainer, scene, pictures)
     plan = storage_plan(config, whole, scene, None)
@@ -109,7 +110,7 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
 
     chosen = stored(scene, plan.coarseness)
     if chosen is None or chosen.coarser > 1:
-        scores, share = default_scores(trainer), KEPT
+        scores, share = default_scores(trainer).cpu(), KEPT
         while share * len(scene) >= 1:
             kept = highest(scores, 1 - share)
             found = stored(scene.select(kept), None if plan.coarseness is None else plan.coarseness[kept])

@@ -22,6 +22,7 @@ from dyngs.data.frame_selection import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.evaluate.temporal import Drawing
 from dyngs.metrics import flip, ssim
+from dyngs.ops.device import finish
 from dyngs.prune.selection import highest
 from dyngs.prune.stage import default_scores, training_quality
 from dyngs.scene import Scene, render_options
@@ -273,6 +274,7 @@ def drawing_seconds(trainer: Trainer, scene: Scene, views: int = VIEWS) -> float
         for i, view in enumerate(chosen):
             start = time.perf_counter()
             picture = drawing.picture(cameras[i], view.time)
+            finish(picture.device)
             least[i] = min(least[i], time.perf_counter() - start)
             part = picture[:JUDGED, :JUDGED]
             ssim(part, part)

@@ -36,12 +36,12 @@ def with_random_gaussians(gaussians: Gaussians, count: int, extent: float, gener
 
 
 def with_gaussians(gaussians: Gaussians, added: Sequence[Gaussians]) -> EditResult:
-    """Return the edit that adds ``added``, all of the same degree, after ``gaussians``."""
+    """Return the edit that adds ``added``, all of the same degree, on any device, after ``gaussians``."""
     device, count = gaussians.means.device, sum(map(len, added))
     old, new = (torch.arange(len(gaussians), device=device), torch.zeros(count, dtype=torch.long, device=device))
     source = torch.cat([old, new])
     is_new = torch.arange(len(source), device=device) >= len(gaussians)
-    parts = [part.tensors() for part in (gaussians, *added)]
+    parts = [part.to(device=device).tensors() for part in (gaussians, *added)]
     changes = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     return EditResult(TopologyEdit(source, is_new), changes)
 

@@ -31,7 +31,7 @@ from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.adam import Count
 from dyngs.parameters import Parameters
 from dyngs.scene import Moment, Scene, Variant
-from dyngs.state import Role, State, with_role
+from dyngs.state import Role, State, fields_moved_to, with_role
 from dyngs.static.filters import FILTER_VARIANCE, filter_std
 from dyngs.static.rates import Rates
 from dyngs.static.training import FilterUpdate
@@ -194,7 +194,8 @@ class DynamicTraining:
         center, half_size = box_of(now, self.capture.extent)
         setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
         if first.seeds:
-            field = field_on_its_way(self.options.deform, setup, first, now.means.detach()[rows])
+            others = now.means.detach()[rows].cpu()  # tracks and seeds are found on the CPU
+            field = field_on_its_way(self.options.deform, fields_moved_to(setup, "cpu"), first, others)
             self._on_its_way(True)
         else:
             field = new_field(self.options.deform, setup, self._generator)

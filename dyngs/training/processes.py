@@ -125,7 +125,7 @@ class Processes:
             for chunk in flat.split(CHUNK):
                 chunk.copy_(self._summed(chunk))
             for x, values in zip(bucket, flat.split([x.numel() for x in bucket]), strict=True):
-                if values.data_ptr() != x.data_ptr():
+                if len(bucket) > 1 or not x.is_contiguous():  # else they are the same memory
                     x.copy_(values.view_as(x))
 
     def sum_gradients_(self, leaves: Sequence[Tensor], report: Tensor) -> None:
@@ -139,7 +139,7 @@ class Processes:
         head = torch.cat([report, counts])
         self.sum_([head])
         report.copy_(head[: len(report)])
-        used = [x for x, count in zip(leaves, head[len(report) :].tolist(), strict=True) if count > 0]
+        used = [x for x, count in zip(leaves, head[len(report) :].cpu().tolist(), strict=True) if count > 0]
         for x in used:
             x.grad = torch.zeros_like(x) if x.grad is None else x.grad.contiguous()
         self.sum_([x.grad for x in used if x.grad is not None])

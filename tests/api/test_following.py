@@ -87,6 +87,14 @@ def test_two_processes_end_with_the_bytes_of_one(moving: Path, still: Path, smal
     assert len(counts) > 3, "the set of Gaussians changes"
 
 
+def test_two_processes_with_a_card_each_do_so_too(still: Path, tmp_path: Path) -> None:
+    """On pretended cards: whatever is exchanged or compared lies where it has to."""
+    codes, said = run_in(2, do.trained_on_card, tmp_path, [_still(still, tmp_path / "two", batch_size=2)])
+    assert codes == [0, 0], said
+    train(_still(still, tmp_path / "one", batch_size=2))
+    _require_same_bytes(tmp_path / "one", tmp_path / "two")
+
+
 def test_four_do_so_too_and_write_one_run(moving: Path, still: Path, tmp_path: Path) -> None:
     four = [_still(still, tmp_path / "four"), _moving(moving, tmp_path / "four_m", 4)]
     codes, said = run_in(4, do.trained, tmp_path, four)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pretend_card import CARD, pretend_card
 from scenes import look_around
 from standing_balls import Ball, filmed
 from tiny_fields import KINDS, cloud, stir, tiny_options
@@ -562,6 +563,27 @@ def test_motion_begins_with_what_travels() -> None:
     assert scene.field is not None
     assert run.scene.field is not None
     torch.testing.assert_close(scene.at(0.3).means, run.scene.at(0.3).means)
+
+
+def test_motion_begins_on_a_card_as_on_the_cpu() -> None:
+    """Tracks and seeds are found on the CPU whatever the scene lies on."""
+    times = tuple(i / 7 for i in range(8))
+    footage = filmed(lambda t: [Ball((0.0, 0.1, 1.6 * t - 0.8))], times)
+
+    def means_on(device: torch.device) -> Tensor:
+        def errors(_: object) -> StillErrors:
+            return alike(torch.tensor(ERRORS).to(device))
+
+        run = new_run(flat_cloud(), times, errors, deform=ControlNodesField(nodes=32), num_random_moving=300)
+        run.training.capture = replace(run.training.capture, standing=lambda: footage)
+        grown = run.training.grown(run.scene.to(device), FINE)
+        assert grown is not None
+        assert grown[0].gaussians.means.device == device
+        return grown[0].at(0.3).means.detach().cpu()
+
+    expected = means_on(torch.device("cpu"))
+    with pretend_card():
+        assert torch.equal(means_on(CARD), expected)
 
 
 def test_where_nothing_travels_random_gaussians_are_added() -> None:

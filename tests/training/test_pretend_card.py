@@ -16,7 +16,8 @@ from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.evaluate.report import EvalReport, evaluate_run
 from dyngs.output.image_files import write_split_images
-from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
+from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.state import tensors_of
 from dyngs.training.prediction import assemble_network
 from dyngs.training.state import Checkpoint
@@ -203,9 +204,9 @@ def test_with_limits_and_pruning_it_ends_with_the_same_bytes(
     still: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def run(name: str) -> list[bytes]:
-        limits = ("budget.max_gaussians=80", "prune.share=0.3", "prune.steps=10")
+        limits = ("budget.max_gaussians=80", "budget.max_mb=0.02", "prune.share=0.3", "prune.steps=10")
         folder = train(config_of("static", still, *STATIC, *limits, f"run.dir={tmp_path / name}", "run.threads=1"))
-        return [checkpoint_paths(folder)[-1].read_bytes()]
+        return [checkpoint_paths(folder)[-1].read_bytes(), (folder / EXPORT_FOLDER / SCENE_FILE).read_bytes()]
 
     expected = run("cpu")
     monkeypatch.setattr("dyngs.build.device_for", lambda _: CARD)

@@ -56,7 +56,7 @@ class Footage:
 
 
 def footage_of(pictures: Iterable[Picture], background: Tensor, total: int = 1) -> Footage:
-    """Return the footage of one camera that stands still.
+    """Return the footage of one camera that stands still, on the CPU.
 
     Args:
         pictures: in order of time.
@@ -72,7 +72,7 @@ def footage_of(pictures: Iterable[Picture], background: Tensor, total: int = 1) 
         shown.append((255 * rgb).round().to(torch.uint8).cpu().numpy())
         counted.append(np.ones(rgb.shape[:2], bool) if small.mask is None else small.mask.cpu().numpy() > 0.5)
         times.append(small.time or 0.0)
-        camera = small.cameras
+        camera = small.cameras.to(device="cpu")
     if camera is None:
         raise ValueError("no pictures")
     stack, valid = np.stack(shown), np.stack(counted)
