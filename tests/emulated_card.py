@@ -21,9 +21,7 @@ from dyngs.ops import native
 
 ROOT = Path(__file__).resolve().parents[1]
 KERNELS = tuple(sorted((ROOT / "csrc/cuda").glob("*.cu")))
-BINDINGS = tuple(
-    f for f in sorted((ROOT / "csrc/bind").glob("bind_*.cpp")) if f.stem not in ("bind_perceptron", "bind_posing")
-)
+BINDINGS = tuple(f for f in sorted((ROOT / "csrc/bind").glob("bind_*.cpp")) if f.stem != "bind_perceptron")
 NAME = "_core_emulated"
 
 

@@ -77,7 +77,7 @@ def _arrays(tensors: list[Tensor]) -> tuple[object, ...]:
     return tuple(array(x) for x in tensors)
 
 
-posing_backward_op = register("posing_backward", _posing_backward, fake=_fake_posing_backward, devices=("cpu",))
+posing_backward_op = register("posing_backward", _posing_backward, fake=_fake_posing_backward)
 """Gradients by means, quaternions and log scales at rest, by the weights, empty unless asked for, and by transforms;
 ``posed`` is what ``posing_op`` returned, ``grads`` are the gradients by the first three of it."""
 
@@ -99,7 +99,7 @@ def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
     return (*by_rest, by_weights if with_weights else None, by_transforms)
 
 
-posing_op = register("posing", _posing, fake=_fake_posing, devices=("cpu",), gradient=Gradient(_save, _backward))
+posing_op = register("posing", _posing, fake=_fake_posing, gradient=Gradient(_save, _backward))
 """Moved means, quaternions and log scales, the blended transforms, and what the backward pass needs (N, 12)."""
 
 

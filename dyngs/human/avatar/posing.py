@@ -15,12 +15,10 @@ from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.light import Light
 from dyngs.human.motion.clip import MotionClip
-from dyngs.human.pose.covariance import transform_covariance
 from dyngs.human.pose.nearest_rotation import nearest_rotations
-from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
+from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import BodyTemplate
-from dyngs.ops.posing import Posed, pose_by_joints
-from dyngs.ops.registration import has_kernel
+from dyngs.ops.posing import pose_by_joints
 from dyngs.state import fields_moved_to
 
 
@@ -112,8 +110,7 @@ def pose_gaussians(
     moves = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
     world = torch.cat([posing.scale * moves[..., :3], posing.scale * moves[..., 3:] + posing.trans[:, None]], dim=-1)
     means = gaussians.means if offsets is None else gaussians.means + offsets
-    pose = pose_by_joints if has_kernel("posing", means.device) else _pose_in_torch
-    moved = pose(means, gaussians.quats, gaussians.log_scales, weights, world)
+    moved = pose_by_joints(means, gaussians.quats, gaussians.log_scales, weights, world)
     linear = moved.transforms[..., :3]
     sh = gaussians.sh if gaussians.sh.shape[1] == 1 else rotate_sh(gaussians.sh, nearest_rotations(linear))
     return Gaussians(
@@ -123,13 +120,6 @@ def pose_gaussians(
         logit_opacities=gaussians.logit_opacities,
         sh=sh if light is None else light.on(sh, linear),
     )
-
-
-def _pose_in_torch(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> Posed:
-    """Return what ``pose_by_joints`` does, from torch's operators, for devices without a kernel."""
-    blended = blend_transforms(weights, transforms)
-    moved = transform_covariance(blended[..., :3], quats, log_scales)
-    return Posed(apply_transforms(blended, means), *moved, blended)
 
 
 def rest_offsets(
