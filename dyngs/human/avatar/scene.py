@@ -91,7 +91,7 @@ class HumanScene(Scene):
     @property
     def is_still(self) -> bool:
         """Whether the clip that is played has one pose."""
-        return len(self.moves_as) == 1
+        return len(self.clip if self.played is None else self.played) == 1
 
     @property
     def rows(self) -> Tensor:
