@@ -15,7 +15,7 @@ namespace dyngs {
 namespace {
 
 constexpr int64_t kBlock = 32 * kLanes;
-constexpr int kAffine = 12, kKept = 12;  // numbers of a transform, and those kept for the backward pass
+constexpr int kAffine = 12;  // numbers of a transform, and of what is kept for the backward pass
 
 // The first `count` of at most sixteen numbers, then zeros.
 template <class S>

@@ -48,7 +48,7 @@ DYNGS_HD RestShape<R> rest_shape(const Quat<R>& q, const R (&log_scales)[3]) {
     const R ratio = log_scales[k] - s.longest;
     s.thick[k] = lowest <= ratio;
     const R exponent = select(ratio < lowest, lowest, ratio) * real<R>(1.4426950408889634);
-    s.length[k] = select(exponent == exponent, exp2(exponent), exponent) + nothing;
+    s.length[k] = exp2(exponent) + (nothing + exponent * zero);
   }
   return s;
 }
