@@ -80,7 +80,8 @@ def main() -> None:
                     timed(lambda pose=pose: torch.autograd.grad(pose(*body), body, grads), options.device),
                 )
                 if number:
-                    forward[name].append(times[0]), both[name].append(times[1])
+                    forward[name].append(times[0])
+                    both[name].append(times[1])
     print(f"{options.gaussians:,} Gaussians, {options.joints} joints, {options.threads} thread(s), {active_isa()}")
     for name in ways:
         print(f"{name:<12} forward {median(forward[name]):7.2f} ms, with backward {median(both[name]):7.2f} ms")
