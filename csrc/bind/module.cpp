@@ -16,6 +16,7 @@ namespace dyngs {
 void bind_planes(nb::module_& module);
 void bind_offsets(nb::module_& module);
 void bind_perceptron(nb::module_& module);
+void bind_posing(nb::module_& module);
 void bind_rasterizer(nb::module_& module);
 void bind_shading(nb::module_& module);
 void bind_skinning(nb::module_& module);
@@ -54,6 +55,7 @@ NB_MODULE(DYNGS_MODULE, module) {
   dyngs::bind_planes(module);
   dyngs::bind_offsets(module);
   dyngs::bind_perceptron(module);
+  dyngs::bind_posing(module);
   dyngs::bind_rasterizer(module);
   dyngs::bind_shading(module);
   dyngs::bind_skinning(module);

@@ -14,6 +14,7 @@ namespace nb = nanobind;
 namespace dyngs {
 void bind_planes(nb::module_& module);
 void bind_offsets(nb::module_& module);
+void bind_posing(nb::module_& module);
 void bind_rasterizer(nb::module_& module);
 void bind_shading(nb::module_& module);
 void bind_skinning(nb::module_& module);
@@ -62,6 +63,7 @@ NB_MODULE(DYNGS_MODULE, module) {
 #endif
   dyngs::bind_planes(module);
   dyngs::bind_offsets(module);
+  dyngs::bind_posing(module);
   dyngs::bind_rasterizer(module);
   dyngs::bind_shading(module);
   dyngs::bind_skinning(module);

@@ -164,6 +164,22 @@ void skinning_backward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, c
 }
 
 template <class S>
+void pose_forward(const Posing<S>& in, const Posed<S>& out, int) {
+  require_float<S>();
+  if constexpr (std::is_same_v<S, float>) cuda::pose_forward(in, out, current_stream());
+}
+
+template <class S>
+void pose_backward(const Posing<S>& in, const Posed<const S>& posed, const PosedGrads<S>& g, const PosingGrads<S>& out,
+                   int) {
+  require_float<S>();
+  if constexpr (std::is_same_v<S, float>) {
+    const Borrowed memory(cuda::pose_backward_workspace(in.count, in.joints));
+    cuda::pose_backward(in, posed, g, out, memory.lent(), current_stream());
+  }
+}
+
+template <class S>
 void add_offsets(const RowOffsets<S>& offsets, const MovedGaussians<S>& gaussians, int) {
   require_float<S>();
   if constexpr (std::is_same_v<S, float>) cuda::add_offsets(offsets, gaussians, current_stream());
@@ -197,25 +213,28 @@ void write_count_nonfinite(const S* x, int64_t n, int32_t* count, int) {
 }
 
 // Of the formulas above, what the bindings call.
-#define DYNGS_INSTANTIATE(S)                                                                                      \
-  template void project_forward(const GaussianViews<S>&, const ProjectOptions<S>&, const Projected<S>&);          \
-  template void project_backward(const GaussianViews<S>&, const ProjectOptions<S>&, const int32_t*,               \
-                                 const ProjectedGrads<S>&, const GaussianGrads<S>&);                              \
-  template void harmonics_forward(const Harmonics<S>&, S*);                                                       \
-  template void harmonics_backward(const Harmonics<S>&, const S*, const S*, S*, S*, S*);                          \
-  template nb::tuple binned(const Splats<S>&, int64_t);                                                           \
-  template void rasterize_forward(const Splats<S>&, const Entries&, const Image<S>&);                             \
-  template void rasterize_backward(const Splats<S>&, const Entries&, const ImageGrads<S>&, const SplatGrads<S>&); \
-  template void hexplane_forward(const HexPlane<S>&, const PlanePoints<S>&, S*, int32_t*, int);                   \
-  template void hexplane_backward(const HexPlane<S>&, const PlanePoints<S>&, const int32_t*, const S*,            \
-                                  std::span<const PlaneGrads<S>>, S*, int);                                       \
-  template void write_plane_penalty(const HexPlane<S>&, const PenaltyWeights&, std::span<const PlaneGrads<S>>,    \
-                                    double*, int);                                                                \
-  template void skinning_forward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<S>&, int);              \
-  template void skinning_backward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<const S>&,             \
-                                  const SkinGrads<S>&, int);                                                      \
-  template void add_offsets(const RowOffsets<S>&, const MovedGaussians<S>&, int);                                 \
-  template void shading_inputs(const Shading<S>&, S*);                                                            \
+#define DYNGS_INSTANTIATE(S)                                                                                        \
+  template void project_forward(const GaussianViews<S>&, const ProjectOptions<S>&, const Projected<S>&);            \
+  template void project_backward(const GaussianViews<S>&, const ProjectOptions<S>&, const int32_t*,                 \
+                                 const ProjectedGrads<S>&, const GaussianGrads<S>&);                                \
+  template void harmonics_forward(const Harmonics<S>&, S*);                                                         \
+  template void harmonics_backward(const Harmonics<S>&, const S*, const S*, S*, S*, S*);                            \
+  template nb::tuple binned(const Splats<S>&, int64_t);                                                             \
+  template void rasterize_forward(const Splats<S>&, const Entries&, const Image<S>&);                               \
+  template void rasterize_backward(const Splats<S>&, const Entries&, const ImageGrads<S>&, const SplatGrads<S>&);   \
+  template void hexplane_forward(const HexPlane<S>&, const PlanePoints<S>&, S*, int32_t*, int);                     \
+  template void hexplane_backward(const HexPlane<S>&, const PlanePoints<S>&, const int32_t*, const S*,              \
+                                  std::span<const PlaneGrads<S>>, S*, int);                                         \
+  template void write_plane_penalty(const HexPlane<S>&, const PenaltyWeights&, std::span<const PlaneGrads<S>>,      \
+                                    double*, int);                                                                  \
+  template void skinning_forward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<S>&, int);                \
+  template void skinning_backward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<const S>&,               \
+                                  const SkinGrads<S>&, int);                                                        \
+  template void pose_forward(const Posing<S>&, const Posed<S>&, int);                                               \
+  template void pose_backward(const Posing<S>&, const Posed<const S>&, const PosedGrads<S>&, const PosingGrads<S>&, \
+                              int);                                                                                 \
+  template void add_offsets(const RowOffsets<S>&, const MovedGaussians<S>&, int);                                   \
+  template void shading_inputs(const Shading<S>&, S*);                                                              \
   template void write_count_nonfinite(const S*, int64_t, int32_t*, int)
 DYNGS_INSTANTIATE(float);
 DYNGS_INSTANTIATE(double);

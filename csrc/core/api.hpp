@@ -1,8 +1,8 @@
 // The native interface: every op, forward and backward, and the structs of its arguments. Pointers are to caller-owned,
 // contiguous, row-major arrays, of the device for which the library was built. Shape letters: V views, N Gaussians,
-// K SH terms, D channels, H W pixels, E tile entries, M points or rows, S control nodes, B nodes per point, L plane levels,
-// C plane channels. Templates over S = float and double. Outputs are written in full unless said otherwise, and no result
-// depends on the number of threads.
+// K SH terms, D channels, H W pixels, E tile entries, M points or rows, S control nodes, B nodes per point, J joints,
+// L plane levels, C plane channels. Templates over S = float and double. Outputs are written in full unless said otherwise,
+// and no result depends on the number of threads.
 #pragma once
 
 #include <cstdint>
@@ -309,6 +309,47 @@ void skinning_forward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, co
 template <class S>
 void skinning_backward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, const Skinned<const S>& g,
                        const SkinGrads<S>& grads, int threads);
+
+// Skinning by joints --------------------------------------------------------------------------------------------------
+// A body's Gaussians in a pose, by linear blend skinning (Loper et al. 2015): T = sum_j w_j A_j moves the mean and, exactly,
+// the covariance of each (math/posing.hpp).
+
+template <class S>
+struct Posing {
+  int64_t count, joints;                // N, J
+  const S *means, *quats, *log_scales;  // (N, 3), (N, 4) wxyz of any length (zero = identity), (N, 3), at rest
+  const S* weights;                     // (N, J)
+  const S* transforms;                  // (J, 3, 4) posed_from_rest
+};
+
+// `kept` is for the backward pass: of each covariance V (3, 3), then the axes' lengths relative to the longest at rest.
+template <class S>
+struct Posed {
+  S *means, *quats, *log_scales;  // (N, 3), (N, 4), (N, 3)
+  S* blended;                     // (N, 3, 4) T
+  S* kept;                        // (N, 12)
+};
+
+template <class S>
+struct PosedGrads {
+  const S *means, *quats, *log_scales;  // shapes of Posed
+  const S* blended;                     // or null
+};
+
+template <class S>
+struct PosingGrads {
+  S *means, *quats, *log_scales;  // shapes of Posing
+  S* weights;                     // or null
+  S* transforms;
+};
+
+template <class S>
+void pose_forward(const Posing<S>& in, const Posed<S>& out, int threads);
+
+// `posed` is what the forward pass wrote; its means and log scales are not read.
+template <class S>
+void pose_backward(const Posing<S>& in, const Posed<const S>& posed, const PosedGrads<S>& g, const PosingGrads<S>& out,
+                   int threads);
 
 // Offsets of a deformation field (dyngs/deform has the formulas in torch) -----------------------------------------------
 

@@ -164,9 +164,29 @@ inline uint32_t to_bits(PacketMask<float> m) {
 }
 #endif
 
-template <class S>
-inline bool any(PacketMask<S> m) {
-  return to_bits(m) != 0;
+template <class S, int kCount>
+inline bool any(Mask<S, kCount> m) {
+#if defined(__AVX__)
+  if constexpr (sizeof m == 32) {
+    __m256 bits;
+    std::memcpy(&bits, &m, sizeof bits);
+    return _mm256_movemask_ps(bits) != 0;
+  }
+#endif
+#if defined(__SSE2__)
+  if constexpr (sizeof m == 16) {
+    __m128 bits;
+    std::memcpy(&bits, &m, sizeof bits);
+    return _mm_movemask_ps(bits) != 0;
+  }
+#endif
+  if constexpr (kCount == kLanes) {
+    return to_bits(m) != 0;
+  } else {
+    bool found = false;
+    for (int i = 0; i < kCount; ++i) found |= m.bits[i] != 0;
+    return found;
+  }
 }
 
 #if defined(__AVX512F__)
@@ -210,15 +230,17 @@ inline Simd<S, kCount> trunc(Simd<S, kCount> x) {
   return __builtin_convertvector(__builtin_convertvector(x.v, typename V::IntVec), typename V::Vec);
 }
 
-inline Packet<double> exp2(Packet<double> x) {
-  Packet<double> r;
-  for (int i = 0; i < kLanes; ++i) r[i] = std::exp2(x[i]);
+template <int kCount>
+inline Simd<double, kCount> exp2(Simd<double, kCount> x) {
+  Simd<double, kCount> r;
+  for (int i = 0; i < kCount; ++i) r[i] = std::exp2(x[i]);
   return r;
 }
 
 // 2^x for x <= 0, relative error below 2.5e-7; results under 2^-126 are flushed to about 2^-126.
-inline Packet<float> exp2(Packet<float> x) {
-  using P = Packet<float>;
+template <int kCount>
+inline Simd<float, kCount> exp2(Simd<float, kCount> x) {
+  using P = Simd<float, kCount>;
   x = max(x, P(-126.0f));
   const P shifted = x + P(12582912.0f);  // 1.5 * 2^23: rounds x to an integer, which lands in the low mantissa bits
   const P f = x - (shifted - P(12582912.0f));
@@ -228,7 +250,7 @@ inline Packet<float> exp2(Packet<float> x) {
   p = p * f + P(2.40221197e-1f);
   p = p * f + P(6.93146967e-1f);
   p = p * f + P(1.00000007f);
-  P::IntVec n, bits;
+  typename P::IntVec n, bits;
   std::memcpy(&n, &shifted.v, sizeof n);
   std::memcpy(&bits, &p.v, sizeof bits);
   bits += n << 23;  // the float 1.5*2^23 has zeros below, so the shift leaves just the integer in the exponent field

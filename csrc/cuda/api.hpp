@@ -82,6 +82,11 @@ int64_t skinning_backward_workspace(int64_t num_nodes, int64_t num_points, int64
 void skinning_backward(const SkinNodes<float>& nodes, const SkinPoints<float>& points, const Skinned<const float>& g,
                        const SkinGrads<float>& grads, const Lent& workspace, Stream stream);
 
+void pose_forward(const Posing<float>& in, const Posed<float>& out, Stream stream);
+int64_t pose_backward_workspace(int64_t count, int64_t joints);
+void pose_backward(const Posing<float>& in, const Posed<const float>& posed, const PosedGrads<float>& g,
+                   const PosingGrads<float>& out, const Lent& workspace, Stream stream);
+
 void add_offsets(const RowOffsets<float>& offsets, const MovedGaussians<float>& gaussians, Stream stream);
 void shading_inputs(const Shading<float>& in, float* out, Stream stream);
 

@@ -41,7 +41,7 @@ struct LaunchGrid {
   int64_t shared_bytes = 0;
 };
 
-inline int64_t blocks_for(int64_t items, int per_block) { return (items + per_block - 1) / per_block; }
+inline int64_t blocks_for(int64_t items, int64_t per_block) { return (items + per_block - 1) / per_block; }
 
 #if defined(__CUDACC__)
 

@@ -37,6 +37,11 @@ template <class S>
 inline constexpr S kLargest = std::numeric_limits<S>::max();
 template <class S>
 inline constexpr S kNaN = std::numeric_limits<S>::quiet_NaN();
+template <class S>
+inline constexpr S kEpsilon = std::numeric_limits<S>::epsilon();
+
+// Whether a comparison holds anywhere: of numbers there is one.
+DYNGS_INLINE bool any(bool condition) { return condition; }
 
 DYNGS_INLINE float select(bool condition, float a, float b) { return condition ? a : b; }
 DYNGS_INLINE double select(bool condition, double a, double b) { return condition ? a : b; }

@@ -6,6 +6,7 @@
 #include "math/ellipse.hpp"
 #include "math/harmonics.hpp"
 #include "math/planes.hpp"
+#include "math/posing.hpp"
 #include "math/projection.hpp"
 #include "math/quaternion.hpp"
 #include "math/scalar.hpp"
@@ -110,6 +111,17 @@ __global__ void deformation(Numbers<S> n) {
 }
 
 template <class S>
+__global__ void posing(Numbers<S> n) {
+  Mat3<S> linear = rotation_matrix(n.quat());
+  const S logs[3] = {n.next(), n.next(), n.next()};
+  const RestShape<S> shape = rest_shape(n.quat(), logs);
+  const MovedShape<S> moved = move_shape(linear, shape);
+  const MovedShapeGrad<S> by = move_shape_vjp(linear, shape, moved, n.quat(), moved.log_scales);
+  n.put(moved.quat), n.put(by.quat), n.put(by.log_scales[0] + by.linear.m[0][0]);
+  n.put(moved_point(linear, n.vec(), n.vec()) + moved_point_vjp(by.linear, n.vec(), n.vec(), linear));
+}
+
+template <class S>
 __global__ void planes(Numbers<S> n) {
   const Cell<S> cell = locate(n.next(), 64);
   const TimeRows rows = time_rows(double(n.next()), 25);
@@ -139,7 +151,7 @@ __global__ void training(Numbers<S> n) {
 template <class S>
 void launch_all(Numbers<S> n) {
   rotations<<<1, 1>>>(n), projection<<<1, 1>>>(n), harmonics<<<1, 1>>>(n), blending<<<1, 1>>>(n);
-  deformation<<<1, 1>>>(n), planes<<<1, 1>>>(n), training<<<1, 1>>>(n);
+  deformation<<<1, 1>>>(n), posing<<<1, 1>>>(n), planes<<<1, 1>>>(n), training<<<1, 1>>>(n);
 }
 template void launch_all<float>(Numbers<float>);
 template void launch_all<double>(Numbers<double>);

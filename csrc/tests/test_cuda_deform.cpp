@@ -114,6 +114,102 @@ void test_far_points() {
   expect(alike, "far points follow all nodes alike");
 }
 
+// Posing --------------------------------------------------------------------------------------------------------------
+
+struct PosingCase {
+  int64_t count, joints;
+  Values means, quats, log_scales, weights, transforms, g_means, g_quats, g_log_scales, g_blended;
+};
+
+PosingCase posing_case(int64_t count, int64_t joints) {
+  PosingCase c{count,
+               joints,
+               uniforms(3 * count, -1, 1),
+               uniforms(4 * count, 0.3, 1),
+               uniforms(3 * count, -4, -2),
+               uniforms(count * joints, 0, 1),
+               uniforms(12 * joints, -0.4, 0.4),
+               uniforms(3 * count, -1, 1),
+               uniforms(4 * count, -1, 1),
+               uniforms(3 * count, -1, 1),
+               uniforms(12 * count, -1, 1)};
+  for (int64_t j = 0; j < joints; ++j)  // far from flat
+    for (int k = 0; k < 3; ++k) c.transforms[12 * j + 5 * k] += 1;
+  for (int64_t at = 0; at < count * joints; ++at)
+    if ((at % joints + at / joints) % 4 != 0 && at % joints != at / joints % joints) c.weights[at] = 0;
+  return c;
+}
+
+template <class S>
+struct PosedCase {
+  std::vector<S> means, quats, log_scales, blended, by_means, by_quats, by_log_scales, by_weights, by_transforms;
+};
+
+PosedCase<double> pose_on_cpu(const PosingCase& c) {
+  PosedCase<double> r{c.means, c.quats,      c.log_scales, c.g_blended, c.means,
+                      c.quats, c.log_scales, c.weights,    c.transforms};
+  Values kept(12 * c.count);
+  const Posing<double> in{c.count,          c.joints,           c.means.data(), c.quats.data(), c.log_scales.data(),
+                          c.weights.data(), c.transforms.data()};
+  pose_forward(in, {r.means.data(), r.quats.data(), r.log_scales.data(), r.blended.data(), kept.data()}, 1);
+  pose_backward(
+      in, {nullptr, r.quats.data(), nullptr, r.blended.data(), kept.data()},
+      {c.g_means.data(), c.g_quats.data(), c.g_log_scales.data(), c.g_blended.data()},
+      {r.by_means.data(), r.by_quats.data(), r.by_log_scales.data(), r.by_weights.data(), r.by_transforms.data()}, 1);
+  return r;
+}
+
+// Without `all`: no gradient by the blended transforms, and none by the weights.
+PosedCase<float> pose_on_card(const PosingCase& c, bool all = true) {
+  Memory<float> means(as<float>(c.means)), quats(as<float>(c.quats)), log_scales(as<float>(c.log_scales));
+  Memory<float> weights(as<float>(c.weights)), transforms(as<float>(c.transforms)), g_means(as<float>(c.g_means));
+  Memory<float> g_quats(as<float>(c.g_quats)), g_logs(as<float>(c.g_log_scales)), g_blended(as<float>(c.g_blended));
+  Memory<float> to_means(3 * c.count), to_quats(4 * c.count), to_logs(3 * c.count), blended(12 * c.count);
+  Memory<float> kept(12 * c.count), by_means(3 * c.count), by_quats(4 * c.count), by_logs(3 * c.count);
+  Memory<float> by_weights(c.count * c.joints), by_transforms(12 * c.joints);
+  const Posing<float> in{c.count,          c.joints,      means.get(),     quats.get(),
+                         log_scales.get(), weights.get(), transforms.get()};
+  Memory<char> workspace(cuda::pose_backward_workspace(c.count, c.joints));
+  cuda::pose_forward(in, {to_means.get(), to_quats.get(), to_logs.get(), blended.get(), kept.get()}, nullptr);
+  cuda::pose_backward(
+      in, {nullptr, to_quats.get(), nullptr, blended.get(), kept.get()},
+      {g_means.get(), g_quats.get(), g_logs.get(), all ? g_blended.get() : nullptr},
+      {by_means.get(), by_quats.get(), by_logs.get(), all ? by_weights.get() : nullptr, by_transforms.get()},
+      {workspace.get(), workspace.count()}, nullptr);
+  return {to_means.values(), to_quats.values(), to_logs.values(),    blended.values(),      by_means.values(),
+          by_quats.values(), by_logs.values(),  by_weights.values(), by_transforms.values()};
+}
+
+void test_posing(int64_t count, int64_t joints) {
+  const PosingCase c = posing_case(count, joints);
+  const std::string what = std::to_string(count) + " Gaussians on " + std::to_string(joints) + " joints";
+  const PosedCase<float> card = pose_on_card(c);
+  const PosedCase<double> cpu = pose_on_cpu(c);
+  expect_close("posed means, " + what, card.means, cpu.means, 2e-6);
+  expect_close("posed quaternions, " + what, card.quats, cpu.quats, 2e-5);
+  expect_close("posed scales, " + what, card.log_scales, cpu.log_scales, 2e-6);
+  expect_close("blended transforms, " + what, card.blended, cpu.blended, 2e-6);
+  expect_close("gradient by means at rest, " + what, card.by_means, cpu.by_means, 1e-5);
+  expect_close("gradient by quaternions at rest, " + what, card.by_quats, cpu.by_quats, 1e-4);
+  expect_close("gradient by scales at rest, " + what, card.by_log_scales, cpu.by_log_scales, 1e-4);
+  expect_close("gradient by weights, " + what, card.by_weights, cpu.by_weights, 1e-4);
+  expect_close("gradient by transforms, " + what, card.by_transforms, cpu.by_transforms, 1e-4);
+  in_other_orders([&] {
+    const PosedCase<float> again = pose_on_card(c);
+    expect_same_bits("posed quaternions again, " + what, again.quats, card.quats);
+    expect_same_bits("gradient by scales again, " + what, again.by_log_scales, card.by_log_scales);
+    expect_same_bits("gradient by weights again, " + what, again.by_weights, card.by_weights);
+    expect_same_bits("gradient by transforms again, " + what, again.by_transforms, card.by_transforms);
+  });
+  expect_same_bits("gradient by scales alone, " + what, pose_on_card(c, false).by_log_scales, card.by_log_scales);
+}
+
+void test_nothing_posed() {
+  const PosedCase<float> card = pose_on_card(posing_case(0, 3));
+  expect(std::all_of(card.by_transforms.begin(), card.by_transforms.end(), [](float x) { return x == 0; }),
+         "no Gaussians, no gradients by transforms");
+}
+
 // Planes --------------------------------------------------------------------------------------------------------------
 
 struct PlaneCase {
@@ -344,6 +440,7 @@ int main() {
   skip_without_card();
   test_skinning(5, 3, 40, 3), test_skinning(300, 7, 500, 4), test_skinning(2, 0, 300, 1);
   test_far_points();
+  test_posing(1, 1), test_posing(150, 24), test_posing(700, 3), test_nothing_posed();
   test_planes("two levels", plane_case(5, 150, 0.37, {{7, 4}, {17, 3}}));
   test_planes("more channels than a warp has lanes", plane_case(40, 60, 1, {{4, 5}}));
   test_planes("one sample", plane_case(3, 30, 0, {{1, 1}, {2, 2}}));

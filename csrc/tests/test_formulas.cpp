@@ -1,9 +1,10 @@
-// Blending, ellipses, skinning, planes, SSIM, Adam and colour inputs of csrc/math, on scalars: every hand-derived vjp against
+// Blending, ellipses, skinning, posing, planes, SSIM, Adam and colour inputs of csrc/math, on scalars: every hand-derived vjp against
 // central differences in double, the rest against plain formulas.
 #include "math/adam.hpp"
 #include "math/blend.hpp"
 #include "math/ellipse.hpp"
 #include "math/planes.hpp"
+#include "math/posing.hpp"
 #include "math/shading.hpp"
 #include "math/skinning.hpp"
 #include "math/ssim.hpp"
@@ -226,6 +227,79 @@ void test_skinning() {
   expect(weight_exponent(Vec3<double>{1e200, 0, 0}, weight_decay<double>(1e-200)) == -kLargest<double>, "no infinity");
 }
 
+// Inputs in a row: T 0-8, quaternion 9-12, log scales 13-15.
+Mat3<double> linear_of(const Values& v) { return {{{v[0], v[1], v[2]}, {v[3], v[4], v[5]}, {v[6], v[7], v[8]}}}; }
+RestShape<double> shape_of(const Values& v) {
+  return rest_shape<double>(load_quat(v.data() + 9), {v[13], v[14], v[15]});
+}
+
+Values gradient_of(const Values& v, const Values& g) {
+  const MovedShape<double> moved = move_shape(linear_of(v), shape_of(v));
+  const MovedShapeGrad<double> by =
+      move_shape_vjp<double>(linear_of(v), shape_of(v), moved, load_quat(g.data()), {g[4], g[5], g[6]});
+  Values gradient;
+  for (const auto& row : by.linear.m) gradient.insert(gradient.end(), row, row + 3);
+  gradient.insert(gradient.end(), {by.quat.w, by.quat.x, by.quat.y, by.quat.z});
+  gradient.insert(gradient.end(), by.log_scales, by.log_scales + 3);
+  return gradient;
+}
+
+// M M^T of R diag(exp(log scales)).
+Mat3<double> covariance_of(const Quat<double>& q, const double (&log_scales)[3]) {
+  Mat3<double> half = rotation_matrix(q);
+  for (auto& row : half.m)
+    for (int k = 0; k < 3; ++k) row[k] *= std::exp(log_scales[k]);
+  return product(half, transposed(half));
+}
+
+// T S T^T to `tolerance` of |T|^2 |S|.
+void expect_moved(const std::string& what, const Values& v, double tolerance) {
+  const Mat3<double> linear = linear_of(v);
+  const Mat3<double> still = covariance_of(shape_of(v).unit, {v[13], v[14], v[15]});
+  const MovedShape<double> moved = move_shape(linear, shape_of(v));
+  const Mat3<double> found = covariance_of(moved.quat, moved.log_scales);
+  const Mat3<double> wanted = product(product(linear, still), transposed(linear));
+  double error = 0, square = 0, size = 0;
+  for (int i = 0; i < 9; ++i) {
+    error = std::max(error, std::abs(found.m[i / 3][i % 3] - wanted.m[i / 3][i % 3]));
+    square += linear.m[i / 3][i % 3] * linear.m[i / 3][i % 3], size += still.m[i / 3][i % 3] * still.m[i / 3][i % 3];
+  }
+  expect(error <= tolerance * square * std::sqrt(size) + 1e-250, what);  // what vanishes is not quite zero
+}
+
+void test_posing() {
+  Values v = uniforms(9, -1, 1), g = uniforms(7, -1, 1);
+  for (double x : uniforms(4, 0.3, 1)) v.push_back(x);  // not short: slopes grow with its inverse
+  for (double x : uniforms(3, -2, 0.5)) v.push_back(x);
+  const auto f = [](const Values& x) {
+    const MovedShape<double> m = move_shape(linear_of(x), shape_of(x));
+    return Values{m.quat.w, m.quat.x, m.quat.y, m.quat.z, m.log_scales[0], m.log_scales[1], m.log_scales[2]};
+  };
+  expect_moved("a moved covariance", v, 1e-14);
+  expect_vjp("move_shape_vjp", f, v, g, gradient_of(v, g));
+  Mat3<double> by_linear{};
+  const Vec3<double> by_point = moved_point_vjp(linear_of(v), vec(v, 9), vec(g, 0), by_linear);
+  Values gradient(by_linear.m[0], by_linear.m[0] + 9);
+  append(gradient, by_point), append(gradient, vec(g, 0));
+  const auto point = [](const Values& x) {
+    Values out;
+    append(out, moved_point(linear_of(x), vec(x, 12), vec(x, 9)));
+    return out;
+  };
+  expect_vjp("moved_point_vjp", point, Values(v.begin(), v.begin() + 15), Values(g.begin(), g.begin() + 3), gradient);
+  // Maps that flatten: to a plane, to a line, to nothing. Gradients stay finite, for balls and needles, too.
+  for (const Values& kept :
+       {Values{0, 1, 1}, {1, 0, 1}, {1, 1, 0}, {1, 0, 0}, {0, 1, 0}, {0, 0, 1}, {0, 0, 0}, {1, 1, 1}})
+    for (const double logs : {0.0, -2.0, -80.0}) {
+      Values flat{kept[0], 0, 0, 0, kept[1], 0, 0, 0, kept[2], 1, 0, 0, 0, 0, logs, logs};
+      expect_moved("a flattened covariance", flat, 2e-14);
+      for (double x : gradient_of(flat, g)) expect(std::isfinite(x), "finite gradients of posing");
+    }
+  v[14] = v[13], v[15] = kNaN<double>;
+  const MovedShape<double> lost = move_shape(linear_of(v), shape_of(v));
+  expect(std::isnan(lost.log_scales[0] + lost.log_scales[1] + lost.log_scales[2]), "NaN in a scale stays");
+}
+
 // 12 samples of three planes, 6 of three lines, then three coordinates in samples.
 Values plane_feature(const Values& v) {
   constexpr int kFast[] = {0, 0, 1}, kSlow[] = {1, 2, 2};
@@ -339,7 +413,7 @@ int main() {
   skip_unless_supported();
   for (int trial = 0; trial < 10; ++trial) {
     test_vectors(), test_blend_vjp(), test_blend_packets(), test_ellipse();
-    test_skinning(), test_planes(), test_places_in_planes();
+    test_skinning(), test_posing(), test_planes(), test_places_in_planes();
     test_shading(), test_ssim(), test_adam();
   }
   return report();

@@ -21,6 +21,7 @@ from dyngs.ops.finite import count_nonfinite_op
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.offsets import add_offsets_
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
+from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.projection import project
 from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
 from dyngs.ops.shading import Sight, shading_inputs
@@ -159,6 +160,20 @@ def skinned() -> Made:
     return [offset, blended, *torch.autograd.grad(loss, [points, motion, values])]
 
 
+def posed() -> Made:
+    """Gaussians moved by joints, with gradients by everything, and by what is at rest alone."""
+    generator = torch.Generator().manual_seed(0)
+    rest = [torch.randn(70, size, generator=generator).requires_grad_() for size in (3, 4, 3)]
+    weights = torch.rand(70, 5, generator=generator).softmax(1).requires_grad_()
+    transforms = torch.randn(5, 3, 4, generator=generator).requires_grad_()
+    found = pose_by_joints(*rest, weights, transforms)
+    results = [found.means, found.quats, found.log_scales]
+    loss = sum((x.sin().sum() for x in results), found.transforms.square().sum())
+    alone = pose_by_joints(*rest, weights.detach(), transforms.detach()).log_scales.square().sum()
+    by_all = torch.autograd.grad(loss, [*rest, weights, transforms])
+    return [*results, found.transforms, *by_all, *torch.autograd.grad(alone, rest[1:])]
+
+
 CASES: dict[str, Callable[[], Made]] = {
     "render": lambda: drawn(single().gaussians),
     "tally": tallied,
@@ -168,6 +183,7 @@ CASES: dict[str, Callable[[], Made]] = {
     "shading": shaded,
     "planes": looked_up,
     "skinning": skinned,
+    "posing": posed,
 }
 
 

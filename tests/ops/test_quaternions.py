@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.deform.nodes import turned
-from dyngs.human.pose.covariance import transform_covariance
+from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.projection import project
 from dyngs.ops.quaternions import quat_product, rotate, rotation_matrices, unit_quats
 from dyngs.ops.shading import shortest_axes
@@ -55,8 +55,8 @@ def test_every_user_takes_every_length(scale: float) -> None:
         offsets = quats - torch.tensor([1.0, 0.0, 0.0, 0.0])
         again = exact(offsets + torch.tensor([1.0, 0.0, 0.0, 0.0])).float()
         torch.testing.assert_close(turned(offsets, vectors), rotate(again, vectors), **long)
-    axes, lengths = transform_covariance(torch.eye(3).expand(3, 3, 3), quats, log_scales)
-    half = rotation_matrices(axes) * lengths.exp()[:, None]
+    posed = pose_by_joints(vectors, quats, log_scales, torch.ones(3, 1), torch.eye(3, 4)[None])
+    half = rotation_matrices(posed.quats) * posed.log_scales.exp()[:, None]
     wanted = matrices * log_scales.exp()[:, None]
     torch.testing.assert_close(half @ half.mT, wanted @ wanted.mT, rtol=0, atol=100 * ROUNDING)
 

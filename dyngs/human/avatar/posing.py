@@ -15,10 +15,10 @@ from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.light import Light
 from dyngs.human.motion.clip import MotionClip
-from dyngs.human.pose.covariance import transform_covariance
 from dyngs.human.pose.nearest_rotation import nearest_rotations
-from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
+from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import BodyTemplate
+from dyngs.ops.posing import pose_by_joints
 from dyngs.state import fields_moved_to
 
 
@@ -107,15 +107,16 @@ def pose_gaussians(
         offsets: (N, 3) m, added to the means at rest; None: no offsets.
         light: that falls on them; None: even light.
     """
-    transforms = blend_transforms(weights, joint_transforms(skeleton.joints, skeleton.parents, posing.rotations))
-    linear = transforms[..., :3]
+    moves = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
+    world = torch.cat([posing.scale * moves[..., :3], posing.scale * moves[..., 3:] + posing.trans[:, None]], dim=-1)
     means = gaussians.means if offsets is None else gaussians.means + offsets
-    quats, log_scales = transform_covariance(linear, gaussians.quats, gaussians.log_scales)
+    moved = pose_by_joints(means, gaussians.quats, gaussians.log_scales, weights, world)
+    linear = moved.transforms[..., :3]
     sh = gaussians.sh if gaussians.sh.shape[1] == 1 else rotate_sh(gaussians.sh, nearest_rotations(linear))
     return Gaussians(
-        means=posing.scale * apply_transforms(transforms, means) + posing.trans,
-        quats=quats,
-        log_scales=log_scales + posing.scale.log(),
+        means=moved.means,
+        quats=moved.quats,
+        log_scales=moved.log_scales,
         logit_opacities=gaussians.logit_opacities,
         sh=sh if light is None else light.on(sh, linear),
     )

@@ -1,1 +1,1 @@
-"""Pose maths: rotations, linear blend skinning, moved covariances."""
+"""Pose maths: rotations, linear blend skinning."""

@@ -1,0 +1,159 @@
+"""Skinning by joints: Gaussians of a body moved to a pose, means and covariances, differentiable (Loper et al. 2015).
+
+N Gaussians, J joints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dyngs.errors import DyngsError
+from dyngs.ops.native import array, core_for, num_threads
+from dyngs.ops.registration import Gradient, register
+
+_KEPT = 12
+"""Numbers per Gaussian that the forward pass keeps for the backward pass."""
+
+
+_Results = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+def _posing(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> _Results:
+    results = _fake_posing(means, quats, log_scales, weights, transforms)
+    *moved, blended, kept = results
+    rest = _arrays([means, quats, log_scales])
+    given = (rest, array(weights), array(transforms))
+    core_for(means).pose_forward(*given, _arrays(moved), array(blended), array(kept), num_threads())
+    return results
+
+
+def _fake_posing(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> _Results:
+    moved = (means.new_empty(means.shape), quats.new_empty(quats.shape), log_scales.new_empty(log_scales.shape))
+    return (*moved, transforms.new_empty(len(means), 3, 4), means.new_empty(len(means), _KEPT))
+
+
+def _posing_backward(
+    rest: list[Tensor],
+    weights: Tensor,
+    transforms: Tensor,
+    posed: list[Tensor],
+    grads: list[Tensor],
+    g_blended: Tensor | None,
+    with_weights: bool,
+) -> _Results:
+    found = _fake_posing_backward(rest, weights, transforms, posed, grads, g_blended, with_weights)
+    *by_rest, by_weights, by_transforms = found
+    *moved, blended, kept = posed
+    core_for(weights).pose_backward(
+        *(_arrays(rest), array(weights), array(transforms)),
+        (_arrays(moved), array(blended), array(kept)),
+        *(_arrays(grads), None if g_blended is None else array(g_blended)),
+        *(_arrays(by_rest), array(by_weights) if with_weights else None, array(by_transforms)),
+        num_threads(),
+    )
+    return found
+
+
+def _fake_posing_backward(
+    rest: list[Tensor],
+    weights: Tensor,
+    transforms: Tensor,
+    posed: list[Tensor],
+    grads: list[Tensor],
+    g_blended: Tensor | None,
+    with_weights: bool,
+) -> _Results:
+    means, quats, log_scales = (x.new_empty(x.shape) for x in rest)
+    by_weights = weights.new_empty(weights.shape if with_weights else (0,))
+    return means, quats, log_scales, by_weights, transforms.new_empty(transforms.shape)
+
+
+def _arrays(tensors: list[Tensor]) -> tuple[object, ...]:
+    return tuple(array(x) for x in tensors)
+
+
+posing_backward_op = register("posing_backward", _posing_backward, fake=_fake_posing_backward)
+"""Gradients by means, quaternions and log scales at rest, by the weights, empty unless asked for, and by transforms;
+``posed`` is what ``posing_op`` returned, ``grads`` are the gradients by the first three of it."""
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: _Results) -> None:
+    ctx.set_materialize_grads(False)  # often nobody uses the blended transforms
+    ctx.mark_non_differentiable(output[4])
+    ctx.save_for_backward(*inputs, *output)
+
+
+def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+    saved: tuple[Tensor, ...] = ctx.saved_tensors
+    rest, weights, transforms, posed = list(saved[:3]), saved[3], saved[4], list(saved[5:])
+    by_moved = [torch.zeros_like(x) if g is None else g for x, g in zip(posed[:3], grads[:3], strict=True)]
+    with_weights = ctx.needs_input_grad[3]
+    *by_rest, by_weights, by_transforms = posing_backward_op(
+        rest, weights, transforms, posed, by_moved, grads[3], with_weights
+    )
+    return (*by_rest, by_weights if with_weights else None, by_transforms)
+
+
+posing_op = register("posing", _posing, fake=_fake_posing, gradient=Gradient(_save, _backward))
+"""Moved means, quaternions and log scales, the blended transforms, and what the backward pass needs (N, 12)."""
+
+
+@dataclass(frozen=True)
+class Posed:
+    """Gaussians in a pose.
+
+    Attributes:
+        means: (N, 3).
+        quats: (N, 4) wxyz, of unit length, the largest component positive.
+        log_scales: (N, 3).
+        transforms: (N, 3, 4) blended, by which each was moved.
+    """
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    transforms: Tensor
+
+
+def pose_by_joints(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> Posed:
+    """Return Gaussians moved by their joints, T_i = sum_j w_ij A_j: means T x, covariances T S T^T, both exactly.
+
+    With S = R diag(s^2) R^T and T R diag(s) = U diag(d) V^T the covariance is U diag(d^2) U^T, for every T. The axes
+    come in no order; a rigid map leaves theirs. Differentiable, once, in everything: the gradient of U divides by
+    d_i^2 - d_j^2; where these are nearly equal its numerator vanishes too, and the quotient is set to zero. Gradients
+    are finite. Axes of less than e^-16 of a Gaussian's longest count as that. The same bits on any number of threads.
+    NaN in a Gaussian or its weights stays there, but for gradients by the transforms, which are sums over all.
+
+    Args:
+        means: (N, 3) at rest; N may be 0. Half precision is computed in float32.
+        quats: (N, 4) wxyz, of any length; zero counts as the identity.
+        log_scales: (N, 3).
+        weights: (N, J) skinning weights.
+        transforms: (J, 3, 4) of the joints, posed from rest.
+
+    Raises:
+        DyngsError: shapes that do not fit each other, integers, or tensors on different devices.
+    """
+    inputs = {"means": means, "quats": quats, "log_scales": log_scales, "weights": weights, "transforms": transforms}
+    _check(inputs)
+    dtype = reduce(torch.promote_types, (x.dtype for x in inputs.values()), torch.float32)
+    return Posed(*posing_op(*(x.to(dtype) for x in inputs.values()))[:4])
+
+
+def _check(inputs: dict[str, Tensor]) -> None:
+    weights, device = inputs["weights"], inputs["means"].device
+    if weights.ndim != 2:
+        raise DyngsError(f"pose_by_joints: weights must be (N, J), got {tuple(weights.shape)}")
+    count, joints = weights.shape
+    wanted = {"means": (count, 3), "quats": (count, 4), "log_scales": (count, 3), "transforms": (joints, 3, 4)}
+    for name, x in inputs.items():
+        if tuple(x.shape) != wanted.get(name, x.shape):
+            raise DyngsError(f"pose_by_joints: {name} must be {wanted[name]}, got {tuple(x.shape)}")
+        if not x.is_floating_point() or x.device != device:
+            like = f"floating point on {device} like the means"
+            raise DyngsError(f"pose_by_joints: {name} must be {like}, got {x.dtype} on {x.device}")

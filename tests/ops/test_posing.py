@@ -1,0 +1,299 @@
+"""Gaussians moved by joints against T S T^T in float64, and gradients that are exact, and finite where axes are alike.
+
+In the tests, N Gaussians follow J joints.
+"""
+
+from __future__ import annotations
+
+import math
+from importlib import import_module
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dyngs.errors import DyngsError
+from dyngs.ops.native import core, kernel_threads
+from dyngs.ops.posing import Posed, pose_by_joints, posing_backward_op, posing_op
+from dyngs.ops.quaternions import rotation_matrices
+
+NAN = float("nan")
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def random_case(count: int, joints: int, seed: int = 0) -> list[Tensor]:
+    """Arguments of ``pose_by_joints``, all of them leaves; every Gaussian follows three joints, in all ways."""
+    weights = normal(count, joints, seed=seed).exp()
+    weights = weights * (weights >= weights.sort(descending=True).values[:, min(2, joints - 1), None])
+    case = [
+        normal(count, 3, seed=seed + 1),
+        normal(count, 4, seed=seed + 2),
+        0.7 * normal(count, 3, seed=seed + 3) - 2,
+        weights / weights.sum(1, keepdim=True),
+        normal(joints, 3, 4, seed=seed + 4),
+    ]
+    return [x.requires_grad_() for x in case]
+
+
+def moved_alone(linear: Tensor, quats: Tensor, log_scales: Tensor) -> Posed:
+    """Gaussians at the origin of which each follows a joint of its own, with the linear map (N, 3, 3)."""
+    transforms = torch.cat([linear, torch.zeros_like(linear[..., :1])], dim=-1)
+    weights = torch.eye(len(linear), dtype=linear.dtype)
+    return pose_by_joints(torch.zeros_like(log_scales), quats, log_scales, weights, transforms)
+
+
+def covariances(quats: Tensor, log_scales: Tensor) -> Tensor:
+    half = rotation_matrices(quats) * log_scales.exp()[:, None, :]
+    return half @ half.mT
+
+
+def reference(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> list[Tensor]:
+    """Means, covariances and blended transforms in plain torch."""
+    blended = torch.einsum("nj,jab->nab", weights, transforms)
+    linear = blended[..., :3]
+    moved = torch.einsum("nab,nb->na", linear, means) + blended[..., 3]
+    return [moved, linear @ covariances(quats, log_scales) @ linear.mT, blended]
+
+
+def posed(*arguments: Tensor) -> list[Tensor]:
+    """The same of ``pose_by_joints``."""
+    found = pose_by_joints(*arguments)
+    return [found.means, covariances(found.quats, found.log_scales), found.transforms]
+
+
+def results(function, case: list[Tensor]) -> list[Tensor]:
+    """Outputs, and the gradients by all arguments for fixed gradients of these."""
+    outputs = function(*case)
+    grads = [normal(*y.shape, seed=20 + i).to(y.dtype) for i, y in enumerate(outputs)]
+    return [*(y.detach() for y in outputs), *torch.autograd.grad(outputs, case, grads)]
+
+
+def assert_close(got: list[Tensor], expected: list[Tensor], tolerance: float) -> None:
+    """Relative to the largest element: sums of terms of that size are rounded at that size."""
+    for a, b in zip(got, expected, strict=True):
+        assert a.shape == b.shape
+        if b.numel():
+            assert (a.double() - b).abs().max() <= tolerance * max(1.0, b.abs().max().item())
+
+
+@pytest.fixture(params=["v2", "v3", "v4"])
+def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Posing runs on the kernels of this instruction set."""
+    if request.param > core.best_isa():
+        pytest.skip(f"this processor has no {request.param}")
+    monkeypatch.setattr("dyngs.ops.native.core", import_module(f"dyngs.ops._core_{request.param}"))
+    return request.param
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(count=st.integers(0, 40), joints=st.integers(1, 35), seed=st.integers(0, 1000))
+def test_double_equals_torch(instruction_set: str, count: int, joints: int, seed: int) -> None:
+    case = random_case(count, joints, seed)
+    short = min((x.detach().norm(dim=1).min().item() for x in case[1:2] if count), default=1.0)
+    assert_close(results(posed, case), results(reference, case), 1e-11 / min(1.0, short))
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**16), shear=st.sampled_from([0.0, 0.1, 1.0]), spread=st.sampled_from([0.0, 0.5, 3.0]))
+def test_covariances_are_moved_exactly(seed: int, shear: float, spread: float) -> None:
+    linear = torch.eye(3, dtype=torch.float64) + shear * normal(40, 3, 3, seed=seed)
+    quats, log_scales = normal(40, 4, seed=seed + 1), spread * normal(40, 3, seed=seed + 2) - 5
+    still = covariances(quats, log_scales)
+    wanted = linear @ still @ linear.mT
+    # T S T^T cancels where T nearly flattens the longest axis: what rounding does is a share of |T|^2 |S|. Up to 24
+    # rotations of 4 roundings each, and the products before and after: 100 or so, twice in a square. Axes of less than
+    # e^-16 of the longest are taken for that.
+    size = linear.norm(dim=(1, 2)).square() * still.norm(dim=(1, 2))
+    thinnest = 4 * math.exp(-32)
+    for dtype in (torch.float64, torch.float32):
+        found = moved_alone(linear.to(dtype), quats.to(dtype), log_scales.to(dtype))
+        moved = covariances(found.quats.double(), found.log_scales.double())
+        assert float(((moved - wanted).norm(dim=(1, 2)) / size).max()) < 100 * torch.finfo(dtype).eps + thinnest
+
+
+def test_axes_are_the_singular_values() -> None:
+    linear, quats, log_scales = normal(50, 3, 3, seed=1), normal(50, 4, seed=2), normal(50, 3, seed=3)
+    half = linear @ (rotation_matrices(quats) * log_scales.exp()[:, None])
+    wanted = np.linalg.svd(half.numpy(), compute_uv=False)
+    found = moved_alone(linear, quats, log_scales).log_scales.exp().sort(dim=1, descending=True).values
+    torch.testing.assert_close(found, torch.from_numpy(wanted.copy()), rtol=1e-11, atol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_rigid_motion_turns_and_leaves_the_axes(dtype: torch.dtype) -> None:
+    """Discs of two equal axes, too: no axis is turned into the other. A larger body has larger Gaussians."""
+    means, quats, log_scales, weights, _ = (x.detach().to(dtype) for x in random_case(60, 4))
+    log_scales[::2, 1] = log_scales[::2, 0]
+    turn, shift = rotation_matrices(normal(1, 4, seed=9))[0].to(dtype), torch.tensor([1.0, 2, 3], dtype=dtype)
+    transforms = torch.cat([2.5 * turn, shift[:, None]], dim=1).expand(4, 3, 4)
+    found = pose_by_joints(means, quats, log_scales, weights, transforms)
+    near = {"rtol": 0, "atol": 100 * torch.finfo(dtype).eps}
+    torch.testing.assert_close(found.means, 2.5 * means @ turn.T + shift, **near)
+    torch.testing.assert_close(found.log_scales, log_scales + math.log(2.5), **near)
+    torch.testing.assert_close(rotation_matrices(found.quats), turn @ rotation_matrices(quats), **near)
+    assert (found.quats.gather(1, found.quats.abs().argmax(1, keepdim=True)) > 0).all()
+
+
+def test_a_reflection_gives_rotations_all_the_same() -> None:
+    mirror = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)).expand(4, 3, 3)
+    quats, log_scales = normal(4, 4), normal(4, 3, seed=3)
+    found = moved_alone(mirror, quats, log_scales)
+    wanted = mirror @ covariances(quats, log_scales) @ mirror.mT
+    torch.testing.assert_close(covariances(found.quats, found.log_scales), wanted)
+
+
+def test_gradcheck() -> None:
+    """By everything, of the rotations and scales themselves."""
+
+    def outputs(*arguments: Tensor) -> tuple[Tensor, ...]:
+        found = pose_by_joints(*arguments)
+        return found.means, found.quats, found.log_scales, found.transforms
+
+    assert torch.autograd.gradcheck(outputs, random_case(5, 3, seed=5))
+
+
+def test_float_agrees_with_double(instruction_set: str) -> None:
+    case = random_case(600, 24)
+    single = [x.detach().float().requires_grad_() for x in case]
+    assert_close(results(posed, single), results(posed, case), 1e-5)
+
+
+@pytest.mark.parametrize("log_scales", [(-4.0, -4.0, -4.0), (-4.0, -4.0, -6.0), (0.0, -80.0, -80.0)])
+@pytest.mark.parametrize("flattened", [(1, 1, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (0, 0, 1), (0, 0, 0)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_maps_that_flatten(log_scales: tuple[float, ...], flattened: tuple[int, ...], dtype: torch.dtype) -> None:
+    """As blends of opposite rotations do: discs, balls and needles are moved exactly, and all gradients are finite."""
+    linear = rotation_matrices(normal(5, 4)) * torch.tensor(flattened)
+    given = [linear, torch.tensor([[1.0, 0, 0, 0]]).repeat(5, 1), torch.tensor([log_scales]).repeat(5, 1)]
+    given = [x.to(dtype).requires_grad_() for x in given]
+    found = moved_alone(*given)
+    wanted = linear @ covariances(*(x.detach().double() for x in given[1:])) @ linear.mT
+    moved = covariances(found.quats.detach().double(), found.log_scales.detach().double())
+    torch.testing.assert_close(moved, wanted, rtol=0, atol=100 * torch.finfo(dtype).eps)
+    ((found.quats.square() * torch.arange(4)).sum() + found.log_scales.sum()).backward()
+    assert all(x.grad is not None and bool(x.grad.isfinite().all()) for x in given)
+
+
+def test_the_gradient_of_a_ball_is_that_of_its_size() -> None:
+    """Its rotation has no effect, and the three scales grow alike."""
+    log_scales = torch.full((1, 3), -3.0, dtype=torch.float64, requires_grad=True)
+    quats = normal(1, 4).requires_grad_()
+    found = moved_alone(rotation_matrices(normal(1, 4, seed=1)), quats, log_scales)
+    by_quats, by_scales = torch.autograd.grad(found.log_scales.sum(), [quats, log_scales])
+    torch.testing.assert_close(by_scales, torch.ones_like(by_scales))
+    torch.testing.assert_close(by_quats, torch.zeros_like(by_quats), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_any_number_of_threads_gives_the_same_bits(dtype: torch.dtype) -> None:
+    case = [x.detach().to(dtype).requires_grad_() for x in random_case(3000, 24)]
+    expected: list[Tensor] = []
+    for threads in (1, 2, 8):
+        with kernel_threads(threads):
+            got = results(posed, case)
+        expected = expected or got
+        assert all(torch.equal(a, b) for a, b in zip(got, expected, strict=True))
+
+
+def test_zero_quaternions_turn_nothing_and_have_no_gradient() -> None:
+    case = [x.detach() for x in random_case(3, 2)]
+    identity = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(3, 4)
+    wanted = posed(case[0], identity, *case[2:])
+    quats = torch.zeros(3, 4, dtype=torch.float64, requires_grad=True)
+    found = posed(case[0], quats, *case[2:])
+    assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
+    assert not torch.autograd.grad(found[1].sum(), quats)[0].any()
+
+
+def test_no_gaussians() -> None:
+    *grads, by_transforms = results(posed, random_case(0, 3))[3:]
+    assert all(len(x) == 0 for x in grads)
+    assert by_transforms.shape == (3, 3, 4)
+    assert not by_transforms.any()
+
+
+@pytest.mark.parametrize("which", range(4))
+@pytest.mark.parametrize("bad", [NAN, float("inf")])
+def test_nan_stays_with_its_gaussian(which: int, bad: float) -> None:
+    case = [x.detach().float() for x in random_case(40, 6)]
+    expected = pose_by_joints(*case)
+    case[which] = case[which].clone()
+    case[which][17, 1] = bad
+    found = pose_by_joints(*case)
+    lost = torch.arange(40) == 17
+    touched = ("means",) if which == 0 else ("quats", "log_scales") if which < 3 else ("means", "log_scales")
+    for name in touched:
+        assert not getattr(found, name)[lost].isfinite().all()
+    for name in ("means", "quats", "log_scales", "transforms"):
+        assert torch.equal(getattr(found, name)[~lost], getattr(expected, name)[~lost])
+
+
+def test_gradients_that_nobody_asks_for() -> None:
+    """Only some results are used, and only some arguments are trained."""
+    case = random_case(20, 4)
+    everything = torch.autograd.grad(pose_by_joints(*case).means.sum(), case)
+    constant = [*case[:3], case[3].detach(), case[4]]
+    found = torch.autograd.grad(pose_by_joints(*constant).means.sum(), [case[0], case[4]])
+    assert torch.equal(found[0], everything[0])
+    assert torch.equal(found[1], everything[4])
+    by_blended = torch.autograd.grad(pose_by_joints(*case).transforms.sum(), case[4])[0]
+    torch.testing.assert_close(by_blended, case[3].detach().sum(0)[:, None, None].expand(4, 3, 4))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
+    case = [x.detach().to(dtype) for x in random_case(5, 3)]
+    found, wanted = pose_by_joints(*case), pose_by_joints(*(x.float() for x in case))
+    assert found.quats.dtype == torch.float32
+    assert torch.equal(found.quats, wanted.quats)
+
+
+def test_bad_inputs_are_refused() -> None:
+    case = [x.detach() for x in random_case(5, 3)]
+    wrong = {
+        r"means must be \(5, 3\), got \(4, 3\)": [case[0][:4], *case[1:]],
+        r"quats must be \(5, 4\), got \(5, 3\)": [case[0], case[0], *case[2:]],
+        r"transforms must be \(3, 3, 4\), got \(2, 3, 4\)": [*case[:4], case[4][:2]],
+        r"weights must be \(N, J\), got \(3,\)": [*case[:3], case[3][0], case[4]],
+        "log_scales must be floating point on cpu like the means, got torch.int64": [
+            *(*case[:2], case[2].long(), *case[3:])
+        ],
+        "quats must be floating point on cpu like the means, got torch.float64 on meta": [
+            *(case[0], case[1].to("meta"), *case[2:])
+        ],
+    }
+    for message, arguments in wrong.items():
+        with pytest.raises(DyngsError, match=message):
+            pose_by_joints(*arguments)
+
+
+def test_second_derivatives_are_refused() -> None:
+    case = random_case(4, 2)
+    (first,) = torch.autograd.grad(pose_by_joints(*case).means.square().sum(), case[4], create_graph=True)
+    with pytest.raises(DyngsError, match="differentiable once"):
+        first.square().sum().backward()
+
+
+def test_it_is_a_well_behaved_torch_op() -> None:
+    case = random_case(9, 4)
+    torch.library.opcheck(posing_op, tuple(case))
+    rest, weights, transforms = [x.detach() for x in case[:3]], case[3].detach(), case[4].detach()
+    found = list(posing_op(*rest, weights, transforms))
+    grads = [torch.ones_like(x) for x in rest]
+    for by_blended, with_weights in ((None, False), (torch.ones_like(found[3]), True)):
+        arguments = (rest, weights, transforms, found, grads, by_blended, with_weights)
+        torch.library.opcheck(posing_backward_op, arguments)
+
+
+def test_compiles_in_one_graph() -> None:
+    compiled = torch.compile(posed, fullgraph=True, backend="aot_eager")
+    case = random_case(9, 4)
+    found, expected = (torch.autograd.grad(sum(x.sum() for x in f(*case)), case) for f in (compiled, posed))
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b)
