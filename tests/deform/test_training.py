@@ -89,7 +89,7 @@ class Run:
             edited = self.scene.edited(result.edit)
             self.scene = edited.with_gaussians(leaves(edited.gaussians))
         self.scene = self.training.after_step(self.scene, step, result is not None)
-        return left_out
+        return int(left_out)
 
     def grow(self, step: int) -> EditResult | None:
         grown = self.training.grown(self.scene, step)
