@@ -63,7 +63,7 @@ from dyngs.training.interrupt import Interrupts
 from dyngs.training.limits import require_possible, shared
 from dyngs.training.longer import told, with_length
 from dyngs.training.loop import Loop, Stopwatch
-from dyngs.training.memory import memory_forecast, require_room
+from dyngs.training.memory import memory_forecasts, require_room
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
 
@@ -349,14 +349,14 @@ def _tell_memory(trainer: Trainer, processes: int) -> None:
     """Print how much memory a run will take, and a warning where that is likely to be more than is there.
 
     Raises:
-        DyngsError: it is certain to be more than this machine can give.
+        DyngsError: it is certain to be more than this machine, or its card, can give.
     """
-    forecast = memory_forecast(trainer, processes)
-    print(forecast, flush=True)
-    forecast.require_possible()
-    warning = forecast.warning()
-    if warning is not None:
-        print(f"dyngs: warning: {warning}", file=sys.stderr, flush=True)
+    for forecast in memory_forecasts(trainer, processes):
+        print(forecast, flush=True)
+        forecast.require_possible()
+        warning = forecast.warning()
+        if warning is not None:
+            print(f"dyngs: warning: {warning}", file=sys.stderr, flush=True)
 
 
 def _is_lost(comparison: StillComparison | None) -> bool:

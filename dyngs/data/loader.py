@@ -34,7 +34,7 @@ from dyngs.data.pictures.resampling import flow_at, nearest_positions, resized, 
 from dyngs.data.pictures.silhouettes import cut_out
 from dyngs.errors import DyngsError
 from dyngs.files.containment import pictures_up_to
-from dyngs.ops.device import CPU, free_bytes
+from dyngs.ops.device import CPU, card_memory
 from dyngs.ops.transfer import sent
 
 FULLY_KEPT = 1 - 1e-4
@@ -186,10 +186,10 @@ class PictureLoader:
         if device == self._device:
             return
         self.rest()
-        free = free_bytes(device)
+        memory = card_memory(device)
         with self._lock:
             self._on_card, self._card_bytes, self._small, self._small_bytes = {}, 0, {}, 0
-            self._device, self._card_room = device, math.inf if free is None else CARD_SHARE * free
+            self._device, self._card_room = device, math.inf if memory is None else CARD_SHARE * memory[0]
 
     @property
     def times(self) -> tuple[float | None, ...]:
@@ -291,6 +291,11 @@ class PictureLoader:
     def keeps_all(self) -> bool:
         """Whether the cache has room for all pictures, as far as their sizes tell."""
         return self._bytes_of_all() <= self._options.cache_mb * 1e6
+
+    @property
+    def keeps_all_on_card(self) -> bool:
+        """Whether a card has room for all pictures, as far as their sizes tell."""
+        return self._bytes_of_all() <= self._card_room
 
     @property
     def bytes_to_come(self) -> int:

@@ -47,9 +47,14 @@ def why_on_cpu(choice: str) -> str | None:
     return None if reason is None else f"computing on the CPU: {reason}; device=cpu ends this line"
 
 
-def free_bytes(device: torch.device) -> int | None:
-    """Return the bytes of a card's memory that nobody has taken; None where ``device`` is none."""
-    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else None
+def card_memory(device: torch.device) -> tuple[int, int] | None:
+    """Return the bytes of a card's memory that nobody has taken, and all that it has; None where it is no card."""
+    return torch.cuda.mem_get_info(device) if device.type == "cuda" else None
+
+
+def num_cards() -> int:
+    """Return the number of cards, at least 1."""
+    return max(torch.cuda.device_count(), 1)
 
 
 def finish(device: torch.device) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from typing_extensions import assert_never
@@ -24,6 +24,7 @@ from dyngs.config import (
 from dyngs.config.kinds import added_for_motion, field_of, person_of, stored_sh_degree
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
+from dyngs.ops.device import card_memory, num_cards
 from dyngs.training.limits import num_field_values
 from dyngs.training.schedule import densify_schedule, growth_per_change
 from dyngs.training.trainer import Trainer
@@ -84,6 +85,7 @@ class MemoryForecast:
         all_kept: every picture has its place in the cache.
         processes: on this machine that take as much.
         longest_side: of the pictures, px.
+        on_card: it is the memory of a card, where pictures take no more than their share.
         limits: key that limits the number of Gaussians, and its value at ``count`` of them.
     """
 
@@ -101,6 +103,7 @@ class MemoryForecast:
     all_kept: bool
     processes: int = 1
     longest_side: int = 0
+    on_card: bool = False
     limits: tuple[str, int] = ("strategy.max_gaussians", 0)
 
     @property
@@ -114,10 +117,12 @@ class MemoryForecast:
         return self.program + self.pictures + self.least * self.least_each
 
     def __str__(self) -> str:
-        kept = "all kept" if self.all_kept else "as many as data.cache_mb keeps"
-        parts = f"{_gb(self.program)} program, {_gb(self.pictures)} pictures ({kept}), {_gb(self.drawing)} drawing, "
+        limit = "a quarter of it" if self.on_card else "data.cache_mb"
+        kept = "all kept" if self.all_kept else f"as many as {limit} keeps"
+        parts = f"{_gb(self.program)} program, " if self.program else ""
+        parts += f"{_gb(self.pictures)} pictures ({kept}), {_gb(self.drawing)} drawing, "
         parts += f"{_gb(self.field)} field, " if self.field else ""
-        parts += f"{_gb(self.count * self.each)} for some {self.count:,} Gaussians"
+        parts += f"{_gb(self.count * self.each)} for some {self.count:,} Gaussians" if self.count else "no Gaussians"
         if self.most > 2 * self.count:
             parts += f"; {_gb(self.most * self.each)} for the {self.most:,} that strategy.max_gaussians allows"
             room = self._gaussians_that_fit()
@@ -125,14 +130,14 @@ class MemoryForecast:
                 parts += f", of which {room:,} fit"
         there = "" if self.free is None else f" ({_gb(self.free + self.program)} are there)"
         each = f" in each of {self.processes} processes" if self.processes > 1 else ""
-        return f"memory: about {_gb(self.total)} GB{each}{there}: {parts}"
+        return f"{self._place}: about {_gb(self.total)} GB{each}{there}: {parts}"
 
     def warning(self) -> str | None:
         """Return a line where that is likely to be more than is there; what to set to which value is in it."""
         if self.free is None or self._growth <= self.free:
             return None
         needed = self.program + self._growth
-        return f"about {_gb(needed)} GB of memory are needed, and {self._there}: give {self._advice()}"
+        return f"about {_gb(needed)} GB of {self._place} are needed, and {self._there}: give {self._advice()}"
 
     def require_possible(self) -> None:
         """Raise where the run certainly needs more than this machine, or its container, can ever give it.
@@ -144,9 +149,13 @@ class MemoryForecast:
         if self.whole is None or needed <= self.whole:
             return
         raise DyngsError(
-            f"at least {_gb(needed)} GB of memory are needed, and this machine gives {_gb(self.whole)}: give "
-            f"{self._advice()}"
+            f"at least {_gb(needed)} GB of {self._place} are needed, and this {'card' if self.on_card else 'machine'} "
+            f"gives {_gb(self.whole)}: give {self._advice()}"
         )
+
+    @property
+    def _place(self) -> str:
+        return "memory of the card" if self.on_card else "memory"
 
     @property
     def _growth(self) -> int:
@@ -172,10 +181,10 @@ class MemoryForecast:
         """Return the keys to lower, with values that make the run fit, the least that does first."""
         rest = self.total - self.program - self.pictures
         room, gaussians = 0.95 * self._share, self.count * self.each
-        if rest < room:
+        if rest < room and not self.on_card:
             return f"data.cache_mb={1e-6 * (room - rest):.0f} (pictures are then decoded again and again)"
         found, left = [], room - 0.2 * room
-        if self.pictures > 0.2 * room:
+        if self.pictures > 0.2 * room and not self.on_card:
             found.append(f"data.cache_mb={0.2e-6 * room:.0f}")
         else:
             left = room - self.pictures
@@ -197,13 +206,35 @@ class MemoryForecast:
         return f"{key}={max(count, 1)}"
 
 
-def memory_forecast(trainer: Trainer, processes: int = 1) -> MemoryForecast:
+def memory_forecasts(trainer: Trainer, processes: int = 1) -> list[MemoryForecast]:
     """Return the memory that the run of ``trainer``, which has not begun to step, is expected to take.
+
+    On a card first that of the card, with the scene, and then that of the machine, with what stays on the CPU.
 
     Args:
         trainer: of the run.
         processes: on this machine that train it together.
     """
+    whole = memory_forecast(trainer, processes)
+    card = card_memory(trainer.device)
+    if card is None:
+        return [whole]
+    free, there = card
+    on_card = replace(
+        whole,
+        program=0,  # the driver and torch have taken theirs when this is asked
+        pictures=trainer.pictures.bytes_on_card,
+        free=free,
+        whole=there,
+        all_kept=trainer.pictures.keeps_all_on_card,
+        processes=-(-processes // num_cards()),
+        on_card=True,
+    )
+    return [on_card, replace(whole, drawing=STEP_BYTES, field=0, count=0, most=0, least=0)]
+
+
+def memory_forecast(trainer: Trainer, processes: int = 1) -> MemoryForecast:
+    """Return what ``memory_forecasts`` says of the machine, as if the scene were there."""
     pictures, config = trainer.pictures, trainer.config
     pixels = max((width * height for width, height in pictures.sizes), default=0)
     files = max((view.width * view.height for view in pictures.views), default=0)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from pretend_card import CARD, pretend_card
 from tensor_bytes import TensorBytes
 
 from dyngs.build import assemble
@@ -31,6 +32,7 @@ from dyngs.training.memory import (
     free_memory,
     gaussian_bytes,
     memory_forecast,
+    memory_forecasts,
     num_changes,
     peak_memory,
     require_room,
@@ -67,6 +69,36 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _config(capture: Path, **changes: object) -> Config:
     return Config(data=DataConfig(root=capture), init=RandomInit(num_random=60)).model_copy(update=changes)
+
+
+def test_on_a_card_the_scene_is_forecast_there_and_the_rest_here(
+    capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dyngs.build.device_for", lambda _: CARD)
+    monkeypatch.setattr(memory, "card_memory", lambda _: (3 * GB, 8 * GB))
+    monkeypatch.setattr("dyngs.data.loader.card_memory", lambda _: (2000, 8 * GB))
+    config = _config(capture, strategy=DefaultStrategy(max_gaussians=10**7), train=TrainConfig(steps=30_000))
+    with pretend_card():
+        trainer = assemble(config)
+        card, machine = memory_forecasts(trainer)
+        monkeypatch.setattr(memory, "card_memory", lambda _: (GB // 100, 8 * GB))
+        small = memory_forecasts(trainer, 2)[0]
+    assert (card.free, card.whole, card.program, card.pictures) == (3 * GB, 8 * GB, 0, 500)
+    assert card.count > 60
+    assert machine.count == machine.field == 0
+    assert machine.pictures > 4 * 16 * 16 * 3 - 500
+    assert card.total + machine.total > memory_forecast(trainer).total
+    line = (
+        r"memory of the card: about [\d.]+ GB \(3 are there\): [\d.e-]+ pictures \(as many as a quarter of it keeps\), "
+    )
+    assert re.match(line, str(card))
+    assert str(machine).endswith(" drawing, no Gaussians")
+    assert small.processes == 2
+    warning = small.warning()
+    assert warning is not None
+    assert "GB of memory of the card are needed" in warning
+    assert "strategy.max_gaussians=" in warning
+    assert "data.cache_mb" not in warning, "it is not what limits them there"
 
 
 def test_a_run_is_forecast_before_it_begins(capture: Path) -> None:

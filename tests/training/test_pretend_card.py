@@ -153,7 +153,7 @@ def test_pictures_that_do_not_fit_there_are_streamed(still: Path, monkeypatch: p
     config = config_of("static", still, *STATIC)
     with pretend_card():
         kept = trained(config, monkeypatch, CARD).checkpoint().tensors
-        monkeypatch.setattr("dyngs.data.loader.free_bytes", lambda _: 0)
+        monkeypatch.setattr("dyngs.data.loader.card_memory", lambda _: (0, 0))
         streamed = trained(config, monkeypatch, CARD).checkpoint().tensors
     assert [key for key, x in kept.items() if not torch.equal(streamed[key], x)] == []
 
