@@ -20,6 +20,7 @@ from safetensors.torch import load, save
 from dyngs.build import build
 from dyngs.config import Config
 from dyngs.errors import DyngsError
+from dyngs.ops.device import deterministic, device_for
 from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.training.events import Event, TopologyChanged
@@ -114,7 +115,8 @@ def follow(processes: Processes) -> None:
 
 def _follow_run(processes: Processes, config: Config) -> tuple[Order, bytes]:
     """Follow a run to its end, and return what is to be done after it."""
-    with kernel_threads(config.run.threads or 1):
+    bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
+    with kernel_threads(config.run.threads or 1), bytewise:
         trainer = build(config, restored=True).scene_trainer
         if trainer is None:
             raise DyngsError("a network is trained by one process; start it without torchrun")

@@ -20,6 +20,7 @@ from dyngs.data.loader import Picture, PictureLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
+from dyngs.ops.device import deterministic, device_for
 from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.search import MOST_HELD_OUT, Limit, Search, Stored
@@ -125,7 +126,8 @@ def prune_within(
     if config.model != load_resolved(run_dir).model:
         raise DyngsError("model.*: losses are counted from RUN as it is; choose that with --prune R")
     keep_freed_memory()
-    with kernel_threads(config.run.threads or num_cores()):
+    bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
+    with kernel_threads(config.run.threads or num_cores()), bytewise:
         trainer = assemble(config, restored=True)
         trainer.restore(start)
         search = Search(trainer, start, tell, _unseen(config, trainer.device))

@@ -27,7 +27,7 @@ from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.ops.device import device_for
+from dyngs.ops.device import deterministic, device_for
 from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FloaterRemoval
@@ -117,7 +117,8 @@ def train(
         return folder
     keep_freed_memory()
     threads = config.run.threads or max(1, num_cores() // processes.local_size)
-    with writing(folder) as is_sole_writer, kernel_threads(threads):
+    bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
+    with writing(folder) as is_sole_writer, kernel_threads(threads), bytewise:
         tidy(folder, sole_writer=is_sole_writer)
         if resume_from is None and is_done(folder, config) and not _owes_file(config, folder):
             print(_told_again(config, folder), flush=True)

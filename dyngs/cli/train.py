@@ -38,6 +38,7 @@ WITH_RESUME = (
     "train.steps",
     "run.threads",
     "run.device",
+    "run.deterministic",
     "train.save_every",
     "train.eval_every",
     "train.log_every",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -55,6 +57,27 @@ def card_memory(device: torch.device) -> tuple[int, int] | None:
 def num_cards() -> int:
     """Return the number of cards, at least 1."""
     return max(torch.cuda.device_count(), 1)
+
+
+@contextmanager
+def deterministic(device: torch.device, wanted: bool = True) -> Iterator[None]:
+    """Let torch's operators on a card give the same bytes every time, inside this context; ours always do.
+
+    Where torch has no such operator it warns. The CPU's need nothing of this.
+    """
+    if device.type != "cuda" or not wanted:
+        yield
+        return
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # what cuBLAS needs for it, before it begins
+    before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    filled = torch.utils.deterministic.fill_uninitialized_memory
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # every op of ours writes its outputs in full
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before[0], warn_only=before[1])
+        torch.utils.deterministic.fill_uninitialized_memory = filled
 
 
 def finish(device: torch.device) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ import torch
 
 from dyngs.errors import DyngsError
 from dyngs.ops import device
-from dyngs.ops.device import device_for, findings, why_no_card, why_on_cpu
+from dyngs.ops.device import deterministic, device_for, findings, why_no_card, why_on_cpu
 
 
 @pytest.fixture
@@ -124,3 +125,21 @@ def test_auto_says_why_only_where_a_card_seems_to_be(machine: pytest.MonkeyPatch
 def test_other_choices_are_refused() -> None:
     with pytest.raises(DyngsError, match="device must be one of auto, cpu, cuda"):
         device_for("tpu")
+
+
+def test_on_a_card_torch_is_told_to_repeat_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And only there, only inside, and only if that is wanted."""
+    told: list[tuple[bool, bool]] = []
+    monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
+    monkeypatch.setattr(torch, "use_deterministic_algorithms", lambda mode, warn_only: told.append((mode, warn_only)))
+    for name, wanted in (("cpu", True), ("cuda", False)):
+        with deterministic(torch.device(name), wanted):
+            assert told == []
+    assert "CUBLAS_WORKSPACE_CONFIG" not in os.environ
+    filled = torch.utils.deterministic.fill_uninitialized_memory
+    with deterministic(torch.device("cuda")):
+        assert told == [(True, True)]
+        assert os.environ["CUBLAS_WORKSPACE_CONFIG"] == ":4096:8"
+        assert not torch.utils.deterministic.fill_uninitialized_memory
+    assert told[1:] == [(False, False)]
+    assert torch.utils.deterministic.fill_uninitialized_memory == filled

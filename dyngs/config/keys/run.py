@@ -20,3 +20,6 @@ class RunConfig(Section):
     device: Literal["auto", "cpu", "cuda"] = Field(
         default="auto", description="what computes; auto: a CUDA card that can be used (docs/gpu.md), else the CPU"
     )
+    deterministic: bool = Field(
+        default=True, description="on a card: the same bytes on every run; false may be faster (the CPU's always are)"
+    )
