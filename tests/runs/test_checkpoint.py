@@ -87,6 +87,15 @@ def test_nobody_is_told_to_delete_a_file_that_may_be_whole(tmp_path: Path, monke
             latest_checkpoint(tmp_path)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
+def test_a_link_to_nothing_is_an_error(tmp_path: Path) -> None:
+    """It was taken for a checkpoint that is removed meanwhile, and looked for without end."""
+    save_checkpoint(tmp_path, _checkpoint(1), 1.0)
+    (tmp_path / "checkpoints" / "step_0000002.safetensors").symlink_to(tmp_path / "nothing")
+    with pytest.raises(DyngsError, match=r"step_0000002.*"):
+        latest_checkpoint(tmp_path)
+
+
 def test_a_run_can_be_loaded_while_it_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two checkpoints are saved, and the one that was found removed, before it is opened."""
     save_checkpoint(tmp_path, _checkpoint(1), 1.0)
