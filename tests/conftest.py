@@ -17,6 +17,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # `pytest -n 2`: processes share the co
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -28,6 +29,8 @@ from tiny_captures import random_pixels, write_colmap, write_frames, write_pictu
 from tiny_fields import write_tiny_capture
 
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.human.fit import fitted_capture
+from dyngs.human.fit.capture_fit import FitEffort
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.ops.native import core
 
@@ -145,6 +148,14 @@ def nerfstudio_root(tmp_path: Path) -> Path:
 def colmap_root(tmp_path: Path) -> Path:
     """Nine pictures in two subfolders, binary model."""
     return write_colmap(tmp_path)
+
+
+@pytest.fixture
+def short_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bodies are fitted to captures in two steps, on squares of 32 px."""
+    effort = FitEffort(side=32, steps=2, visits=0)
+    for name in ("fit_capture", "placed_clip"):
+        monkeypatch.setattr(fitted_capture, name, partial(getattr(fitted_capture, name), effort=effort))
 
 
 @pytest.fixture

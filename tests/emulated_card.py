@@ -33,9 +33,22 @@ def compiler() -> str:
     return found
 
 
-def compiled(folder: Path, sources: Iterable[Path], flags: Iterable[str]) -> list[str]:
-    """Object files of ``sources`` in ``folder``, each compiled unless it is there."""
-    command = [compiler(), "-std=gnu++20", "-fPIC", "-w", f"-I{ROOT / 'csrc'}", *flags, "-x", "c++", "-c"]
+def compiled(folder: Path, sources: Iterable[Path], flags: Iterable[str], common: Iterable[str] = ()) -> list[str]:
+    """Object files of ``sources`` in ``folder``, each compiled unless it is there.
+
+    Args:
+        folder: that exists; of these sources and flags alone.
+        sources: C++, also with the endings of CUDA.
+        flags: of the compiler.
+        common: headers below csrc that most of them include; they are read once for all.
+    """
+    command = [compiler(), "-std=gnu++20", "-fPIC", "-w", f"-I{ROOT / 'csrc'}", *flags]
+    headers = folder / "common.hpp"
+    headers.write_text("".join(f'#include "{name}"\n' for name in common), encoding="utf-8")
+    if common and not (folder / "common.hpp.gch").exists():
+        own = ["-x", "c++-header", str(headers), "-o", f"{headers}.gch"]
+        subprocess.run([*command, *own], check=True, timeout=500)
+    command += ["-include", str(headers), "-x", "c++", "-c"]
 
     def compile_one(source: Path) -> str:
         target = folder / f"{source.name}.o"
@@ -62,7 +75,7 @@ def emulated_kernels(base: Path) -> list[str]:
 
             fcntl.flock(lock, fcntl.LOCK_EX)
         # nothing contracted, as in CMakeLists.txt
-        return compiled(folder, KERNELS, ["-O1", "-ffp-contract=off"])
+        return compiled(folder, KERNELS, ["-O1", "-ffp-contract=off"], ("cuda/device.hpp", "cuda/sort.hpp"))
 
 
 def session_folder(factory: pytest.TempPathFactory) -> Path:

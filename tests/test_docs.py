@@ -320,7 +320,7 @@ def shortened(command: Command) -> list[str]:
     return [*words, *extra]
 
 
-@pytest.mark.usefixtures("one_thread", "workplace")
+@pytest.mark.usefixtures("one_thread", "workplace", "short_fits")
 @pytest.mark.parametrize("page", RUN_PAGES)
 def test_the_commands_of_these_pages_run(page: str, capsys: pytest.CaptureFixture[str]) -> None:
     for command in (command for command in commands() if command.page == page):

@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -44,18 +43,29 @@ WITHOUT_MIRROR = {
 }
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
+Found = list[tuple[str, str, Function]]
 
 
 def relative(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-def functions() -> Iterator[tuple[str, str, Function]]:
-    """File, name and definition of every function of the package."""
-    for path in PYTHON_FILES:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, Function):
-                yield relative(path), node.name, node
+@pytest.fixture(scope="module")
+def trees() -> dict[str, ast.Module]:
+    """Every file of the package, parsed."""
+    return {relative(path): ast.parse(path.read_text(encoding="utf-8")) for path in PYTHON_FILES}
+
+
+@pytest.fixture(scope="module")
+def nodes(trees: dict[str, ast.Module]) -> dict[str, list[ast.AST]]:
+    """All that it consists of, by file."""
+    return {file: list(ast.walk(tree)) for file, tree in trees.items()}
+
+
+@pytest.fixture(scope="module")
+def functions(nodes: dict[str, list[ast.AST]]) -> Found:
+    """File, name and definition of every function."""
+    return [(file, node.name, node) for file, own in nodes.items() for node in own if isinstance(node, Function)]
 
 
 def is_plumbing(file: str, name: str) -> bool:
@@ -74,35 +84,35 @@ def test_files_are_short() -> None:
     assert {name: n for name, n in lengths.items() if n > MAX_FILE_LINES} == {}
 
 
-def test_functions_are_short() -> None:
-    lengths = {f"{file}:{name}": (node.end_lineno or 0) - node.lineno + 1 for file, name, node in functions()}
+def test_functions_are_short(functions: Found) -> None:
+    lengths = {f"{file}:{name}": (node.end_lineno or 0) - node.lineno + 1 for file, name, node in functions}
     assert {k: n for k, n in lengths.items() if n > MAX_FUNCTION_LINES and k.split(":")[1] not in LONG_FUNCTIONS} == {}
 
 
-def test_functions_take_few_parameters() -> None:
+def test_functions_take_few_parameters(functions: Found) -> None:
     counts = {
         f"{file}:{name}": len(parameters(node))
-        for file, name, node in functions()
+        for file, name, node in functions
         if name not in MANY_PARAMETERS and not is_plumbing(file, name)
     }
     assert {k: n for k, n in counts.items() if n > MAX_PARAMETERS} == {}
 
 
-def test_exceptions_to_the_rules_still_exist() -> None:
-    assert (LONG_FUNCTIONS.keys() | MANY_PARAMETERS.keys()) - {name for _, name, _ in functions()} == set()
+def test_exceptions_to_the_rules_still_exist(functions: Found) -> None:
+    assert (LONG_FUNCTIONS.keys() | MANY_PARAMETERS.keys()) - {name for _, name, _ in functions} == set()
 
 
-def test_every_parameter_and_result_is_annotated() -> None:
+def test_every_parameter_and_result_is_annotated(functions: Found) -> None:
     bare = []
-    for file, name, node in functions():
+    for file, name, node in functions:
         given = [*parameters(node), *(a for a in (node.args.vararg, node.args.kwarg) if a is not None)]
         if (node.returns is None or any(a.annotation is None for a in given)) and not is_plumbing(file, name):
             bare.append(f"{file}:{name}")
     assert bare == []
 
 
-def test_every_module_says_what_it_is() -> None:
-    silent = [relative(f) for f in PYTHON_FILES if not ast.get_docstring(ast.parse(f.read_text(encoding="utf-8")))]
+def test_every_module_says_what_it_is(trees: dict[str, ast.Module]) -> None:
+    silent = [file for file, tree in trees.items() if not ast.get_docstring(tree)]
     assert silent == []
 
 
@@ -123,12 +133,12 @@ def test_no_paths_of_one_machine() -> None:
     assert [name for name in found if "__pycache__" not in name] == []
 
 
-def test_no_code_from_data() -> None:
+def test_no_code_from_data(nodes: dict[str, list[ast.AST]]) -> None:
     """Untrusted files never run code: no pickle, no eval, no unsafe YAML, no shell."""
     forbidden_modules = {"pickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"}
     found = []
-    for path in PYTHON_FILES:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for file, own in nodes.items():
+        for node in own:
             if isinstance(node, ast.Import):
                 names = {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
@@ -139,7 +149,7 @@ def test_no_code_from_data() -> None:
             else:
                 continue
             if names & forbidden_modules:
-                found.append(f"{relative(path)}:{node.lineno}")
+                found.append(f"{file}:{node.lineno}")
     assert found == []
 
 
@@ -158,17 +168,17 @@ FACTORIES = {"zeros", "ones", "full", "empty", "tensor", "arange", "linspace", "
 """Functions of torch that make a tensor on the CPU unless told otherwise."""
 
 
-def test_every_tensor_is_made_on_a_named_device() -> None:
+def test_every_tensor_is_made_on_a_named_device(nodes: dict[str, list[ast.AST]]) -> None:
     """A tensor made without ``device`` lies on the CPU, whatever it is to be used with. Say ``device="cpu"`` where it
     belongs there."""
     found = []
-    for path in PYTHON_FILES:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for file, own in nodes.items():
+        for node in own:
             if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
                 continue
             made = ast.unparse(node.func.value) == "torch" and node.func.attr in FACTORIES
             if made and "device" not in {keyword.arg for keyword in node.keywords}:
-                found.append(f"{relative(path)}:{node.lineno}")
+                found.append(f"{file}:{node.lineno}")
     assert found == []
 
 
@@ -193,9 +203,9 @@ def run_python(code: str) -> str:
 
 
 def test_import_is_cheap() -> None:
-    """The best of three processes, because a busy machine only ever makes it slower."""
+    """One of three processes suffices, because a busy machine only ever makes it slower."""
     code = "import time, torch, numpy; t = time.perf_counter(); import dyngs; print(time.perf_counter() - t)"
-    assert min(float(run_python(code)) for _ in range(3)) < 1.0
+    assert any(float(run_python(code)) < 1.0 for _ in range(3))
 
 
 def test_import_leaves_heavy_packages_alone() -> None:

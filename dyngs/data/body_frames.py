@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.data.capture import BODY_KINDS, BodyFrames, Split, View
 from dyngs.errors import DyngsError
-from dyngs.files.fields import first_few, float_array, numbers_of
+from dyngs.files.fields import LARGEST, first_few, float_array, numbers_of
 
 
 def body_frames(
@@ -124,7 +124,7 @@ def of_one_clip(body: BodyFrames) -> dict[Split, BodyFrames]:
 
 
 def _rows(where: Path, name: str, value: object, frames: Sequence[int], width: int = 0) -> np.ndarray:
-    """(F, width) finite float64, any width where that is 0."""
+    """(F, width) float64 numbers of at most ``LARGEST``, any width where that is 0."""
     array = float_array(value)
     if array is None:
         raise DyngsError(f"{where}: '{name}' must hold as many numbers for each frame; export the file again")
@@ -136,10 +136,10 @@ def _rows(where: Path, name: str, value: object, frames: Sequence[int], width: i
         raise DyngsError(
             f"{where}: '{name}' has {array.shape[1]} numbers per frame instead of {width}; export it again"
         )
-    bad = ~np.isfinite(array).all(axis=1)
+    bad = ~(np.abs(array) <= LARGEST).all(axis=1)
     if bad.any():
         frame = frames[int(np.argmax(bad))]
-        raise DyngsError(f"{where}: '{name}' of frame {frame} holds NaN or infinite numbers; repair or remove it")
+        raise DyngsError(f"{where}: '{name}' of frame {frame} holds NaN, infinite or huge numbers; repair or remove it")
     return array
 
 

@@ -10,6 +10,9 @@ import numpy as np
 
 from dyngs.errors import DyngsError
 
+LARGEST = 1e30
+"""Magnitude up to which numbers are taken: in float32 they, and sums of a few, are finite."""
+
 
 def is_number(value: object) -> TypeGuard[int | float]:
     """Whether a value from a JSON file is a number; true and false are not."""
@@ -42,14 +45,14 @@ def entry(where: object, fields: object, key: str) -> Any:
 
 
 def numbers_of(where: object, value: object, shape: tuple[int, ...] | None) -> np.ndarray:
-    """Return finite float64 numbers, reshaped to ``shape``, or flat if that is None; the file may have another shape.
+    """Return float64 numbers up to ``LARGEST``, reshaped to ``shape``, or flat if that is None; the file may differ.
 
     Raises:
         DyngsError: no numbers, or another number of them; ``where`` says which file.
     """
     array = float_array(value)
     fits = array is not None and (shape is None or array.size == math.prod(shape))
-    if array is None or not fits or not np.isfinite(array).all():
+    if array is None or not fits or not (np.abs(array) <= LARGEST).all():
         count = "x".join(map(str, shape)) + " " if shape else ""
         raise DyngsError(f"{where} must hold {count}finite numbers; export it again")
     return array.ravel() if shape is None else array.reshape(shape)

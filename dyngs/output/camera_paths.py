@@ -250,7 +250,7 @@ def _read_pose(frame: dict[str, Any], where: str) -> np.ndarray:
         raise DyngsError(f"{where} needs exactly one of 'cam_from_world' and 'transform_matrix'")
     try:
         matrix = np.array(frame[given[0]], np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise DyngsError(f"{where}: '{given[0]}' must be a 4x4 or 3x4 matrix of numbers") from None
     pose, _ = checked_pose(matrix, f"{where}: '{given[0]}'")
     return cam_from_opengl(pose) if given[0] == "transform_matrix" else pose

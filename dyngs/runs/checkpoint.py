@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -129,7 +130,7 @@ def latest_checkpoint(run_dir: Path) -> Checkpoint:
         try:
             return load_checkpoint(paths[-1])
         except DyngsError:
-            if paths[-1].exists():
+            if os.path.lexists(paths[-1]):  # also a link to nothing
                 raise  # otherwise its run has saved twice since it was found
 
 

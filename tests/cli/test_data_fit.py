@@ -1,7 +1,6 @@
 """``dyngs data fit``: what it prints, writes and refuses."""
 
 import json
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -9,17 +8,11 @@ from tiny_captures import write_colmap
 
 from dyngs.cli import main
 from dyngs.human.avatar import pose_fit
-from dyngs.human.fit import fitted_capture
-from dyngs.human.fit.capture_fit import FitEffort, fit_capture
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
+pytestmark = pytest.mark.usefixtures("short_fits")
+
 PrintedOutput = pytest.CaptureFixture[str]
-
-
-@pytest.fixture(autouse=True)
-def _cheap(monkeypatch: pytest.MonkeyPatch) -> None:
-    effort = FitEffort(side=32, steps=1, visits=0)
-    monkeypatch.setattr(fitted_capture, "fit_capture", partial(fit_capture, effort=effort))
 
 
 def test_a_fitted_capture_says_how_good_it_is(tmp_path: Path, capsys: PrintedOutput) -> None:

@@ -119,7 +119,8 @@ def test_cuda_kernels_in_cpp(tmp_path: Path, tmp_path_factory: pytest.TempPathFa
     tests = [ROOT / f"csrc/tests/test_cuda_{name}.cpp" for name in ("emulator", "render", "train", "deform")]
     cpu = sorted((ROOT / "csrc/cpu").glob("*.cpp"))
     # nothing contracted, as in CMakeLists.txt; what hardly takes time to run is compiled quickly
-    objects = compiled(tmp_path, [*tests, *cpu], ["-ffp-contract=off", "-fopenmp", "-O0"])
+    common = ("core/api.hpp", "cpu/parallel.hpp", "cpu/simd.hpp", "tests/check.hpp")
+    objects = compiled(tmp_path, [*tests, *cpu], ["-ffp-contract=off", "-fopenmp", "-O0"], common)
     emulated = emulated_kernels(session_folder(tmp_path_factory))
     for test, own in zip(tests, objects, strict=False):
         program = tmp_path / test.stem

@@ -60,6 +60,7 @@ GOOD = {"width": 8, "height": 8, "fl_x": 8, "frames": [{"cam_from_world": np.eye
         ({"frames": [{}]}, r"frames\[0\].*cam_from_world"),
         ({"fl_x": True}, "'fl_x'"),
         ({"frames": [{"cam_from_world": [[1, 2], [3]]}]}, r"frames\[0\].*4x4"),
+        ({"frames": [{"cam_from_world": [[10**400, 2], [3, 4]]}]}, r"frames\[0\].*4x4"),
         ({"frames": [{"cam_from_world": (2 * np.eye(4)).tolist()}]}, r"frames\[0\]"),
         ({"frames": [{"cam_from_world": np.diag([-1, 1, 1, 1]).tolist()}]}, "mirrored"),
         ({"frames": [{"cam_from_world": np.full((4, 4), np.nan).tolist()}]}, "NaN"),

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from dyngs.cli import main
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.runs import lock as run_lock
@@ -39,10 +40,10 @@ def _holder(folder: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def _train(capture: Path, run_dir: Path, *words: str) -> list[str]:
-    """A command line of a run that is not soon over."""
+    """Words of a command for a run that is not soon over."""
     keys = (f"data.root={capture}", f"run.dir={run_dir}", "run.threads=1", "train.steps=100000", "train.save_every=5")
     more = ("init.kind=random", "init.num_random=50", "model.sh_degree=0", "train.log_every=5")
-    return [sys.executable, "-m", "dyngs", "train", "static", *keys, *more, *words]
+    return ["train", "static", *keys, *more, *words]
 
 
 def test_the_second_is_told_who_holds_it(tmp_path: Path) -> None:
@@ -127,20 +128,20 @@ def test_of_many_that_want_it_at_once_one_has_it(tmp_path: Path) -> None:
     assert (tmp_path / "n").read_text() == "300"
 
 
-def test_two_trainings_into_one_folder(still: Path, tmp_path: Path) -> None:
+def test_two_trainings_into_one_folder(still: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The second ends at once with one line; readers may read; the first goes on, and can be resumed after a kill."""
     run = tmp_path / "run"
-    first = subprocess.Popen(_train(still, run), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    words = [sys.executable, "-m", "dyngs", *_train(still, run)]
+    first = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         while not checkpoint_paths(run):
             assert first.poll() is None
             time.sleep(0.05)
-        resume = [sys.executable, "-m", "dyngs", "train", "--resume", str(run)]
-        for command in (_train(still, run, "run.seed=1"), resume):
-            second = subprocess.run(command, capture_output=True, text=True, check=False)
-            assert second.returncode == 2
-            assert second.stderr.count("\n") == 1
-            assert f"process {first.pid} on " in second.stderr
+        for second in (_train(still, run, "run.seed=1"), ["train", "--resume", str(run)]):
+            assert main(second) == 2
+            told = capsys.readouterr().err
+            assert told.count("\n") == 1
+            assert f"process {first.pid} on " in told
         for _ in range(5):
             assert load_run(run).step > 0
         assert evaluate_run(run).num_views == 1

@@ -40,7 +40,7 @@ def trained(config: Config, monkeypatch: pytest.MonkeyPatch, device: torch.devic
 
 
 STATIC = ("train.steps=20", "init.kind=random", "init.num_random=100")
-DYNAMIC = ("train.steps=40", "model.num_random_moving=100", "init.kind=random", "init.num_random=300")
+DYNAMIC = ("train.steps=24", "model.num_random_moving=100", "init.kind=random", "init.num_random=300")
 CASES = {
     "growing": ("static", "still", (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.grad_threshold=1e-7")),
     "mcmc": ("static_mcmc", "still", (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.min_opacity=0.09")),
@@ -52,7 +52,7 @@ CASES = {
     "robust": ("static", "still", (*STATIC, "train.robust=always")),
     "nodes": ("dynamic", "moving", DYNAMIC),
     "hexplane": ("dynamic", "moving", (*DYNAMIC, "model.deform.kind=hexplane", "model.deform.resolution=16")),
-    "human": ("human", "person", ("train.steps=12", "model.resolution=32")),
+    "human": ("human", "person", ("train.steps=8", "model.resolution=24")),
 }
 """Preset, capture and overrides by name."""
 

@@ -21,10 +21,13 @@ class SceneModel(Section):
         description="classic: 3DGS; antialiased: opacity makes up for the low-pass filter (2D filter of Mip-Splatting)",
     )
     eps2d: float = Field(
-        default=0.3, ge=0, description="variance of the 2D low-pass filter, px^2; Mip-Splatting: 0.1 with antialiased"
+        default=0.3,
+        ge=0,
+        le=3.4e38,
+        description="variance of the 2D low-pass filter, px^2; Mip-Splatting: 0.1 with antialiased",
     )
     filter_3d: bool = Field(default=False, description="3D smoothing filter of Mip-Splatting (Yu et al. 2024)")
-    near: Positive = Field(default=0.2, description="near plane, world units")
+    near: Positive = Field(default=0.2, le=3.4e38, description="near plane, world units")
     alpha_min: CutOff = Field(
         default=1 / 255, description="a pixel skips Gaussians with an alpha below this there; 1/255 in 3DGS"
     )

@@ -1,6 +1,5 @@
 """The fit before training: when it runs, and that it runs once."""
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,19 +8,15 @@ import pytest
 from dyngs.config import DataConfig
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.human.fit import before_training, fitted_capture
+from dyngs.human.fit import before_training
 from dyngs.human.fit.before_training import with_fitted_body
-from dyngs.human.fit.capture_fit import FitEffort, fit_capture
 from dyngs.human.fit.fitted_capture import write_fitted_capture
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 
 @pytest.fixture
-def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DataConfig:
+def data(tmp_path: Path, short_fits: None) -> DataConfig:
     """A small capture, an empty cache, and fits of two steps."""
-    monkeypatch.setenv("DYNGS_CACHE_DIR", str(tmp_path / "cache"))
-    effort = FitEffort(side=32, steps=2, visits=0)
-    monkeypatch.setattr(fitted_capture, "fit_capture", partial(fit_capture, effort=effort))
     options = HumanOptions(size=64, num_frames=2, num_new=2, num_cameras=3, num_test=1, samples=1, body_seed=3)
     root = write_human_capture(tmp_path / "person", options)
     for name in ("train", "pose"):

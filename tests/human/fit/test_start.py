@@ -83,7 +83,7 @@ def test_nobody_has_the_place_of_the_frame_before(surface: Surface) -> None:
 
 
 def test_the_heading_is_found(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 30)
+    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 15)
     monkeypatch.setattr("dyngs.human.fit.start.ARMS", ())
     place, heading = torch.tensor([0.0, 1.0, 0.0]), 2.0
     seen = seen_by(surface, standing(place, heading), ring(3, place))
@@ -101,7 +101,7 @@ def test_nobody_at_all_is_an_error(surface: Surface) -> None:
 
 def test_who_turns_before_one_camera_is_followed(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
     """From frame to frame a body would rather twist than turn: outlines of front and back are alike."""
-    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 20)
+    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 10)
     monkeypatch.setattr("dyngs.human.fit.start.ARMS", ())
     place, camera = torch.tensor([0.0, 1.0, 0.0]), ring(1, torch.tensor([0.0, 1.0, 0.0]))
     turns = [0.4 * math.pi + x for x in (0.1, 1.6, 3.1)]  # towards the camera, then sideways, then away from it
