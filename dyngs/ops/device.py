@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -60,7 +61,7 @@ def num_cards() -> int:
 
 
 @contextmanager
-def deterministic(device: torch.device, wanted: bool = True) -> Iterator[None]:
+def deterministic(device: torch.device, wanted: bool = True) -> Generator[None]:
     """Let torch's operators on a card give the same bytes every time, inside this context; ours always do.
 
     Where torch has no such operator it warns. The CPU's need nothing of this.
@@ -70,14 +71,15 @@ def deterministic(device: torch.device, wanted: bool = True) -> Iterator[None]:
         return
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # what cuBLAS needs for it, before it begins
     before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
-    filled = torch.utils.deterministic.fill_uninitialized_memory
+    memory: Any = torch.utils.deterministic
+    filled = memory.fill_uninitialized_memory
     torch.use_deterministic_algorithms(True, warn_only=True)
-    torch.utils.deterministic.fill_uninitialized_memory = False  # every op of ours writes its outputs in full
+    memory.fill_uninitialized_memory = False  # every op of ours writes its outputs in full
     try:
         yield
     finally:
         torch.use_deterministic_algorithms(before[0], warn_only=before[1])
-        torch.utils.deterministic.fill_uninitialized_memory = filled
+        memory.fill_uninitialized_memory = filled
 
 
 def finish(device: torch.device) -> None:
