@@ -326,7 +326,7 @@ def _explain_unknown(layers: _Layers, keys: tuple[str, ...]) -> str:
         return f"{dotted} belongs to {'.'.join(above)}.kind={' or '.join(owners)}, not to {present}"
     full = next((k for k in layers.origins if k[: len(keys)] == keys), keys)
     section = section_at(layers.tree, keys)
-    return f"unknown key {dotted!r}{_did_you_mean_key(full, section, inside=bool(above) and full == keys)}"
+    return f"unknown key {_shorten(dotted)}{_did_you_mean_key(full, section, inside=bool(above) and full == keys)}"
 
 
 def _shorten(value: object) -> str:

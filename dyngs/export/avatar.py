@@ -38,6 +38,8 @@ _KIND = FileKind("dyngs avatar", "an avatar", 1)
 _ADVICE = "; export it again with `dyngs export RUN --format avatar`"
 _MOST_FACES = 2**31 - 1
 """All that an int32 can number: the faces of a template without blend shapes are not in the file."""
+_LONGEST_NAME = 200
+"""Characters of the name of a file, which must have its place in every file system."""
 _WEIGHT_SUM = 1e-3
 """Tolerance of the sum of skinning weights; rounding errors in float32 are below 1e-6."""
 
@@ -133,6 +135,8 @@ def _template_ref(model: HumanModel) -> TemplateRef:
 
 def _template_beside(path: Path, ref: TemplateRef) -> Path | None:
     """Return where the template of an avatar in ``path`` is or should be; None: the free one."""
+    if len(Path(ref.file).name) > _LONGEST_NAME:
+        raise ValueError("the name of its template is too long")
     file = template_path(HumanModel()) if ref.packaged else path.parent / Path(ref.file).name
     if file.is_file() and _sha256(file) != ref.sha256:
         whose = "that of this version of dyngs" if ref.packaged else f"{file}"

@@ -67,6 +67,8 @@ class Measurement:
 
 
 _MEASUREMENT = TypeAdapter(Measurement)
+_SHORTEST = 1e-9
+"""Milliseconds, and a gain, below which a number is none that was measured."""
 
 
 def read_measurement(path: Path) -> Measurement:
@@ -81,8 +83,8 @@ def read_measurement(path: Path) -> Measurement:
         variant, speed = Variant(**stored.pop("variant")), stored.pop("speed")
         if speed is not None:
             speed = Speed(Quartiles(**speed["ms"]), Quartiles(**speed["gain"]))
-            if min(*speed.ms.__dict__.values(), *speed.gain.__dict__.values()) <= 0:
-                raise ValueError("a time that is not positive")
+            if min(*speed.ms.__dict__.values(), *speed.gain.__dict__.values()) < _SHORTEST:
+                raise ValueError("a time that is not positive, or too short to be one")
         return _MEASUREMENT.validate_python(asdict(Measurement(variant=variant, speed=speed, **stored)))
 
 

@@ -27,7 +27,7 @@ class SceneModel(Section):
         description="variance of the 2D low-pass filter, px^2; Mip-Splatting: 0.1 with antialiased",
     )
     filter_3d: bool = Field(default=False, description="3D smoothing filter of Mip-Splatting (Yu et al. 2024)")
-    near: Positive = Field(default=0.2, le=3.4e38, description="near plane, world units")
+    near: Positive = Field(default=0.2, le=1e9, description="near plane, world units")
     alpha_min: CutOff = Field(
         default=1 / 255, description="a pixel skips Gaussians with an alpha below this there; 1/255 in 3DGS"
     )
