@@ -122,7 +122,7 @@ def read_avatar(path: Path) -> LoadedRun:
             rasterize_mode=RasterizeMode(info.rasterize_mode),
             sh_degree={1: 0, 4: 1}[scene.gaussians.sh.shape[1]],
         )
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise DyngsError(f"{path}: not a valid avatar ({_reason(error)}){_ADVICE}") from None
     return LoadedRun(Config(data=DataConfig(root=path), model=model), scene, info.step, 0.0, info)
 

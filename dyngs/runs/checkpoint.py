@@ -108,7 +108,7 @@ def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
 
     Raises:
         KeyError: something lacks.
-        ValueError, TypeError: a value is of another kind or out of range.
+        ValueError, TypeError, OverflowError: a value is of another kind or out of range.
     """
     step, (x, y, z) = header["step"], (float(value) for value in header["world_offset"])
     extent, background, mode = float(header["extent"]), header["background"], header["rasterize_mode"]
