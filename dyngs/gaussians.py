@@ -11,6 +11,9 @@ from torch import Tensor
 from dyngs.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
 from dyngs.tensor_checks import require_tensor
 
+LARGEST_LOG_SCALE = 88
+"""Natural logarithm of the largest size that float32 can hold, rounded down."""
+
 
 @dataclass(frozen=True)
 class Gaussians:
@@ -45,11 +48,13 @@ class Gaussians:
 
         Raises:
             KeyError: a tensor is missing.
-            ValueError: one is not finite float32, they do not fit together, or no degree has that many harmonics.
+            ValueError: one is not finite float32, or a size; they do not fit together, or no degree has these harmonics.
         """
         found = Gaussians(**{f.name: tensors[f.name] for f in fields(Gaussians)})
         for name, x in found.tensors().items():
             require_tensor(name, x, x.shape)
+        if bool((found.log_scales > LARGEST_LOG_SCALE).any()):
+            raise ValueError(f"'log_scales' holds sizes beyond e^{LARGEST_LOG_SCALE}, which no float32 can hold")
         if found.sh.shape[1] not in [num_sh_terms(degree) for degree in range(MAX_SH_DEGREE + 1)]:
             raise ValueError(f"'sh' has {found.sh.shape[1]} terms, which no degree has")
         return found

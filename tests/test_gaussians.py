@@ -108,3 +108,13 @@ def test_moments_of_new_rows_start_at_zero(rows: list[tuple[int, bool]]) -> None
     assert torch.equal(edit.apply(x), x[source])
     assert torch.equal(edit.apply_moments(x), x[source] * (~is_new)[:, None])
     assert torch.equal(x, before)
+
+
+def test_stored_sizes_beyond_float32_are_refused() -> None:
+    """They would be drawn as infinite, long after the file that they came from."""
+    tensors = random_scene().to(torch.float32).gaussians.tensors()
+    tensors["log_scales"][2, 1] = 87.9
+    Gaussians.stored(tensors)
+    tensors["log_scales"][2, 1] = 88.5
+    with pytest.raises(ValueError, match=r"'log_scales' holds sizes beyond e\^88"):
+        Gaussians.stored(tensors)

@@ -211,7 +211,7 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
     values |= {name: tensors[name] for name in ("pose_dirs", "light", "normals") if name in tensors}
     options = HumanModel(pose_offsets="pose_dirs" in tensors)
     return HumanScene(
-        gaussians=Gaussians(**part("gaussians.")),
+        gaussians=Gaussians.stored(Gaussians(**part("gaussians.")).tensors()),  # and nothing else
         anchors=anchors,
         skeleton=skeleton,
         clip=reference,

@@ -24,7 +24,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
-from dyngs.errors import DyngsError, require_regular
+from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.write import atomic_file
 from dyngs.scene import Scene
 from dyngs.storage.coding import Packing, compressed, decompressed, packed, unpacked
@@ -196,7 +196,7 @@ def decoded(data: bytes) -> StoredScene:
             raise DyngsError("it holds something else than its header says")
         full = completed(tensors)
     except KeyError as missing:
-        raise DyngsError(f"it lacks {missing}") from None
+        raise DyngsError(f"it lacks {printable(str(missing), 60)}") from None
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
