@@ -48,7 +48,7 @@ class Gaussians:
 
         Raises:
             KeyError: a tensor is missing.
-            ValueError: one is not finite float32, or a size; they do not fit together, or no degree has these harmonics.
+            ValueError: one is not finite float32, or a size; they do not fit together, or no degree has so many terms.
         """
         found = Gaussians(**{f.name: tensors[f.name] for f in fields(Gaussians)})
         for name, x in found.tensors().items():
