@@ -85,14 +85,32 @@ void test_no_rows() {
          "no rows, no gradients by parameters");
 }
 
+// More tiles than sums, in the smallest tiles.
+void test_many_tiles() {
+  const NetworkCase c = network_case({250, 250, 256}, 1, 100);
+  const NetworkResults<float> card = network_on_card(c);
+  const NetworkResults<double> cpu = network_on_cpu(c);
+  expect_close("outputs of many tiles", card.y, cpu.y, 5e-6);
+  expect_close("gradient by inputs of many tiles", card.by_x, cpu.by_x, 5e-6);
+  expect_close("gradient by parameters of many tiles", card.by_params, cpu.by_params, 2e-5);
+}
+
 // A row with NaN has NaN in its outputs, and no other row has.
 void test_spoilt_row() {
-  NetworkCase c = network_case({5, 8, 8, 3}, 2, 40);
+  NetworkCase c = network_case({5, 8, 8, 3}, 0, 40);
   const NetworkResults<float> good = network_on_card(c);
   c.x[7 * 5 + 2] = std::numeric_limits<double>::quiet_NaN();
   const NetworkResults<float> bad = network_on_card(c);
   for (size_t at = 0; at < good.y.size(); ++at)
     expect(at / 3 == 7 ? std::isnan(bad.y[at]) : bad.y[at] == good.y[at], "NaN in its own row alone");
+}
+
+// What the network makes of the zeros after the last row, here infinity, is in no sum.
+void test_padding() {
+  const NetworkCase c{{1, 1, 1, 1}, 0, 3, {-1e30, 1e30, 1e30, 1, 1, 0}, {1, 1, 1}, {1, 1, 1}};
+  const NetworkResults<float> card = network_on_card(c);
+  expect(card.y == std::vector<float>{1, 1, 1}, "outputs beside rows that are none");
+  expect(card.by_params == std::vector<float>{0, 0, 0, 3, 3, 3}, "gradient by parameters beside rows that are none");
 }
 
 void test_large_networks() {
@@ -115,6 +133,6 @@ int main() {
   skip_without_card();
   test_perceptron({5, 24, 24, 3}, 2, 301), test_perceptron({4, 1}, 0, 30), test_perceptron({13, 32, 32, 3}, 0, 700);
   test_perceptron({33, 70, 41, 70, 9}, 3, 150), test_perceptron({100, 256, 130, 11}, 2, 37);
-  test_no_rows(), test_spoilt_row(), test_large_networks();
+  test_no_rows(), test_many_tiles(), test_spoilt_row(), test_padding(), test_large_networks();
   return report();
 }
