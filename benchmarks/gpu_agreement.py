@@ -23,6 +23,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.ops.adam import adam_step_
 from dyngs.ops.device import why_no_card
 from dyngs.ops.loss import l1_ssim_loss
+from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import rotation_matrices
@@ -104,6 +105,21 @@ def posed(given: Given) -> Found:
     return with_gradients(given, {"means": made.means, "covariances": axes @ axes.mT})
 
 
+def decoded(given: Given) -> Found:
+    """A network whose third layer sees the features once more."""
+    layers = [Layer(given[f"weight{i}"], given[f"bias{i}"]) for i in range(4)]
+    return with_gradients(given, {"outputs": perceptron(given["features"], layers, skip=2)})
+
+
+def network() -> Given:
+    """Features, and the weights of 40-64-64-64-10."""
+    given = {"features": numbers(COUNT, 40).requires_grad_()}
+    for i, (width, inputs) in enumerate(((64, 40), (64, 64), (64, 104), (10, 64))):
+        given[f"weight{i}"] = numbers(width, inputs, seed=i, scale=(2 / inputs) ** 0.5).requires_grad_()
+        given[f"bias{i}"] = numbers(width, seed=4 + i, scale=0.1).requires_grad_()
+    return given
+
+
 def cases() -> dict[str, tuple[Callable[[Given], Found], Given]]:
     """What is computed, of what, by name."""
     trained, pictures = torch.Tensor.requires_grad_, [numbers(SIDE, SIDE, 3, seed=i).sigmoid() for i in range(2)]
@@ -142,6 +158,7 @@ def cases() -> dict[str, tuple[Callable[[Given], Found], Given]]:
                 "transforms": trained(transforms),
             },
         ),
+        "network": (decoded, network()),
     }  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from dyngs.ops import native
 
 ROOT = Path(__file__).resolve().parents[1]
 KERNELS = tuple(sorted((ROOT / "csrc/cuda").glob("*.cu")))
-BINDINGS = tuple(f for f in sorted((ROOT / "csrc/bind").glob("bind_*.cpp")) if f.stem != "bind_perceptron")
+BINDINGS = tuple(sorted((ROOT / "csrc/bind").glob("bind_*.cpp")))
 NAME = "_core_emulated"
 
 

@@ -7,7 +7,7 @@ for which torch takes both), and NumPy gets none. Whatever makes the host wait f
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -16,8 +16,6 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_flatten, tree_map
-
-from dyngs.ops import registration
 
 aten: Any = torch.ops.aten
 CARD = torch.device("meta")
@@ -119,11 +117,9 @@ class PretendCard(TorchDispatchMode):
 
 
 @contextmanager
-def pretend_card(without: Collection[str] = ()) -> Iterator[PretendCard]:
-    """Inside, tensors may lie on ``CARD``, where all ops compute but those ``without`` a kernel there."""
-    kernels = {name: on - ({"meta"} if name in without else set()) for name, on in registration._kernels.items()}
+def pretend_card() -> Iterator[PretendCard]:
+    """Inside, tensors may lie on ``CARD``, where all ops compute."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(registration, "_kernels", kernels)
         patch.setattr(torch, "tensor", made)
         patch.setattr(torch, "as_tensor", lambda x, **how: x.to(**how) if isinstance(x, Tensor) else made(x, **how))
         patch.setattr(

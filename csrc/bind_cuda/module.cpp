@@ -12,6 +12,7 @@
 namespace nb = nanobind;
 
 namespace dyngs {
+void bind_perceptron(nb::module_& module);
 void bind_planes(nb::module_& module);
 void bind_offsets(nb::module_& module);
 void bind_posing(nb::module_& module);
@@ -61,6 +62,7 @@ NB_MODULE(DYNGS_MODULE, module) {
   module.def("note_memory", dyngs::note_memory);
   module.def("host_reads", [] { return dyngs::cuda::emulated::machine.host_reads; });
 #endif
+  dyngs::bind_perceptron(module);
   dyngs::bind_planes(module);
   dyngs::bind_offsets(module);
   dyngs::bind_posing(module);

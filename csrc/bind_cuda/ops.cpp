@@ -140,6 +140,33 @@ void write_plane_penalty(const HexPlane<S>& planes, const PenaltyWeights& weight
   }
 }
 
+// Perceptron ----------------------------------------------------------------------------------------------------------
+
+// The backward pass computes the activations again.
+template <class S>
+int64_t Perceptron<S>::kept_per_row() const {
+  return 0;
+}
+
+template <class S>
+void perceptron_forward(const Perceptron<S>& net, int64_t rows, const S* x, S* y, S*) {
+  require_float<S>();
+  if constexpr (std::is_same_v<S, float>) {
+    const Borrowed memory(cuda::perceptron_forward_workspace(net));
+    cuda::perceptron_forward(net, rows, x, y, memory.lent(), current_stream());
+  }
+}
+
+template <class S>
+void perceptron_backward(const Perceptron<S>& net, int64_t rows, const S* x, const S* grad_y, const S*, S* grad_x,
+                         S* grad_params) {
+  require_float<S>();
+  if constexpr (std::is_same_v<S, float>) {
+    const Borrowed memory(cuda::perceptron_backward_workspace(net, rows));
+    cuda::perceptron_backward(net, rows, x, grad_y, grad_x, grad_params, memory.lent(), current_stream());
+  }
+}
+
 // Moving Gaussians ----------------------------------------------------------------------------------------------------
 
 bool follow_within(const int64_t*, int64_t, int64_t) { return true; }  // not readable, see bind/arrays.hpp
@@ -227,6 +254,9 @@ void write_count_nonfinite(const S* x, int64_t n, int32_t* count, int) {
                                   std::span<const PlaneGrads<S>>, S*, int);                                         \
   template void write_plane_penalty(const HexPlane<S>&, const PenaltyWeights&, std::span<const PlaneGrads<S>>,      \
                                     double*, int);                                                                  \
+  template struct Perceptron<S>;                                                                                    \
+  template void perceptron_forward(const Perceptron<S>&, int64_t, const S*, S*, S*);                                \
+  template void perceptron_backward(const Perceptron<S>&, int64_t, const S*, const S*, const S*, S*, S*);           \
   template void skinning_forward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<S>&, int);                \
   template void skinning_backward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<const S>&,               \
                                   const SkinGrads<S>&, int);                                                        \

@@ -248,7 +248,11 @@ struct Perceptron {
   int64_t hidden(int64_t l) const { return widths[l]; }
   int64_t in(int64_t l) const { return widths[l] + (l > 0 && l == skip ? widths[0] : 0); }
   int64_t out(int64_t l) const { return widths[l + 1]; }
-  int64_t num_params() const;
+  int64_t num_params() const {
+    int64_t count = 0;
+    for (int64_t l = 0; l < layers(); ++l) count += out(l) * (in(l) + 1);
+    return count;
+  }
   // Scalars per row that the forward pass can keep for the backward pass: the padded inputs of all layers but the first.
   int64_t kept_per_row() const;
 };

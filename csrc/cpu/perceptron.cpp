@@ -373,13 +373,6 @@ void sum_parts(const Plan<S>& plan, const S* sums, int64_t parts, int threads, S
 }  // namespace
 
 template <class S>
-int64_t Perceptron<S>::num_params() const {
-  int64_t count = 0;
-  for (int64_t l = 0; l < layers(); ++l) count += out(l) * (in(l) + 1);
-  return count;
-}
-
-template <class S>
 int64_t Perceptron<S>::kept_per_row() const {
   int64_t count = 0;
   for (int64_t l = 1; l < layers(); ++l) count += stride_of(in(l));

@@ -73,6 +73,20 @@ int64_t plane_penalty_workspace(const HexPlane<float>& planes);
 void plane_penalty(const HexPlane<float>& planes, const PenaltyWeights& weights,
                    std::span<const PlaneGrads<float>> grads, double* penalty, const Lent& workspace, Stream stream);
 
+// Perceptron ----------------------------------------------------------------------------------------------------------
+
+inline constexpr int kPerceptronLayers = 16, kPerceptronWidth = 256;  // at most, x and outputs included
+inline constexpr int64_t kPerceptronBytes = 128 << 20;
+
+bool perceptron_fits(const Perceptron<float>& net);
+int64_t perceptron_forward_workspace(const Perceptron<float>& net);
+void perceptron_forward(const Perceptron<float>& net, int64_t rows, const float* x, float* y, const Lent& workspace,
+                        Stream stream);
+// The activations are computed again, of as many rows at a time as fit `bytes`.
+int64_t perceptron_backward_workspace(const Perceptron<float>& net, int64_t rows, int64_t bytes = kPerceptronBytes);
+void perceptron_backward(const Perceptron<float>& net, int64_t rows, const float* x, const float* grad_y, float* grad_x,
+                         float* grad_params, const Lent& workspace, Stream stream, int64_t bytes = kPerceptronBytes);
+
 // Moving Gaussians ----------------------------------------------------------------------------------------------------
 
 int64_t skinning_forward_workspace(int64_t num_nodes);

@@ -16,6 +16,7 @@
 #if defined(__CUDACC__)
 #include <cuda_runtime.h>
 #define DYNGS_UNROLL _Pragma("unroll")
+#define DYNGS_UNROLL_BY_4 _Pragma("unroll 4")
 #define DYNGS_SHARED(T, name, count) \
   __shared__ T name##_memory[count]; \
   T* const name = name##_memory
@@ -24,6 +25,7 @@
   T* const name = reinterpret_cast<T*>(name##_memory)
 #else
 #define DYNGS_UNROLL
+#define DYNGS_UNROLL_BY_4
 #include "tests/cuda_on_cpu.hpp"
 #endif
 

@@ -1,8 +1,9 @@
-"""A small multilayer perceptron over many rows, fused on the CPU.
+"""A small multilayer perceptron over many rows, fused.
 
 Per-Gaussian decoders of deformation fields have tens of thousands of rows but layers of only 10 to 256 features. A
 matrix product, a bias and a ReLU per layer each go through memory once per step and direction; the fused kernel runs
-all layers of a hundred rows while they are in the cache. Its results do not depend on the number of threads.
+all layers of a hundred rows while they are in the cache, on a card in shared memory. Its results do not depend on the
+number of threads.
 """
 
 from __future__ import annotations
@@ -17,11 +18,13 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core, num_threads
+from dyngs.ops.native import array, core_for, num_threads
 from dyngs.ops.registration import Gradient, has_kernel, register
 
 KEPT_BYTES = 2**30
-"""The backward pass computes the activations again where keeping them would take more memory than this."""
+"""The backward pass computes activations again where keeping them would take more memory than this, and on a card."""
+CARD_LAYERS, CARD_WIDTH = 16, 256
+"""Networks of more layers, or with more features anywhere, are computed by torch's operators on a card."""
 
 
 @dataclass(frozen=True)
@@ -34,15 +37,17 @@ class Layer:
 
 def _empty_kept(x: Tensor, widths: list[int], skip: int, keep: bool) -> Tensor:
     """Return room for the activations between the layers; empty unless asked for, and if they would take too much."""
-    size = x.shape[0] * core.perceptron_kept_per_row(widths, skip)
-    return x.new_empty(size if keep and size * x.element_size() <= KEPT_BYTES else 0)
+    if not keep or x.device.type != "cpu":
+        return x.new_empty(0)
+    size = x.shape[0] * core_for(x).perceptron_kept_per_row(widths, skip)
+    return x.new_empty(size if size * x.element_size() <= KEPT_BYTES else 0)
 
 
 def _perceptron(x: Tensor, params: Tensor, widths: list[int], skip: int, keep: bool) -> tuple[Tensor, Tensor]:
     y = x.new_empty(x.shape[0], widths[-1])
     kept = _empty_kept(x, widths, skip, keep)
     arrays = (array(t) for t in (x, params, y))
-    core.perceptron_forward(*arrays, array(kept) if kept.numel() else None, widths, skip, num_threads())
+    core_for(x).perceptron_forward(*arrays, array(kept) if kept.numel() else None, widths, skip, num_threads())
     return y, kept
 
 
@@ -56,7 +61,7 @@ def _perceptron_backward(
     x, params, kept = inputs
     grad_x = x.new_empty(x.shape if with_x else (0,))
     grad_params = params.new_empty(params.shape)
-    core.perceptron_backward(
+    core_for(x).perceptron_backward(
         *(array(t) for t in (x, params, grad)),
         array(kept) if kept.numel() else None,
         array(grad_x) if with_x else None,
@@ -79,7 +84,6 @@ perceptron_backward_op = register(
     "perceptron_backward",
     _perceptron_backward,
     fake=_fake_perceptron_backward,
-    devices=("cpu",),
 )
 """Gradients by x, empty unless asked for, and by the parameters; ``inputs`` are x, params and kept."""
 
@@ -101,7 +105,6 @@ perceptron_op = register(
     "perceptron",
     _perceptron,
     fake=_fake_perceptron,
-    devices=("cpu",),
     gradient=Gradient(_save, _backward),
 )
 """Outputs (M, out), and the activations between the layers in the kernel's layout or an empty tensor. ``params`` holds
@@ -111,7 +114,7 @@ weight and bias of each layer, flat; ``skip`` 0 means none."""
 def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
     """Return (M, out) outputs of linear layers with a ReLU after each but the last, differentiable in all of them.
 
-    Only first derivatives exist on the CPU. A row with NaN gives an output row of NaN and leaves the other rows alone;
+    Only first derivatives exist. A row with NaN gives an output row of NaN and leaves the other rows alone;
     gradients by the layers are sums over all rows, so a NaN in one reaches them.
 
     Args:
@@ -126,7 +129,7 @@ def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -
     widths = _checked_widths(x, layers, skip)
     dtype = reduce(torch.promote_types, (t.dtype for layer in layers for t in (layer.weight, layer.bias)), x.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
-    if not has_kernel("perceptron", x.device):
+    if not has_kernel("perceptron", x.device) or (x.device.type != "cpu" and _is_large(widths)):
         return reference_perceptron(x, layers, skip=skip)
     params = torch.cat([t.to(dtype).reshape(-1) for layer in layers for t in (layer.weight, layer.bias)])
     x = x.to(dtype)
@@ -143,6 +146,11 @@ def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None
         if i + 1 < len(layers):
             h = h.relu()
     return h
+
+
+def _is_large(widths: list[int]) -> bool:
+    """Return whether the kernel of a card does not take the network."""
+    return len(widths) - 1 > CARD_LAYERS or max(widths) > CARD_WIDTH
 
 
 def _checked_widths(x: Tensor, layers: Sequence[Layer], skip: int | None) -> list[int]:

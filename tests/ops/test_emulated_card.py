@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from types import ModuleType
 
 import pytest
@@ -20,6 +21,7 @@ from dyngs.ops.adam import adam_step_, seen_rows
 from dyngs.ops.finite import count_nonfinite_op
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.offsets import add_offsets_
+from dyngs.ops.perceptron import CARD_LAYERS, CARD_WIDTH, Layer, perceptron, perceptron_op
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.projection import project
@@ -174,6 +176,23 @@ def posed() -> Made:
     return [*results, found.transforms, *by_all, *torch.autograd.grad(alone, rest[1:])]
 
 
+def decoded() -> Made:
+    """Outputs of networks without and with a skip, and gradients with and without those by the rows."""
+    generator = torch.Generator().manual_seed(0)
+    found = []
+    for widths, skip in (((7, 3), None), ((7, 20, 33, 20, 5), 2)):
+        ins = [w + (widths[0] if i == skip else 0) for i, w in enumerate(widths[:-1])]
+        weights = [0.4 * torch.randn(b, a, generator=generator) for a, b in zip(ins, widths[1:], strict=True)]
+        biases = [0.4 * torch.randn(b, generator=generator) for b in widths[1:]]
+        layers = [Layer(w.requires_grad_(), b.requires_grad_()) for w, b in zip(weights, biases, strict=True)]
+        x = torch.randn(150, widths[0], generator=generator).requires_grad_()
+        y = perceptron(x, layers, skip=skip)
+        found += [y, *torch.autograd.grad(y.square().sum(), [x, *weights, *biases])]
+        found += torch.autograd.grad(perceptron(x.detach(), layers, skip=skip).sin().sum(), weights)
+        found.append(perceptron(x.detach()[:0], [Layer(v.weight.detach(), v.bias.detach()) for v in layers], skip=skip))
+    return found
+
+
 CASES: dict[str, Callable[[], Made]] = {
     "render": lambda: drawn(single().gaussians),
     "tally": tallied,
@@ -184,6 +203,7 @@ CASES: dict[str, Callable[[], Made]] = {
     "planes": looked_up,
     "skinning": skinned,
     "posing": posed,
+    "perceptron": decoded,
 }
 
 
@@ -256,6 +276,19 @@ def test_too_many_tile_entries_are_refused_as_on_the_cpu(card: Callable) -> None
 def test_float64_is_refused_in_one_line(card: Callable) -> None:
     with card(), pytest.raises((DyngsError, ValueError), match="float64 is not there on a GPU; use float32"):
         count_nonfinite_op(torch.zeros(3, dtype=torch.float64))
+
+
+def test_the_limits_of_networks_are_those_of_the_kernel(card: Callable) -> None:
+    def computed(*widths: int) -> Tensor:
+        params = torch.zeros(sum((a + 1) * b for a, b in pairwise(widths)))
+        return perceptron_op(torch.ones(1, widths[0]), params, list(widths), 0, False)[0]
+
+    with card():
+        assert computed(2, CARD_WIDTH, CARD_WIDTH, 1).tolist() == [[0.0]]
+        assert computed(*[1] * (CARD_LAYERS + 1)).tolist() == [[0.0]]
+        for widths in ([2, CARD_WIDTH + 1, 1], [CARD_WIDTH + 1, 1], [1] * (CARD_LAYERS + 2)):
+            with pytest.raises(ValueError, match="up to 16 layers of up to 256 features"):
+                computed(*widths)
 
 
 def test_arrays_of_the_wrong_size_are_refused(card: Callable) -> None:

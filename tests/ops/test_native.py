@@ -116,7 +116,7 @@ def test_formulas_in_cpp(tmp_path: Path, name: str) -> None:
 
 def test_cuda_kernels_in_cpp(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     """csrc/tests/test_cuda_*.cpp: the kernels of csrc/cuda as plain C++, run by an emulation, against csrc/cpu."""
-    tests = [ROOT / f"csrc/tests/test_cuda_{name}.cpp" for name in ("emulator", "render", "train", "deform")]
+    tests = [ROOT / f"csrc/tests/test_cuda_{name}.cpp" for name in ("emulator", "render", "train", "deform", "network")]
     cpu = sorted((ROOT / "csrc/cpu").glob("*.cpp"))
     # nothing contracted, as in CMakeLists.txt; what hardly takes time to run is compiled quickly
     common = ("core/api.hpp", "cpu/parallel.hpp", "cpu/simd.hpp", "tests/check.hpp")

@@ -99,11 +99,13 @@ def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
         assert [key for key, x in here.tensors.items() if not torch.equal(there.tensors[key], x)] == []
 
 
-def test_a_network_without_a_kernel_is_computed_by_torch(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_network_too_large_for_the_kernel_is_computed_by_torch(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = config_of("static", still, *STATIC, "colour.kind=network")
     expected = trained(config, monkeypatch, torch.device("cpu")).colours.network
     assert expected is not None
-    with pretend_card(without=("perceptron", "perceptron_backward")):
+    monkeypatch.setattr("dyngs.ops.perceptron.CARD_WIDTH", 31)
+    monkeypatch.setattr("dyngs.ops.perceptron.perceptron_op", None)  # the CPU has had it
+    with pretend_card():
         network = trained(config, monkeypatch, CARD).colours.network
         assert network is not None
         found = network.layers[0].weight.detach().cpu()
