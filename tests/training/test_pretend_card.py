@@ -137,7 +137,8 @@ def test_how_often_the_host_waits_in_a_step(
 ) -> None:
     """Once for the loss; the number of tile entries, which the kernels read back, is not seen here (docs/gpu.md)."""
     kind, capture, more = CASES[name] if name != "static" else ("static", "still", STATIC)
-    config = config_of(kind, request.getfixturevalue(capture), *more, "strategy.kind=fixed")
+    long = ("train.steps=40", "strategy.kind=fixed")  # nothing but steps happens in those that are looked at
+    config = config_of(kind, request.getfixturevalue(capture), *more, *long)
     with pretend_card() as card:
         monkeypatch.setattr("dyngs.build.device_for", lambda _: CARD)
         trainer = assemble(config)
