@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from emulated_card import compiled, compiler, emulated_kernels, session_folder
+from emulated_gpu import compiled, compiler, emulated_kernels, session_folder
 
 from dyngs.ops.native import active_isa, array, core, kernel_threads, num_threads
 
@@ -139,7 +139,7 @@ import torch
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.ops.native import kernel_threads, num_threads
-from dyngs.rendering import render
+from dyngs.gaussians.rendering import render
 
 def draw(count):
     fields = torch.zeros(count, 3) + torch.tensor([0.0, 0, 3]), torch.ones(count, 4), torch.full((count, 3), -2.0)
