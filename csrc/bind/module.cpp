@@ -21,21 +21,6 @@ void bind_rasterizer(nb::module_& module);
 void bind_shading(nb::module_& module);
 void bind_skinning(nb::module_& module);
 void bind_train(nb::module_& module);
-
-namespace {
-
-// The newest of the compiled x86-64 levels that this processor runs. Only the baseline module is asked.
-const char* best_isa() {
-#if defined(DYNGS_HAS_v4)
-  if (runs_v4()) return "v4";
-#endif
-#if defined(DYNGS_HAS_v3)
-  if (runs_v3()) return "v3";
-#endif
-  return "v2";
-}
-
-}  // namespace
 }  // namespace dyngs
 
 // Turns a failed allocation into the one line of error that any other request too large gets.
