@@ -109,6 +109,9 @@ struct Splats {
   const int32_t* radii;  // (V, N, 2)
   S alpha_min, alpha_max, transmittance_min;
   int threads;
+
+  // Of all views.
+  int64_t tiles() const { return num_views * ((width + kTile - 1) / kTile) * int64_t{(height + kTile - 1) / kTile}; }
 };
 
 // The tiles that each Gaussian may be seen in, sorted by (view, tile, depth, index).

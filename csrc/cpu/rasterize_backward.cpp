@@ -255,8 +255,7 @@ void tile_backward(const Splats<S>& s, const Layout& layout, const Entries& entr
 template <class S, int D>
 void all_tiles_backward(const Splats<S>& s, const Layout& layout, const Entries& entries, const ImageGrads<S>& image,
                         S* slots) {
-  const int64_t tiles = s.num_views * ((s.width + kTile - 1) / kTile) * int64_t{(s.height + kTile - 1) / kTile};
-  parallel_for(tiles, 1, s.threads, [&](int64_t begin, int64_t end) {
+  parallel_for(s.tiles(), 1, s.threads, [&](int64_t begin, int64_t end) {
     for (int64_t t = begin; t < end; ++t) tile_backward<S, D>(s, layout, entries, image, t, slots);
   });
 }

@@ -328,7 +328,7 @@ void rasterize_backward(const Splats<float>& s, const Entries& entries, const Im
   auto* slots = Workspace(workspace.memory, workspace.bytes).take<float>(entries.count * fields);
   with_channels(s.channels, [&](auto cap) {
     constexpr int kCap = decltype(cap)::value;
-    launch("blend_backward", {count_tiles(s), kTileThreads}, stream,
+    launch("blend_backward", {s.tiles(), kTileThreads}, stream,
            out.absolute ? blend_backward_kernel<kCap, true> : blend_backward_kernel<kCap, false>, s, entries, image,
            slots);
   });

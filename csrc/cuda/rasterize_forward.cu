@@ -145,7 +145,7 @@ __global__ void __launch_bounds__(kTileThreads)
 template <int kCap, Tally kTally>
 void launch_blend(const Splats<float>& s, const Entries& entries, const Image<float>& image, float* slot_sums,
                   Stream stream) {
-  launch("blend", {count_tiles(s), kTileThreads}, stream, blend_kernel<kCap, kTally>, s, entries, image, slot_sums);
+  launch("blend", {s.tiles(), kTileThreads}, stream, blend_kernel<kCap, kTally>, s, entries, image, slot_sums);
 }
 
 void blend(const Splats<float>& s, const Entries& entries, const Image<float>& image, Stream stream) {

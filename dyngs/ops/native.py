@@ -98,9 +98,15 @@ def cuda_core() -> ModuleType:
 
 
 def core_for(x: Tensor) -> ModuleType:
-    """Return the compiled core that computes where ``x`` lies; on a card it goes on in torch's current stream there."""
+    """Return the compiled core that computes where ``x`` lies; on a card it goes on in torch's current stream there.
+
+    Raises:
+        DyngsError: ``x`` is float64 on a card.
+    """
     if x.device.type == "cpu":
         return core
+    if x.dtype == torch.float64:
+        raise DyngsError("float64 is not there on a GPU; use float32")
     module = cuda_core()
     module.use_queue(x.get_device(), torch.cuda.current_stream(x.device).cuda_stream)
     return module

@@ -13,7 +13,7 @@ import torch
 from emulated_card import compiled, compiler, emulated_kernels, session_folder
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import active_isa, array, built_isas, choose_isa, core, kernel_threads, num_threads
+from dyngs.ops.native import active_isa, array, built_isas, choose_isa, core, core_for, kernel_threads, num_threads
 
 ROOT = Path(__file__).parents[2]
 
@@ -101,6 +101,11 @@ def test_array_detaches_and_copies_only_if_needed() -> None:
     assert torch.from_dlpack(array(x)).data_ptr() == x.data_ptr()
     assert not torch.from_dlpack(array(x)).requires_grad
     assert torch.from_dlpack(array(x[:, 0])).stride() == (1,)
+
+
+def test_float64_on_a_card_is_refused_in_one_line() -> None:
+    with pytest.raises(DyngsError, match=r"^float64 is not there on a GPU; use float32$"):
+        core_for(torch.zeros(3, dtype=torch.float64, device="meta"))
 
 
 def test_arrays_of_the_wrong_size_are_refused_before_they_are_read() -> None:
